@@ -1,0 +1,52 @@
+# The two commands: `make demo` and `make test`. Both make .venv once; README.md has the same steps in plain pip.
+PYTHON ?= python3
+OUT ?= outputs/demo
+
+VENV := .venv
+RUN := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+
+.PHONY: help demo test lab notebooks doctor clean
+
+help:
+	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
+	@echo "make test       unit tests, then every notebook re-executed and checked (nbval)"
+	@echo "make lab        JupyterLab on the notebooks"
+	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
+	@echo "make doctor     what is installed, what is missing, and what to do about it"
+	@echo "make clean      remove .venv, caches and outputs/"
+	@echo "PYTHON=/path/to/python3.12 make demo   chooses the interpreter (3.11 or newer)"
+
+$(STAMP): environment.txt pyproject.toml
+	@command -v "$(PYTHON)" >/dev/null || \
+	  { echo "zsp-lite needs Python 3.11 or newer; '$(PYTHON)' was not found (set PYTHON=/path/to/python3)" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "zsp-lite needs Python 3.11 or newer; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1) (set PYTHON=/path/to/python3)" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || \
+	  { echo "'$(PYTHON)' comes without venv and ensurepip; install them or set PYTHON=/path/to/python3" >&2; exit 1; }
+	@echo "Installing the pinned environment into $(VENV) (once)"
+	"$(PYTHON)" -m venv $(VENV)
+	$(RUN) -m pip install --disable-pip-version-check -r environment.txt
+	$(RUN) -m pip install --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: $(STAMP)
+	$(RUN) -m zsp_lite demo --out "$(OUT)"
+
+# One pytest run: the cells marked `# NBVAL_CHECK_OUTPUT` must reproduce their stored output, the others must run.
+test: $(STAMP)
+	$(RUN) -m pytest --nbval-lax --nbval-current-env --nbval-cell-timeout=600 --durations=10 tests $(wildcard notebooks)
+
+lab: $(STAMP)
+	$(RUN) -m jupyter lab notebooks
+
+notebooks: $(STAMP)
+	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
+
+doctor: $(STAMP)
+	$(RUN) -m zsp_lite doctor
+
+clean:
+	rm -rf $(VENV) outputs build dist .pytest_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
