@@ -1,0 +1,103 @@
+"""Depth maps: CO3D's 16-bit encoding, hole filling, and the 3D point behind each pixel or patch.
+
+A depth map is (H, W), along +z in the unit of the world; 0 means unknown.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Real, UInt16
+
+from zsp_lite.cameras import Camera
+from zsp_lite.errors import InputError
+
+
+def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
+    """Depth (float32, 0 = unknown) from a PNG's 16-bit values, whose bits are a float16 to be scaled.
+
+    What is not finite or not positive is unknown.
+    """
+    depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> UInt16[np.ndarray, "h w"]:
+    """The inverse of `decode_depth`, to float16's relative precision of 2^-11."""
+    depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
+    # Beyond float16's range (65504) a value would become infinite: unknown, as what is not finite is.
+    usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
+    return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
+
+
+def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
+    """Depth (float32) with the unknown pixels filled by OpenCV's Navier-Stokes in-painting.
+
+    `radius` is in pixels. Known pixels keep their values; filled ones stay between the smallest and largest known
+    depth. Raises InputError where no pixel is known.
+    """
+    depth = np.ascontiguousarray(depth, dtype=np.float32)
+    known = np.isfinite(depth) & (depth > 0)
+    if not known.any():
+        raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
+    if known.all():
+        return depth.copy()
+    low, high = depth[known].min(), depth[known].max()
+    filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), radius, cv2.INPAINT_NS)
+    filled = np.nan_to_num(filled, nan=low)  # the solver divides by weights that can vanish
+    return np.where(known, depth, filled.clip(low, high))
+
+
+def structured_point_cloud(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """The camera-frame point behind each pixel's centre; unknown depth (0) gives the origin."""
+    depth = np.asarray(depth, dtype=np.float64)
+    _check_size(depth, camera)
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return camera.unproject_camera(np.stack([x, y], axis=-1), depth)
+
+
+def patch_points(
+    depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int]
+) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+    """One camera-frame point per patch of a (rows, cols) grid, and whether a known depth stands behind it.
+
+    A patch's point is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
+    silhouette the nearer surface is the object, and a single stray pixel does not decide. A patch without a known
+    depth takes the in-painted depth at its central pixel. Raises InputError where the whole map is unknown, the
+    camera has another size, or the grid is finer than the image.
+    """
+    depth = np.asarray(depth, dtype=np.float32)
+    _check_size(depth, camera)
+    if not all(0 < cells <= pixels for cells, pixels in zip(grid, depth.shape)):
+        raise InputError(f"patch grid is {tuple(grid)}, expected between 1 and the image's {depth.shape}")
+    (rows, row_valid, row_middle), (cols, col_valid, col_middle) = (_bands(*pair) for pair in zip(depth.shape, grid))
+
+    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where nothing is known.
+    shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
+    pixel = np.broadcast_to(rows[:, None, :, None] * depth.shape[1] + cols[None, :, None, :], shape)
+    pixel = pixel.reshape(*shape[:2], -1)
+    valid = np.broadcast_to(row_valid[:, None, :, None] & col_valid[None, :, None, :], shape).reshape(pixel.shape)
+    values = depth.ravel()[pixel]
+    values = np.where(valid & np.isfinite(values) & (values > 0), values, np.inf)
+
+    n_known = np.isfinite(values).sum(axis=-1)
+    known = n_known > 0
+    rank = np.maximum(n_known - 1, 0) // 4
+    chosen = np.take_along_axis(np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1)
+    index = np.where(known, np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
+                     row_middle[:, None] * depth.shape[1] + col_middle)
+    filled = depth if known.all() else inpaint_depth(depth)
+    y, x = np.divmod(index, depth.shape[1])
+    return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), filled.ravel()[index]), known
+
+
+def _bands(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`count` bands over `length` pixels: pixel indices (count, widest), which are the band's own, band centres."""
+    edges = np.arange(count + 1) * length // count
+    index = edges[:-1, None] + np.arange(np.diff(edges).max())
+    valid = index < edges[1:, None]
+    return np.minimum(index, length - 1), valid, (edges[:-1] + edges[1:]) // 2
+
+
+def _check_size(depth: np.ndarray, camera: Camera) -> None:
+    if depth.shape != camera.size:
+        raise InputError(f"depth map has shape {depth.shape}, expected the camera's image size {camera.size}")

@@ -1,0 +1,184 @@
+"""One picture with all that is known about it, its object crop, and the only place that opens image files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Real, UInt8
+
+from zsp_lite.cameras import Box, Camera
+from zsp_lite.depth import decode_depth, encode_depth
+from zsp_lite.errors import InputError
+from zsp_lite.files import read_bytes, write_atomic
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image, and, where known, its depth (0 = unknown pixel), object mask (probability in [0, 1]) and name.
+
+    Depth is along +z in the unit of the camera's world. Raises InputError where the parts do not fit together or hold
+    values outside their range.
+    """
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"] | None
+    mask: Float32[np.ndarray, "h w"] | None
+    camera: Camera
+    name: str = ""
+
+    def __post_init__(self):
+        rgb = np.asarray(self.rgb)
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise InputError(f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)")
+        if rgb.shape[:2] != self.camera.size:
+            raise InputError(
+                f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's image size {self.camera.size}"
+            )
+        object.__setattr__(self, "rgb", rgb)
+        for name, top in (("depth", np.inf), ("mask", 1.0)):
+            if getattr(self, name) is None:
+                continue
+            values = np.asarray(getattr(self, name), dtype=np.float32)
+            if values.shape != rgb.shape[:2]:
+                raise InputError(f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}")
+            if not np.isfinite(values).all() or values.min() < 0 or values.max() > top:
+                expected = "values in [0, 1]" if name == "mask" else "finite values, 0 where unknown"
+                raise InputError(f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}")
+            object.__setattr__(self, name, values)
+
+    @property
+    def _label(self) -> str:
+        return f"frame {self.name}" if self.name else "frame"
+
+
+def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
+    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown and kept in the image.
+
+    Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where no pixel
+    passes, the threshold is lowered in steps of 0.05, down to "above 0". Raises InputError on an empty mask.
+    """
+    mask = np.asarray(mask)
+    if mask.ndim != 2 or not (mask > 0).any():
+        raise InputError(f"object mask of shape {mask.shape} is empty, expected (H, W) with a pixel above 0")
+    while not (inside := mask > max(threshold, 0.0)).any():
+        threshold -= 0.05
+    top, bottom = _span(inside.any(axis=1), padding)
+    left, right = _span(inside.any(axis=0), padding)
+    return top, left, bottom - top, right - left
+
+
+def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
+    """The frame cut to its object's box (see `object_box`). Raises InputError without a mask or with an empty one."""
+    if frame.mask is None:
+        raise InputError(f"{frame._label} has no object mask, expected one to crop to")
+    try:
+        return crop_frame(frame, object_box(frame.mask, threshold, padding))
+    except InputError as error:
+        raise InputError(f"{frame._label}: {error}") from error
+
+
+def crop_frame(frame: Frame, box: Box) -> Frame:
+    """The frame cut to `box`, camera included. Raises InputError where the box leaves the image."""
+    top, left, height, width = box
+    image_height, image_width = frame.camera.size
+    if min(box) < 0 or height == 0 or width == 0 or top + height > image_height or left + width > image_width:
+        raise InputError(f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}")
+    cut = np.s_[top : top + height, left : left + width]
+    return replace(
+        frame,
+        rgb=frame.rgb[cut],
+        depth=None if frame.depth is None else frame.depth[cut],
+        mask=None if frame.mask is None else frame.mask[cut],
+        camera=frame.camera.crop(box),
+    )
+
+
+def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
+    """The frame resized to (height, width), not keeping its aspect.
+
+    Colours are averaged over the area when shrinking, interpolated otherwise; depth takes the pixel under the new
+    pixel's centre, so that no depth is made up across an edge or a hole; the mask is interpolated.
+    """
+    camera = frame.camera.resize(size)
+    (height, width), (old_height, old_width) = camera.size, frame.camera.size
+    shrinks = height <= old_height and width <= old_width
+    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    depth, mask = frame.depth, frame.mask
+    if depth is not None:
+        rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
+        cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
+        depth = depth[np.ix_(rows, cols)]
+    if mask is not None:
+        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
+    return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
+    """An image file's colours, in the pixel grid as stored. Raises InputError where it is missing or corrupt."""
+    # An orientation tag would turn the picture against the camera that belongs to its stored pixels.
+    image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
+    """An 8-bit (or 1-bit) mask file as probabilities in [0, 1]. Raises InputError where missing or corrupt."""
+    return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
+
+
+def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
+    """A CO3D depth file (16-bit PNG of float16 bits) times `scale_adjustment`; 0 where unknown.
+
+    Raises InputError where the file is missing, corrupt or not 16-bit grey.
+    """
+    bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
+    if bits.dtype != np.uint16 or bits.ndim != 2:
+        raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit grey PNG")
+    return decode_depth(bits, scale_adjustment)
+
+
+def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
+    """Write colours as JPEG of the given quality (0 to 100)."""
+    _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
+    """Write probabilities in [0, 1] as 8-bit PNG."""
+    _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
+
+
+def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> None:
+    """Write depth as a 16-bit PNG whose bits are the float16 of `depth / scale_adjustment`."""
+    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
+
+
+def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
+    """Write true and false as a 1-bit PNG, which reads as 255 and 0."""
+    _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
+
+
+def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
+    """First and one past the last true index of a line, grown by `padding` in all and kept on the line."""
+    first, last = np.flatnonzero(inside)[[0, -1]]
+    margin = (last + 1 - first) * padding / 2
+    return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
+
+
+def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
+    data = read_bytes(path, what)
+    # Decoders fill what a cut-off file lacks with grey and return it: look for the format's end mark as well.
+    ends = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(data[:2], b"")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and ends in data else None
+    except cv2.error:  # a header that promises more pixels than OpenCV accepts
+        image = None
+    if image is None:
+        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG")
+    return image
+
+
+def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:
+    done, data = cv2.imencode(extension, image, options)
+    if not done:
+        raise InputError(f"image {path} of shape {image.shape} cannot be encoded as {extension}")
+    write_atomic(path, data.tobytes())
