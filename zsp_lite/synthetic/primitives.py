@@ -1,0 +1,132 @@
+"""Triangle meshes of simple solids, the letters that every procedural object is written in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+TAU = 2 * np.pi
+_PLANES = {"xz": (0, 2, 1), "xy": (0, 1, 2), "yz": (1, 2, 0)}
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh: vertices (V, 3) in object units and faces (F, 3), indices into them."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+    def moved(self, offset) -> "Mesh":
+        """The mesh shifted by `offset` (3,)."""
+        return Mesh(self.vertices + np.asarray(offset, float), self.faces)
+
+    def scaled(self, factors) -> "Mesh":
+        """The mesh stretched about the origin by `factors`, one number or (3,)."""
+        return Mesh(self.vertices * np.asarray(factors, float), self.faces)
+
+    def turned(self, axis: str, angle: float) -> "Mesh":
+        """The mesh rotated about the axis "x", "y" or "z" through the origin, `angle` in radians, right-handed."""
+        i = "xyz".index(axis)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        R = np.eye(3)
+        R[j, j] = R[k, k] = np.cos(angle)
+        R[j, k], R[k, j] = -np.sin(angle), np.sin(angle)
+        return Mesh(self.vertices @ R.T, self.faces)
+
+    def mirrored(self) -> "Mesh":
+        """The mirror image in the plane y = 0, with faces turned so that normals keep pointing outwards."""
+        return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
+
+
+def _along(vertices: np.ndarray, direction) -> np.ndarray:
+    """Vertices rotated so that their z axis points along `direction`."""
+    z = np.asarray(direction, float)
+    z = z / np.linalg.norm(z)
+    x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
+    x /= np.linalg.norm(x)
+    return vertices @ np.stack([x, np.cross(z, x), z])
+
+
+def box(size, centre=(0, 0, 0)) -> Mesh:
+    """An axis-aligned box of the given size (3,)."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    return Mesh(corners * np.asarray(size, float) + np.asarray(centre, float), np.array(faces))
+
+
+def lathe(profile, sides: int = 20) -> Mesh:
+    """The surface swept by a profile of (radius, height) points turning about z."""
+    profile = np.asarray(profile, float)
+    angle = np.linspace(0, TAU, sides, endpoint=False)
+    x, y = np.outer(profile[:, 0], np.cos(angle)), np.outer(profile[:, 0], np.sin(angle))
+    vertices = np.stack([x, y, np.repeat(profile[:, 1:], sides, 1)], -1).reshape(-1, 3)
+    ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, np.arange(sides), indexing="ij")
+    a, b = (ring + j).ravel(), (ring + (j + 1) % sides).ravel()
+    faces = np.stack([np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)], 1)
+    return Mesh(vertices, faces.reshape(-1, 3))
+
+
+def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
+    """A closed cone frustum about z, centred at the origin, with radii `bottom` and `top`."""
+    return lathe([[1e-4, -height / 2], [bottom, -height / 2], [top, height / 2], [1e-4, height / 2]], sides)
+
+
+def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18, rings: int = 12) -> Mesh:
+    """An ellipsoid with the given radii (3,)."""
+    t = np.linspace(-np.pi / 2, np.pi / 2, rings)
+    unit = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
+    return unit.scaled(radii).moved(centre)
+
+
+def rod(start, end, radius: float, end_radius: float | None = None, sides: int = 12) -> Mesh:
+    """A closed cone frustum from point `start` to point `end`."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    end_radius = radius if end_radius is None else end_radius
+    mesh = cylinder(radius, end_radius, np.linalg.norm(end - start) + 1e-9, sides)
+    return Mesh(_along(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+
+
+def capsule(start, end, radius: float, end_radius: float | None = None, sides: int = 14) -> Mesh:
+    """A rod with hemispherical ends."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    end_radius = radius if end_radius is None else end_radius
+    half = np.linalg.norm(end - start) / 2 + 1e-9
+    t = np.linspace(-np.pi / 2, 0, 5)
+    tail = [[radius * np.cos(a) + 1e-5, -half + radius * np.sin(a)] for a in t]
+    head = [[end_radius * np.cos(a) + 1e-5, half + end_radius * np.sin(a)] for a in -t[::-1]]
+    mesh = lathe(tail + head, sides)
+    return Mesh(_along(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+
+
+def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start: float = 0.0, stop: float = TAU,
+          sides: int = 24, tube_sides: int = 10) -> Mesh:  # fmt: skip
+    """A torus about `axis`, or the arc of it from angle `start` to `stop` in radians."""
+    closed = abs(stop - start - TAU) < 1e-6
+    p, q = np.meshgrid(np.linspace(start, stop, sides, endpoint=not closed),
+                       np.linspace(0, TAU, tube_sides, endpoint=False), indexing="ij")  # fmt: skip
+    reach = major + minor * np.cos(q)
+    vertices = np.stack([reach * np.cos(p), reach * np.sin(p), minor * np.sin(q)], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(sides if closed else sides - 1), np.arange(tube_sides), indexing="ij")
+    i, j, i1, j1 = i.ravel(), j.ravel(), (i.ravel() + 1) % sides, (j.ravel() + 1) % tube_sides
+    a, b, c, d = (r * tube_sides + s for r, s in ((i, j), (i, j1), (i1, j1), (i1, j)))
+    faces = np.stack([np.stack([a, c, b], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
+    return Mesh(_along(vertices, axis) + np.asarray(centre, float), faces)
+
+
+def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:
+    """An outline (n, 2), star-shaped about its mean, in the plane "xz", "xy" or "yz", made `thickness` thick.
+
+    The slab is centred at `offset` along the plane's normal.
+    """
+    outline = np.asarray(outline, float)
+    n = len(outline)
+    flat = np.concatenate([outline, [outline.mean(0)]])
+    i, k = np.arange(n), (np.arange(n) + 1) % n
+    back, front, hub = np.full(n, n), n + 1, np.full(n, 2 * n + 1)
+    faces = [[back, i, k], [hub, front + k, front + i], [i, k, front + k], [i, front + k, front + i]]
+    vertices = np.zeros((2 * n + 2, 3))
+    u, v, w = _PLANES[plane]
+    vertices[:, u], vertices[:, v] = np.tile(flat[:, 0], 2), np.tile(flat[:, 1], 2)
+    vertices[:, w] = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
+    return Mesh(vertices, np.stack([np.stack(f, 1) for f in faces], 1).reshape(-1, 3))

@@ -1,0 +1,1 @@
+"""Training the embedded backbone on renders of the training categories."""

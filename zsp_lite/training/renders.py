@@ -1,0 +1,105 @@
+"""The training set: several views of one object at a time, with what a renderer knows about each."""
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from zsp_lite.synthetic.appearance import random_appearance
+from zsp_lite.synthetic.assembly import deform, make_shape
+from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
+from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
+
+VIEWS = 6
+SIZE = 192
+GRID = 48
+SHARD = 200
+
+
+@dataclass(frozen=True)
+class RenderSet:
+    """Views of n objects.
+
+    `surface` holds the object coordinates of every fourth pixel, NaN on the background: two views of ONE object
+    correspond where these agree. They are never compared between objects. `geometry` holds the normal in the camera
+    frame and the depth, standardised over the object's pixels of that view.
+    """
+
+    rgb: UInt8[np.ndarray, "n views size size 3"]
+    surface: Float[np.ndarray, "n views grid grid 3"]
+    geometry: Float[np.ndarray, "n views grid grid 4"]
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+
+def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render one training object; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
+
+    Half of the objects come from the named training categories, half are random assemblies. Views come in three pairs
+    around the object; every view shows a gently deformed copy under its own materials, light and room, so that only
+    what is shared by all views, the object's structure, can tell one place from another.
+    """
+    rng = np.random.default_rng([seed, 0])
+    generators = list(TRAINING.values()) if generators is None else generators
+    generator = generators[rng.integers(len(generators))] if rng.random() < 0.5 else random_assembly
+    shape = make_shape(generator, [seed, 1])
+    start = rng.uniform(0, 2 * np.pi)
+    rgb = np.empty((VIEWS, SIZE, SIZE, 3), np.uint8)
+    surface = np.empty((VIEWS, GRID, GRID, 3), np.float16)
+    geometry = np.empty((VIEWS, GRID, GRID, 4), np.float16)
+    step = SIZE // GRID
+    for view in range(VIEWS):
+        if view % 2 == 0:
+            azimuth = start + (view // 2) * 2 * np.pi / 3 + rng.normal(0, 0.3)
+            elevation = rng.uniform(-0.05, 0.9)
+        scene = Scene(shape, deform(shape, rng))
+        R, t = orbit_pose(
+            azimuth + rng.normal(0, 0.2), np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
+            rng.uniform(5, 10), scene.centre,
+        )  # fmt: skip
+        camera = framed_camera(scene.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
+        image = scene.render(camera, random_appearance(rng), rng, shadows=rng.random() < 0.6)
+        every = (slice(step // 2, None, step),) * 2
+        depth, mask = image.depth[every], image.mask[every]
+        spread = max(float(depth[mask].std()), 1e-6)
+        rgb[view], surface[view] = image.rgb, image.canonical[every]
+        geometry[view, ..., :3] = image.normals[every]
+        geometry[view, ..., 3] = np.where(mask, (depth - depth[mask].mean()) / spread, 0)
+    return rgb, surface, geometry
+
+
+def _render_shard(index: int, folder: Path, seed: int) -> Path:
+    path = folder / f"objects-{seed}-{index:04d}.npz"
+    if not path.exists():
+        rows = [render_object(seed * 10_000_000 + index * SHARD + i) for i in range(SHARD)]
+        rgb, surface, geometry = (np.stack(column) for column in zip(*rows, strict=True))
+        partial_path = path.with_suffix(".part.npz")
+        np.savez(partial_path, rgb=rgb, surface=surface, geometry=geometry)
+        partial_path.rename(path)
+    return path
+
+
+def render_set(folder: Path, objects: int, seed: int = 0, workers: int = 2, progress=lambda iterable, total: iterable):
+    """Render `objects` objects (rounded up to whole shards of 200) into `folder`, or reuse what is there.
+
+    Returns the shard paths; a killed run continues with the first missing shard.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    shards = range(-(-objects // SHARD))
+    with ProcessPoolExecutor(workers) as pool:
+        return list(progress(pool.map(partial(_render_shard, folder=folder, seed=seed), shards), len(shards)))
+
+
+def load_render_set(paths: list[Path]) -> RenderSet:
+    """Read shards into memory: about 0.7 MB per object."""
+    names = ("rgb", "surface", "geometry")
+    shards = []
+    for path in paths:
+        with np.load(path) as file:
+            shards.append([file[name] for name in names])
+    return RenderSet(*(np.concatenate(column) for column in zip(*shards, strict=True)))
