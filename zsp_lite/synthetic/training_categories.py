@@ -20,7 +20,7 @@ def teapot(a: Assembly) -> None:
     a.add(ellipsoid((r * 0.5, r * 0.5, 0.12), (0, 0, h)), 1)
     a.add(ellipsoid((0.09, 0.09, 0.1), (0, 0, h + 0.15)), 2)
     a.add(rod((r * 0.75, 0, h * 0.35), (r * 1.25, 0, h * a.u(0.7, 1.1)), 0.14, 0.06), 0)
-    handle = torus(h * a.u(0.25, 0.35), a.u(0.04, 0.07), (0, 1, 0), (-r * 0.9, 0, h * 0.5), 0.4 * PI, 1.6 * PI)
+    handle = torus(h * a.u(0.25, 0.35), a.u(0.04, 0.07), (0, 1, 0), (-r * 0.9, 0, h * 0.5), 1.05 * PI, 1.95 * PI)
     a.add(handle, 2)
 
 
@@ -177,7 +177,7 @@ def faucet(a: Assembly) -> None:
     a.add(cylinder(0.3, 0.25, 0.12), 0)
     a.add(rod((0, 0, 0), (0, 0, h), a.u(0.08, 0.14)), 0)
     arched = a.chance(0.5)
-    spout = torus(r, 0.08, (0, 1, 0), (r, 0, h), -PI, 0) if arched else rod((0, 0, h), (2 * r, 0, h + 0.1), 0.09, 0.07)
+    spout = torus(r, 0.08, (0, 1, 0), (r, 0, h), -PI / 2, PI / 2) if arched else rod((0, 0, h), (2 * r, 0, h + 0.1), 0.09, 0.07)
     a.add(spout, 0)
     a.add(rod((0, 0.05, h * 0.5), (0, a.u(0.25, 0.4), h * 0.5), 0.06), 1)
     a.add(rod((0, 0.3, h * 0.5), (0.05, 0.35, h * 0.5 + a.u(0.2, 0.4)), 0.05), 2)
