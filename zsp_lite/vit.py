@@ -110,7 +110,7 @@ class Block(nn.Module):
         return self.finish(x, self.attn(q, k, v))
 
     def forward_cls(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor]:
-        """The CLS token's part of the block: CLS (batch, 1, dim), keys (batch, n, dim), logits (batch, heads, n).
+        """The block as seen by CLS: CLS (batch, 1, dim), keys (batch, n, dim), logits (batch, heads, n).
 
         One query instead of n: queries, attention, projection and MLP of the patches are never computed.
         """
@@ -143,7 +143,12 @@ class VisionTransformer(nn.Module):
     """
 
     def __init__(
-        self, image_size: int = 224, patch_size: int = 8, embed_dim: int = 384, depth: int = 12, num_heads: int = 6
+        self,
+        image_size: int = 224,
+        patch_size: int = 8,
+        embed_dim: int = 384,
+        depth: int = 12,
+        num_heads: int = 6,
     ):
         super().__init__()
         if min(image_size, patch_size, embed_dim, depth, num_heads) < 1 or image_size % patch_size:
@@ -152,7 +157,7 @@ class VisionTransformer(nn.Module):
                 f"image_size {image_size}, patch_size {patch_size}, depth {depth}"
             )
         if embed_dim % num_heads:
-            raise InputError(f"VisionTransformer: embed_dim {embed_dim} is no multiple of num_heads {num_heads}")
+            raise InputError(f"VisionTransformer: embed_dim {embed_dim} is no multiple of {num_heads} heads")
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))
@@ -183,7 +188,9 @@ class VisionTransformer(nn.Module):
         """Input of the first block (batch, 1 + n, dim) and the patch grid."""
         p = self.patch_size
         if images.ndim != 4 or images.shape[1] != 3 or any(side < p or side % p for side in images.shape[2:]):
-            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}")
+            raise InputError(
+                f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}"
+            )
         grid = (images.shape[2] // p, images.shape[3] // p)
         patches = self.patch_embed(images)
         x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
@@ -197,7 +204,7 @@ class VisionTransformer(nn.Module):
         return self.norm(x)
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9) -> Tokens:
-        """Keys of block `key_block` (0-based), CLS attention of the last block, CLS output, in one forward."""
+        """Keys of block `key_block` (0-based), last CLS attention and CLS output, in one forward."""
         key_block = self._checked(key_block)
         x, grid = self.embed(images)
         for index, block in enumerate(self.blocks[:-1]):
@@ -210,8 +217,10 @@ class VisionTransformer(nn.Module):
             keys = last_keys[:, 1:]
         return Tokens(keys, logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
 
-    def forward_training(self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9) -> TrainingTokens:
-        """All output tokens, the keys of block `key_block` and the last block's CLS logits, with gradients."""
+    def forward_training(
+        self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9
+    ) -> TrainingTokens:
+        """All output tokens, keys of block `key_block` and the last block's CLS logits, with gradients."""
         key_block = self._checked(key_block)
         x, grid = self.embed(images)
         for index, block in enumerate(self.blocks):
