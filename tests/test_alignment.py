@@ -1,0 +1,267 @@
+"""Umeyama and RANSAC: recovery, equivariance, reflections, degenerate input."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsp_lite.alignment import Sim3, _draw_samples, ransac, umeyama
+from zsp_lite.errors import InputError
+
+seeds = st.integers(0, 2**32 - 1)
+scales = st.floats(0.3, 4.0)
+
+
+def rotation(seed: int) -> np.ndarray:
+    """A uniformly random rotation, through a unit quaternion."""
+    w, x, y, z = (q := np.random.default_rng(seed).normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def similarity(seed: int, scale: float = 1.3) -> Sim3:
+    return Sim3(scale, rotation(seed), np.random.default_rng(seed + 1).normal(size=3) * 3)
+
+
+def cloud(seed: int, n: int = 20) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(n, 3)) * (1.0, 0.7, 0.4)
+
+
+def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
+    np.testing.assert_allclose(first.matrix, second.matrix, atol=atol)
+
+
+# Sim3
+
+
+@given(seeds, scales)
+def test_a_similarity_after_its_inverse_moves_nothing(seed, scale):
+    sim3 = similarity(seed, scale)
+    assert_same(sim3 @ sim3.inverse(), Sim3.identity())
+    assert_same(sim3.inverse() @ sim3, Sim3.identity())
+
+
+@given(seeds, scales)
+def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
+    a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
+    np.testing.assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
+    np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
+    homogeneous = np.c_[points, np.ones(len(points))] @ a.matrix.T
+    np.testing.assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scale", "R", "t"),
+    [
+        (0.0, np.eye(3), np.zeros(3)),
+        (np.nan, np.eye(3), np.zeros(3)),
+        (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
+        (1.0, 2 * np.eye(3), np.zeros(3)),
+        (1.0, np.eye(4), np.zeros(3)),
+        (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
+    ],
+)
+def test_what_is_no_similarity_is_refused(scale, R, t):
+    with pytest.raises(InputError):
+        Sim3(scale, R, t)
+
+
+# Umeyama
+
+
+@given(seeds, scales, st.integers(4, 40))
+def test_umeyama_recovers_the_similarity_that_made_the_target(seed, scale, n):
+    truth, source = similarity(seed, scale), cloud(seed + 2, n)
+    assert_same(umeyama(source, truth.apply(source)), truth, atol=1e-7)
+
+
+def test_umeyama_agrees_with_a_case_worked_out_by_hand():
+    # A unit square in z = 0, turned by 90 degrees about z, doubled, shifted by (1, 2, 3).
+    source = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    target = [[1, 2, 3], [1, 4, 3], [-1, 4, 3], [-1, 2, 3]]
+    sim3 = umeyama(source, target)
+    assert sim3.scale == pytest.approx(2)
+    np.testing.assert_allclose(sim3.R, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(sim3.t, [1, 2, 3], atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(seeds, scales)
+def test_umeyama_is_equivariant_under_similarities_of_source_and_target(seed, scale):
+    source, a, b = cloud(seed), similarity(seed + 3, scale), similarity(seed + 5)
+    target = cloud(seed) + 0.1 * cloud(seed + 1)
+    plain = umeyama(source, target)
+    # Moving the target composes; the least-squares scale is exactly equivariant in both arguments.
+    assert_same(umeyama(source, b.apply(target)), b @ plain, atol=1e-7)
+    assert_same(umeyama(a.apply(source), target), plain @ a.inverse(), atol=1e-7)
+
+
+@settings(max_examples=30)
+@given(seeds)
+def test_no_nearby_similarity_fits_better(seed):
+    rng = np.random.default_rng(seed)
+    source, target = cloud(seed), similarity(seed).apply(cloud(seed)) + 0.2 * rng.normal(size=(20, 3))
+    best = umeyama(source, target)
+    cost = np.square(best.apply(source) - target).sum()
+    for _ in range(20):
+        angle, axis = 1e-2 * rng.normal(), np.eye(3)[rng.integers(3)]
+        cross = np.cross(np.eye(3), axis)
+        nudge = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        near = Sim3(best.scale * (1 + 1e-2 * rng.normal()), nudge @ best.R, best.t + 1e-2 * rng.normal(size=3))
+        assert np.square(near.apply(source) - target).sum() >= cost
+
+
+@given(seeds)
+def test_a_mirrored_target_gets_a_rotation_and_not_a_reflection(seed):
+    source = cloud(seed)
+    mirrored = source * (1, 1, -1)
+    sim3 = umeyama(source, mirrored)
+    assert np.linalg.det(sim3.R) == pytest.approx(1)
+    # The thinnest axis is the one a mirror is cheapest to forgo: the identity is close to the best rotation.
+    assert np.square(sim3.apply(source) - mirrored).sum() <= np.square(source - mirrored).sum() + 1e-9
+
+
+@given(seeds)
+def test_points_in_a_plane_suffice(seed):
+    flat = cloud(seed, 10) * (1, 1, 0)
+    truth = similarity(seed)
+    assert_same(umeyama(flat, truth.apply(flat)), truth, atol=1e-6)
+
+
+def test_without_scale_the_scale_is_one():
+    source, truth = cloud(0), similarity(1, 1.0)
+    assert_same(umeyama(source, truth.apply(source), with_scale=False), truth)
+    assert umeyama(source, 3 * source, with_scale=False).scale == 1
+
+
+def test_torch_tensors_give_the_same_as_numpy_arrays():
+    source, target = cloud(0), similarity(1).apply(cloud(0))
+    assert_same(umeyama(torch.as_tensor(source), torch.as_tensor(target)), umeyama(source, target))
+
+
+line = np.linspace(0, 1, 8)[:, None] * (1.0, 2.0, 3.0)
+not_finite = cloud(0).copy()
+not_finite[3, 1] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        (cloud(0, 2), cloud(0, 2)),
+        (line, line),
+        (np.ones((5, 3)), np.ones((5, 3))),
+        (cloud(0, 8), line),
+        (cloud(0), np.ones((20, 3))),
+        (not_finite, cloud(0)),
+        (cloud(0), not_finite),
+        (cloud(0, 5), cloud(0, 6)),
+        (cloud(0)[:, :2], cloud(0)[:, :2]),
+    ],
+    ids=["two", "collinear", "equal", "target line", "target point", "nan", "nan target", "lengths", "flat"],
+)
+@pytest.mark.parametrize("solver", [umeyama, ransac])
+def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, source, target):
+    with pytest.raises(InputError) as error:
+        solver(source, target)
+    assert "\n" not in str(error.value)
+
+
+# RANSAC
+
+
+def contaminated(seed: int, outliers: float = 0.6, n: int = 50) -> tuple[np.ndarray, np.ndarray, Sim3, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    source, truth = rng.normal(size=(n, 3)), similarity(seed, 1.2)
+    target = truth.apply(source) + 0.01 * rng.normal(size=(n, 3))
+    wrong = rng.permutation(n) < outliers * n
+    target[wrong] = truth.t + 2 * rng.normal(size=(wrong.sum(), 3))
+    return source, target, truth, ~wrong
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds)
+def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
+    source, target, truth, right = contaminated(seed)
+    sim3, inliers = ransac(source, target, seed=seed)
+    assert inliers[right].mean() > 0.9
+    np.testing.assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
+
+
+def test_the_result_is_the_fit_on_the_inliers():
+    source, target, _, _ = contaminated(3)
+    sim3, inliers = ransac(source, target)
+    assert_same(sim3, umeyama(source[inliers], target[inliers]))
+
+
+def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
+    source, target, _, _ = contaminated(4, outliers=0.8)
+    first, second = ransac(source, target, seed=5), ransac(source, target, seed=np.random.default_rng(5))
+    assert_same(first[0], second[0], atol=0)
+    assert (first[1] == second[1]).all()
+
+
+def test_ransac_agrees_with_a_loop_over_its_trials():
+    source, target, _, _ = contaminated(6)
+    _, inliers = ransac(source, target, seed=11, trials=200)
+    best, leader = (-1, 0.0), None
+    for sample in _draw_samples(len(source), 4, 200, np.random.default_rng(11)):
+        sim3 = umeyama(source[sample], target[sample])
+        if 0.2 <= sim3.scale <= 5:
+            residual = np.linalg.norm(sim3.apply(source) - target, axis=1)
+            inside = residual < 0.2
+            if (inside.sum(), -residual[inside].sum()) > best:
+                best, leader = (inside.sum(), -residual[inside].sum()), inside
+    assert (inliers == leader).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.floats(0.5, 2.0))
+def test_ransac_is_equivariant_when_the_threshold_scales_along(seed, scale):
+    source, target, _, _ = contaminated(seed)
+    moved = similarity(seed + 1, scale)
+    plain, inliers = ransac(source, target, seed=1, scale_range=(1e-3, 1e3))
+    other, same = ransac(source, moved.apply(target), 0.2 * scale, seed=1, scale_range=(1e-3, 1e3))
+    assert (inliers == same).all()
+    assert_same(other, moved @ plain, atol=1e-6)
+
+
+def test_scales_out_of_range_are_not_considered():
+    source = cloud(0)
+    with pytest.raises(InputError, match="scale"):
+        ransac(source, 10 * source)
+    assert ransac(source, 10 * source, scale_range=(1, 20))[0].scale == pytest.approx(10)
+
+
+def test_fewer_points_than_a_sample_are_refused():
+    with pytest.raises(InputError, match="at least 4"):
+        ransac(cloud(0, 3), cloud(0, 3))
+    with pytest.raises(InputError, match="threshold"):
+        ransac(cloud(0), cloud(0), threshold=0)
+
+
+def test_a_hopeless_set_still_gives_a_similarity_and_few_inliers():
+    rng = np.random.default_rng(0)
+    sim3, inliers = ransac(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
+    assert np.linalg.det(sim3.R) == pytest.approx(1)
+    assert inliers.sum() < 12
+
+
+@given(seeds, st.integers(4, 30), st.integers(3, 4))
+def test_samples_hold_different_indices_below_n(seed, n, size):
+    samples = _draw_samples(n, size, 50, np.random.default_rng(seed))
+    assert samples.min() >= 0 and samples.max() < n
+    assert all(len(set(sample)) == size for sample in samples.tolist())
+
+
+def test_every_sample_is_equally_likely():
+    samples = np.sort(_draw_samples(5, 3, 100_000, np.random.default_rng(0)), axis=1)
+    _, counts = np.unique(samples, axis=0, return_counts=True)
+    assert len(counts) == 10
+    # 10 subsets of 100,000 draws: standard deviation sqrt(1e5 * 0.1 * 0.9) = 95.
+    assert np.abs(counts - 10_000).max() < 5 * 95
