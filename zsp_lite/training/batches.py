@@ -1,0 +1,96 @@
+"""Training batches: random crops, flips and colours of rendered views, with the geometry that goes with them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet
+
+# The trainer's own input scaling; `export_checkpoint` folds it into the patch embedding, so that the shipped
+# checkpoint expects ImageNet statistics like any DINO model.
+MEAN, STD = 0.45, 0.25
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Crops of `objects` objects x `views` views, objects outermost; n patches per crop in row-major order."""
+
+    images: Float[Tensor, "crops 3 side side"]
+    surface: Float[Tensor, "crops n 3"]  # object coordinates at each patch, NaN on the background
+    geometry: Float[Tensor, "crops n 4"]  # camera-frame normal and standardised depth
+    coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
+    objects: int
+
+
+def _crop_grids(rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]):
+    """Sampling grids (n, side, side, 2) of random, slightly turned crops, and the flips (n,), one per object."""
+    size = rng.uniform(*scale, n)
+    ratio = np.exp(rng.uniform(-0.25, 0.25, n))
+    width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
+    angle = rng.normal(0, 0.12, n)
+    x, y = (rng.uniform(-1, 1, n) * (1 - extent) * 0.9 for extent in (width, height))
+    flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
+    c, s = np.cos(angle), np.sin(angle)
+    affine = np.stack([
+        np.stack([width * c * flip, -width * s, x], 1),
+        np.stack([height * s * flip, height * c, y], 1),
+    ], 1).astype(np.float32)  # fmt: skip
+    grid = F.affine_grid(torch.from_numpy(affine), (n, 1, side, side), align_corners=False)
+    return grid, torch.from_numpy(flip.astype(np.float32))
+
+
+def _recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Random brightness, contrast and saturation; some images grey, some blurred; scaled for the network."""
+    n = len(x)
+
+    def draw(low, high):
+        return torch.from_numpy(rng.uniform(low, high, (n, 1, 1, 1)).astype(np.float32))
+
+    x = x * draw(0.7, 1.3)
+    mean = x.mean((2, 3), keepdim=True)
+    x = (x - mean) * draw(0.7, 1.3) + mean
+    grey = x.mean(1, keepdim=True)
+    saturation = draw(0.3, 1.4) * torch.from_numpy((rng.random((n, 1, 1, 1)) > 0.2).astype(np.float32))
+    x = grey + (x - grey) * saturation
+    blurred = torch.from_numpy(rng.random(n) < 0.3)
+    x[blurred] = F.avg_pool2d(F.pad(x[blurred], (1, 1, 1, 1), mode="replicate"), 3, 1)
+    return ((x - MEAN) / STD).contiguous()
+
+
+def sample_batch(renders: RenderSet, rng: np.random.Generator, objects: int, views: int, side: int,
+                 scale: tuple[float, float], patch_size: int = 8, members: np.ndarray | None = None) -> Batch:  # fmt: skip
+    """Draw a batch of square crops of `side` pixels whose width is a fraction `scale` (low, high) of the render's.
+
+    views is 6, all of them, or 2, a pair from one side of the object. `members` fixes the objects by index.
+    """
+    index = rng.integers(0, len(renders), objects) if members is None else members
+    chosen = np.arange(VIEWS)[None].repeat(objects, 0)
+    if views == 2:
+        chosen = 2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(2)
+    pick = (index[:, None], chosen)
+    rgb = torch.from_numpy(renders.rgb[pick].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2).float() / 255
+    maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
+            for m in (renders.surface, renders.geometry)]  # fmt: skip
+    n, patches = objects * views, side // patch_size
+    grid, flip = _crop_grids(rng, n, views, side, scale)
+    images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
+
+    def at(resolution):
+        return F.interpolate(grid.permute(0, 3, 1, 2), (resolution,) * 2, mode="area").permute(0, 2, 3, 1)
+
+    def sample(values, where):
+        return F.grid_sample(values, where, mode="nearest", padding_mode="border", align_corners=False)
+
+    surface, geometry = maps
+    on_object = (~surface[:, :1].isnan()).float()
+    coverage = F.avg_pool2d(sample(on_object, at(2 * patches)), 2).flatten(1)
+    centres = at(patches)
+    surface = sample(surface.nan_to_num(nan=-99.0), centres).flatten(2).transpose(1, 2)
+    surface[surface < -50] = float("nan")
+    geometry = sample(geometry, centres).flatten(2).transpose(1, 2)
+    geometry[..., 0] *= flip[:, None]
+    return Batch(_recolour(rng, images), surface, geometry, coverage, objects)

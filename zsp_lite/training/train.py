@@ -1,0 +1,303 @@
+"""Train the embedded backbone from random weights: stages from small crops and geometry to full size.
+
+The recipe, in the order of the stages: first the patch tokens learn geometry, for correspondence alone drowns in
+its own gradient noise when it starts from nothing; then correspondence takes over at 96 px, where crops are
+cheap; last come larger crops, up to the size that the method uses. An exponential average of the weights is what is
+evaluated and exported.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from zsp_lite.errors import InputError
+from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
+from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss
+from zsp_lite.training.renders import SHARD, RenderSet, load_render_set, render_set
+from zsp_lite.vit import TrainingTokens, VisionTransformer
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stretch of training: crops of `side` pixels, `objects` x `views` of them a step.
+
+    `correspondence` is the weight of that loss at the stage's start and end, `helpers` that of the other two.
+    """
+
+    steps: int
+    side: int
+    objects: int
+    views: int
+    scale: tuple[float, float]
+    correspondence: tuple[float, float] = (1.0, 1.0)
+    helpers: float = 0.4
+    radius: float = 0.15
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything that decides the result; `seed` fixes objects, crops and initial weights."""
+
+    seed: int = 0
+    objects: int = 7000
+    embed_dim: int = 192
+    depth: int = 12
+    num_heads: int = 6
+    key_block: int = 9
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.05
+    temperature: float = 0.1
+    queries: int = 256
+    average: float = 0.998
+    stages: tuple[Stage, ...] = (
+        Stage(1200, 96, 8, 2, (0.4, 1.0), correspondence=(0.1, 0.1), helpers=1.0),
+        Stage(700, 96, 4, 6, (0.4, 1.0), correspondence=(0.1, 1.0), helpers=1.0),
+        Stage(3000, 96, 4, 6, (0.4, 1.0)),
+        Stage(1300, 128, 4, 6, (0.5, 1.0)),
+        Stage(500, 184, 2, 6, (0.75, 1.0), radius=0.12),
+        Stage(250, 224, 2, 6, (0.85, 1.0), radius=0.12),
+    )
+
+    @property
+    def steps(self) -> int:
+        return sum(stage.steps for stage in self.stages)
+
+    def shortened(self, factor: float) -> "TrainingConfig":
+        """The same recipe with every stage's steps multiplied by `factor`."""
+        return replace(self, stages=tuple(replace(s, steps=max(1, round(s.steps * factor))) for s in self.stages))
+
+
+class Trainee(nn.Module):
+    """The backbone with the two linear read-outs that only training uses, and the running mean of its keys."""
+
+    def __init__(self, config: TrainingConfig):
+        super().__init__()
+        self.key_block = config.key_block
+        self.backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
+        self.geometry_of_tokens = nn.Linear(config.embed_dim, 5)
+        self.geometry_of_keys = nn.Linear(config.embed_dim, 5)
+        self.register_buffer("key_mean", torch.zeros(config.embed_dim))
+
+    def forward(self, images: Tensor) -> TrainingTokens:
+        return self.backbone.forward_training(images, self.key_block)
+
+    def descriptors(self, keys: Tensor, update_mean: bool = False) -> Tensor:
+        """Unit keys about their running mean; `export_checkpoint` subtracts the mean through the key bias."""
+        keys = keys.float()
+        if update_mean:
+            mean = keys.detach().mean((0, 1))
+            self.key_mean.copy_(mean if not self.key_mean.any() else 0.95 * self.key_mean + 0.05 * mean)
+        return F.normalize(keys - self.key_mean, dim=-1)
+
+
+def initialise(model: Trainee, renders: RenderSet, seed: int) -> None:
+    """Start values: scaled residual branches, sine-cosine positions, a damped-whitening patch embedding.
+
+    A random linear patch embedding passes little but mean brightness on; whitening the training patches (damped, so
+    that noise is not blown up) starts with all of their contrast, and stays one linear convolution.
+    """
+    backbone, dim = model.backbone, model.backbone.embed_dim
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, module in backbone.named_modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight, generator=generator)
+                if name.endswith(("proj", "fc2")):
+                    module.weight *= 1.5 * (2 * backbone.depth) ** -0.5
+        nn.init.normal_(backbone.cls_token, std=0.02, generator=generator)
+        backbone.pos_embed.zero_()
+        backbone.pos_embed[0, 1:] = 0.25 * _sincos(dim, backbone.image_size // backbone.patch_size)
+        rng = np.random.default_rng([seed, 1])
+        images = torch.cat([sample_batch(renders, rng, 20, 6, 96, (0.4, 1.0)).images for _ in range(4)])
+        p = backbone.patch_size
+        patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
+        patches = patches - patches.mean(0)
+        variance, axes = torch.linalg.eigh(patches.T @ patches / len(patches))
+        kept = min(dim, len(variance))
+        whiten = (axes[:, -kept:] / (variance[-kept:] + 0.02).sqrt()).T
+        mixing = torch.linalg.qr(torch.randn(dim, dim, generator=generator))[0][:, :kept]
+        backbone.patch_embed.proj.weight.copy_((0.5 * mixing @ whiten).view(dim, 3, p, p))
+        backbone.patch_embed.proj.bias.zero_()
+
+
+def _sincos(dim: int, side: int, span: float = 12.0) -> Tensor:
+    """Sine-cosine position embedding (side * side, dim) of a grid."""
+    centre = (torch.arange(side) + 0.5) / side * span
+    wave = torch.exp(-math.log(60) * torch.arange(dim // 4) / (dim // 4))
+    y, x = torch.meshgrid(centre, centre, indexing="ij")
+    return torch.cat([f(p[..., None] * wave) for p in (y, x) for f in (torch.sin, torch.cos)], -1).flatten(0, 1)
+
+
+def losses(model: Trainee, batch: Batch, stage: Stage, weight: float, config: TrainingConfig,
+           generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
+    """The weighted sum of the three objectives on one batch, and the figures worth logging."""
+    device = batch.images.device.type
+    with torch.autocast(device, torch.bfloat16):
+        out = model(batch.images)
+    on_object = ~batch.surface[..., 0].isnan()
+    geometry = 0.5 * sum(
+        geometry_loss(head(features.float()), batch.geometry, on_object)
+        for head, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input))
+    )
+    attention, iou = attention_loss(out.cls_logits.float(), batch.coverage)
+    match, accuracy = correspondence_loss(
+        model.descriptors(out.keys, update_mean=True), batch.surface, batch.objects, stage.radius, config.temperature,
+        config.queries, generator,
+    )  # fmt: skip
+    total = weight * match + stage.helpers * (geometry + attention)
+    figures = dict(loss=total, match=match, geometry=geometry, attention=attention)
+    return total, {name: float(value) for name, value in figures.items()} | dict(accuracy=accuracy, iou=iou)
+
+
+@torch.no_grad()
+def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 184, objects: int = 40) -> dict[str, float]:
+    """Match accuracy and saliency IoU on TRAINING-category objects that no step has seen; same crops every time."""
+    rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)
+    hits, ious = [], []
+    device = next(model.parameters()).device
+    for first in range(0, min(objects, len(renders)), 2):
+        members = np.arange(first, min(first + 2, len(renders)))
+        batch = _to(sample_batch(renders, rng, len(members), 6, side, (0.85, 1.0), members=members), device)
+        with torch.autocast(device.type, torch.bfloat16):
+            out = model(batch.images)
+        hits.append(correspondence_loss(model.descriptors(out.keys), batch.surface, len(members), 0.15, 0.1, 256, generator)[1])
+        ious.append(attention_loss(out.cls_logits.float(), batch.coverage)[1])
+    return dict(held_out_accuracy=float(np.mean(hits)), held_out_iou=float(np.mean(ious)))
+
+
+def _to(batch: Batch, device) -> Batch:
+    return replace(batch, **{name: getattr(batch, name).to(device) for name in ("images", "surface", "geometry", "coverage")})
+
+
+def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
+    """Warm-up over 150 steps, constant for a third of the run, then a cosine to 1 %; less for large crops."""
+    progress = max(0.0, (step / config.steps - 0.35) / 0.65)
+    decay = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
+    return config.learning_rate * min(1, (step + 1) / 150) * decay * (0.7 if side > 128 else 1.0)
+
+
+def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
+          checkpoint_every: int = 250, log_every: int = 50) -> Path:  # fmt: skip
+    """Train from scratch, or resume from `folder`/checkpoint.pt, and export `folder`/zsp-tiny.safetensors.
+
+    folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights; `renders`
+    is where the training set is kept or made (default `folder`/renders). The checkpoint holds model, average, optimiser
+    and step; batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
+    Raises InputError when `folder` holds a run of another configuration.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = json.loads(json.dumps(asdict(config)))
+    config_file, checkpoint_file = folder / "config.json", folder / "checkpoint.pt"
+    if config_file.exists() and json.loads(config_file.read_text()) != settings:
+        raise InputError(f"{config_file}: holds a run of another configuration; expected a new folder for this one")
+    config_file.write_text(json.dumps(settings, indent=1) + "\n")
+    shards = render_set(renders or folder / "renders", config.objects, config.seed)
+    training, held_out = load_render_set(shards[:-1]), load_render_set(shards[-1:])
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    torch.manual_seed(config.seed)
+    model = Trainee(config)
+    initialise(model, training, config.seed)
+    model.to(device)
+    average = Trainee(config).to(device)
+    average.load_state_dict(model.state_dict())
+    optimiser = _optimiser(model, config)
+    step = 0
+    if checkpoint_file.exists():
+        state = torch.load(checkpoint_file, map_location=device, weights_only=True)
+        model.load_state_dict(state["model"])
+        average.load_state_dict(state["average"])
+        optimiser.load_state_dict(state["optimiser"])
+        step = state["step"]
+    start, smooth = time.monotonic(), {}
+    log_file = (folder / "log.jsonl").open("a")
+    ends = np.cumsum([stage.steps for stage in config.stages])
+    while step < config.steps:
+        k = int(np.searchsorted(ends, step, side="right"))
+        stage = config.stages[k]
+        through = (step - (ends[k] - stage.steps)) / stage.steps
+        weight = stage.correspondence[0] + through * (stage.correspondence[1] - stage.correspondence[0])
+        rng = np.random.default_rng([config.seed, 2, step])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        batch = _to(sample_batch(training, rng, stage.objects, stage.views, stage.side, stage.scale), device)
+        for group in optimiser.param_groups:
+            group["lr"] = _learning_rate(config, step, stage.side)
+        loss, figures = losses(model, batch, stage, weight, config, generator)
+        optimiser.zero_grad()
+        loss.backward()
+        norm = float(nn.utils.clip_grad_norm_(model.parameters(), 1.0))
+        if math.isfinite(norm):
+            optimiser.step()
+        _update_average(average, model, min(config.average, (1 + step) / (10 + step)))
+        step += 1
+        for name, value in (figures | dict(gradient=norm)).items():
+            smooth[name] = 0.95 * smooth.get(name, value) + 0.05 * value
+        if step % log_every == 0 or step == config.steps:
+            row = dict(step=step, seconds=round(time.monotonic() - start), side=stage.side, weight=round(weight, 3))
+            row |= {name: round(value, 4) for name, value in smooth.items()}
+            if step % (5 * log_every) == 0 or step == config.steps:
+                row |= {name: round(value, 4) for name, value in held_out_accuracy(average, held_out).items()}
+            log_file.write(json.dumps(row) + "\n")
+            log_file.flush()
+            log("  ".join(f"{name} {value}" for name, value in row.items()))
+        if step % checkpoint_every == 0 or step == config.steps:
+            state = dict(model=model.state_dict(), average=average.state_dict(), optimiser=optimiser.state_dict(), step=step)
+            torch.save(state, checkpoint_file.with_suffix(".part"))
+            checkpoint_file.with_suffix(".part").replace(checkpoint_file)
+    return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
+
+
+def _optimiser(model: Trainee, config: TrainingConfig) -> torch.optim.Optimizer:
+    """AdamW; no weight decay on biases, norms and embeddings."""
+    plain = [p for name, p in model.named_parameters() if p.ndim <= 1 or name.endswith(("pos_embed", "cls_token"))]
+    chosen = {id(p) for p in plain}
+    decayed = [p for p in model.parameters() if id(p) not in chosen]
+    groups = [dict(params=decayed, weight_decay=config.weight_decay), dict(params=plain, weight_decay=0.0)]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98), fused=True)
+
+
+@torch.no_grad()
+def _update_average(average: Trainee, model: Trainee, decay: float) -> None:
+    mine, theirs = list(average.parameters()), list(model.parameters())
+    torch._foreach_lerp_(mine, theirs, 1 - decay)
+    average.key_mean.copy_(model.key_mean)
+
+
+@torch.no_grad()
+def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig, path: Path) -> Path:
+    """Write the backbone as float16 safetensors that any DINO code loads, and return the path.
+
+    Two exact changes: the mean key of every block is folded into its key bias (softmax attention does not see a constant
+    added to all keys, and cosine similarity of the keys becomes meaningful), and the trainer's input scaling is folded
+    into the patch embedding, so that the model expects ImageNet statistics.
+    """
+    backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
+    backbone.load_state_dict(model.backbone.state_dict())
+    rgb = torch.from_numpy(renders.rgb[: min(24, SHARD), ::3].reshape(-1, *renders.rgb.shape[2:])).permute(0, 3, 1, 2)
+    images = (F.interpolate(rgb.float() / 255, (224, 224), mode="bilinear") - MEAN) / STD
+    dim = config.embed_dim
+    x, _ = backbone.embed(images)
+    for block in backbone.blocks:
+        _, q, k, v = block.project(x)
+        x = block.finish(x, block.attn(q, k, v))
+        block.attn.qkv.bias[dim : 2 * dim] -= k[:, 1:].mean((0, 1))
+    proj = backbone.patch_embed.proj
+    mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    proj.bias += (proj.weight * (mean - MEAN) / STD).sum((1, 2, 3))
+    proj.weight *= std / STD
+    metadata = dict(name="zsp-tiny", patch_size=8, image_size=224, num_heads=config.num_heads, key_block=config.key_block)
+    weights = {name: value.half().contiguous() for name, value in backbone.state_dict().items()}
+    save_file(weights, path, metadata={name: str(value) for name, value in metadata.items()})
+    return path
