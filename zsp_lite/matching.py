@@ -1,0 +1,239 @@
+"""Semantic correspondences between two images from cyclical distances (section 4.1, eq. 2, and supplement).
+
+`similarity` is the cosine of log-binned descriptors, `cyclical_distances` follows each patch to the other image and
+back, `match` keeps the 2K patches that come back nearest and thins them to K by k-means.
+
+Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two of them is a sum over
+bins of products of keys, and every such product stands already in one small matrix S of all keys against all keys,
+only shifted on both images at once. With J_s[S](r1,c1,r2,c2) = sum over i in (-1,0,1) of S(r1+si, c1, r2+si, c2) and
+likewise for columns, and with P the 3x3 pooling on both images, the whole is
+J_1 J_1' S + (J_3 J_3' - 1) P S: a dozen additions of S to itself.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
+
+Keys = FeatureMap | Float[Tensor, "h w d"] | Float[np.ndarray, "h w d"]
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Patches that correspond, best cyclical distance first; K may be 0."""
+
+    reference: Int[np.ndarray, "k 2"]  # (row, column) on the reference's grid
+    target: Int[np.ndarray, "k 2"]  # (row, column) on the target's grid
+    similarity: Float[np.ndarray, "k"]  # cosine of the two log-binned descriptors
+    distance: Float[np.ndarray, "k"]  # d(u, u') >= 0 of the cycle, in patches
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+
+def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
+    """Cosine of the log-binned descriptors of all patches of one image against all of the other, both row-major.
+
+    ref and target are FeatureMaps or keys (H1, W1, D), (H2, W2, D). Descriptors without length have similarity 0.
+    Raises InputError on other shapes.
+    """
+    return similarities(ref, [target])[0]
+
+
+def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
+    """`similarity` of one reference against several targets; the reference is prepared once."""
+    keys1 = _keys(ref, "ref")
+    inverse_norm1 = _inverse_norm(keys1)
+    results = []
+    for index, target in enumerate(targets):
+        keys2 = _keys(target, f"target {index}")
+        if keys1.shape[-1] != keys2.shape[-1]:
+            raise InputError(
+                f"similarity: ref has {keys1.shape[-1]} channels, target {index} has {keys2.shape[-1]}, "
+                f"expected equal numbers"
+            )
+        product = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
+        summed = _bin_products(product.view(*keys1.shape[:2], *keys2.shape[:2]))
+        cosine = summed.view(product.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
+        results.append(cosine)
+    return results
+
+
+def nearest_neighbours(
+    sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
+) -> tuple[Int[Tensor, "n1"], Int[Tensor, "n2"]]:
+    """For each row its most similar column, and for each column its most similar row (eq. 2's two argmins)."""
+    sim = torch.as_tensor(sim)
+    return sim.argmax(dim=1), sim.argmax(dim=0)
+
+
+def cyclical_distances(
+    sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
+    grid1: Grid,
+    grid2: Grid,
+    fg1: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
+    fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
+    published: bool = False,
+) -> Float[Tensor, "h1 w1"]:
+    """Cyclical distance map C_u = -d(u, u') in patches (eq. 2): u's neighbour v in image 2, v's neighbour u' back.
+
+    -inf where u, v or u' is off the foreground. published=True masks as the published code does: u' need not be on
+    the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and looks for the
+    mark in each coordinate by itself). Raises InputError where shapes do not fit.
+    """
+    sim = torch.as_tensor(sim)
+    n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
+    if tuple(sim.shape) != (n1, n2):
+        raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, expected {(n1, n2)} for the grids")
+    on1, on2 = _mask(fg1, grid1, "fg1", sim.device), _mask(fg2, grid2, "fg2", sim.device)
+    forth, back = nearest_neighbours(sim)
+    u = torch.arange(n1, device=sim.device)
+    returned = back[forth]
+    row, column = returned // grid1[1], returned % grid1[1]
+    offset = torch.stack([u // grid1[1] - row, u % grid1[1] - column])
+    valid_return = (row > 0) & (column > 0) if published else on1[returned]
+    valid = on1 & on2[forth] & valid_return
+    distance = -offset.to(torch.float32).square().sum(0).sqrt()
+    return distance.masked_fill(~valid, -torch.inf).view(grid1)
+
+
+def match(
+    ref: FeatureMap,
+    target: FeatureMap,
+    k: int = 50,
+    kmeans: bool = True,
+    seed: int | np.random.Generator = 0,
+    cycle_from: Literal["reference", "target"] = "reference",
+    threshold: float = 0.05,
+    ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
+    target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
+    sim: Float[Tensor, "n1 n2"] | None = None,
+) -> Matches:
+    """At most k correspondences between two feature maps (section 4.1; supplement, "K-Means clustering").
+
+    The 2k patches with the least cyclical distance (ties: more similar first, then row-major) are clustered by
+    k-means on their descriptors into k clusters, and each cluster gives its most salient patch. kmeans=False takes
+    the k best patches. Fewer valid cycles than 2k: what there is, down to none.
+
+    cycle_from="reference" is the paper's way. "target" is the published code's: cycles start in the target, clusters
+    and salience are the target's, and `cyclical_distances` masks in its published form.
+    Foreground is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
+    """
+    if k < 1:
+        raise InputError(f"match: k is {k}, expected at least 1")
+    if cycle_from not in ("reference", "target"):
+        raise InputError(f"match: cycle_from is {cycle_from!r}, expected 'reference' or 'target'")
+    sim = similarity(ref, target) if sim is None else torch.as_tensor(sim)
+    on_ref = ref.foreground(threshold) if ref_foreground is None else ref_foreground
+    on_target = target.foreground(threshold) if target_foreground is None else target_foreground
+    if cycle_from == "reference":
+        start, end, on_start, on_end = ref, target, on_ref, on_target
+    else:
+        start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
+    published = cycle_from == "target"
+    cyclical = cyclical_distances(sim, start.grid, end.grid, on_start, on_end, published).flatten()
+    best, neighbour = sim.max(dim=1)
+
+    # Off the device once; a few hundred candidates are a matter for numpy.
+    cyclical, best, neighbour = (x.cpu().numpy() for x in (cyclical, best, neighbour))
+    order = np.lexsort((np.arange(len(best)), -best, -cyclical))
+    order = order[np.isfinite(cyclical[order])][: 2 * k if kmeans else k]
+    if kmeans and len(order) > k:
+        clusters = _cluster(_gram(start, order), k, np.random.default_rng(seed))
+        order = order[_most_salient(clusters, start.saliency.flatten().cpu().numpy()[order])]
+    u = np.stack(np.unravel_index(order, start.grid), axis=-1)
+    v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
+    reference, matched = (u, v) if cycle_from == "reference" else (v, u)
+    return Matches(reference, matched, best[order], -cyclical[order])
+
+
+def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
+    keys = torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
+    if keys.ndim != 3 or 0 in keys.shape:
+        raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D), none of them 0")
+    return keys
+
+
+def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, "n"]:
+    if mask is None:
+        return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
+    mask = torch.as_tensor(mask, device=device)
+    if tuple(mask.shape) != grid:
+        raise InputError(f"cyclical_distances: {name} has shape {tuple(mask.shape)}, expected the grid {grid}")
+    return mask.flatten().bool()
+
+
+def _bin_products(product: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
+    """Sum over the 17 bins of products of keys (module docstring), from the products of single keys."""
+
+    def rows(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        pooled = average_pool(average_pool(x, 0), 2)
+        return _joint_shifts(x, 1), _joint_shifts(pooled, 3), pooled
+
+    def columns(x: Tensor) -> Tensor:
+        # Swapping rows and columns makes the inner runs of memory long; a copy costs less than short runs would.
+        return x.permute(1, 0, 3, 2).contiguous()
+
+    near, far, centre = (columns(x) for x in rows(product))
+    far = average_pool(average_pool(far, 0), 2)
+    centre = average_pool(average_pool(centre, 0), 2)
+    return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
+
+
+def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
+    """x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border, summed."""
+    n1, n2 = x.shape[0], x.shape[2]
+    padded = x
+    for axis, n in ((0, n1), (2, n2)):
+        padded = padded.index_select(axis, torch.arange(-step, n + step, device=x.device).clamp_(0, n - 1))
+    back, on = (padded[i : i + n1, :, i : i + n2] for i in (0, 2 * step))
+    return (x + back).add_(on)
+
+
+def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, "n"]:
+    """1 / length of each patch's log-binned descriptor."""
+    index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
+    raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(average_pool(keys, 0), 1)))
+    squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
+    return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
+
+
+def _gram(features: FeatureMap, index: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m m"]:
+    """Cosines between the log-binned descriptors of a few patches; for so few the bins are cheap to make."""
+    keys = features.keys.to(torch.float32)
+    bins = bin_indices(features.grid)[:, torch.from_numpy(index)].to(keys.device)
+    pooled = average_pool(average_pool(keys, 0), 1)
+    descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
+    descriptors = F.normalize(descriptors.transpose(0, 1).flatten(1), dim=1)
+    return (descriptors @ descriptors.T).cpu().numpy().astype(np.float64)
+
+
+def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, "m"]:
+    """k-means labels of m points known by their inner products.
+
+    The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
+    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only faster.
+    """
+    values, vectors = np.linalg.eigh(gram)
+    points = vectors * np.sqrt(np.maximum(values, 0.0))
+    with warnings.catch_warnings():
+        # Equal descriptors (a uniform surface) can leave clusters empty: fewer matches, no reason for alarm.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
+
+
+def _most_salient(labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]) -> Int[np.ndarray, "clusters"]:
+    """Index of each cluster's most salient point (ties: the first), ascending."""
+    order = np.lexsort((np.arange(len(labels)), -salience, labels))
+    _, first = np.unique(labels[order], return_index=True)
+    return np.sort(order[first])
