@@ -1,0 +1,109 @@
+"""One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks reuse."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from zsp_lite.backbones import Backbone
+from zsp_lite.co3d import Co3D
+from zsp_lite.depth import structured_point_cloud
+from zsp_lite.errors import InputError
+from zsp_lite.frames import Frame
+from zsp_lite.labels import read_labels, relative_pose
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pairs import Pair, read_upstream_pairs, sample_pairs
+from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
+
+N_TARGETS = 5
+_SEQUENCE_FRAMES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """One pair and its estimate. `error`: rotation error in degrees; `seconds`: for the whole estimate, from frames in
+    memory; `sequence`: whole frames spread over the target sequence, which the pose is propagated to."""
+
+    pair: Pair
+    estimate: PoseEstimate
+    error: float
+    seconds: float
+    sequence: tuple[Frame, ...]
+
+
+def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
+    """The first evaluation pair of every category: fixed beforehand, not picked for its result.
+
+    Categories without evaluation pairs for `n_targets` get the first pair of a sample with seed 0. Raises InputError
+    where the folder holds no category.
+    """
+    categories = dataset.categories()
+    if not categories:
+        raise InputError(f"{dataset.root}: no category found, expected folders with frame_annotations.jgz")
+    pairs = []
+    for category in categories:
+        shipped = sorted(Path(dataset.root).glob(f"determ_eval/*samples_{n_targets}tgt/{category}.pt"))
+        read = read_upstream_pairs(shipped[0], dataset) if shipped else []
+        pairs.append((read or sample_pairs(dataset, category, 1, n_targets, seed=0))[0])
+    return pairs
+
+
+def run_demo(dataset: Co3D, backbone: Backbone) -> Iterator[DemoResult]:
+    """The estimates for `demo_pairs`, one after the other, with the paper's settings."""
+    method = ZeroShotPose(backbone)
+    for pair in demo_pairs(dataset):
+        yield run_pair(dataset, pair, method)
+
+
+def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
+    """Load a pair's frames, estimate its pose, and compare it with the pose that the labels give.
+
+    Raises InputError where a frame or a label of the pair is missing.
+    """
+    reference_frames = dataset.frames(pair.category, pair.reference_sequence)
+    target_frames = dataset.frames(pair.category, pair.target_sequence)
+    by_number = {frame.frame_number: frame for frame in reference_frames}
+    target_by_number = {frame.frame_number: frame for frame in target_frames}
+    reference = dataset.load(by_number[pair.reference_frame])
+    targets = [dataset.load(target_by_number[number]) for number in pair.target_frames]
+
+    start = time.perf_counter()
+    estimate = method.estimate(reference, targets)
+    seconds = time.perf_counter() - start
+
+    labels = read_labels(dataset.root, pair.category)
+    for sequence in (pair.reference_sequence, pair.target_sequence):
+        if sequence not in labels:
+            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with")
+    truth = relative_pose(
+        labels[pair.reference_sequence], reference.camera,
+        labels[pair.target_sequence], targets[estimate.view].camera,
+    )  # fmt: skip
+    error = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
+    spread = np.linspace(0, len(target_frames) - 1, min(_SEQUENCE_FRAMES, len(target_frames))).round().astype(int)
+    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(target_frames[i]) for i in spread))
+
+
+def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Camera-frame points of the pixels of the object with a measured depth, at most `most` of them.
+
+    The object is where the mask is above 0.5; without a mask, the patches of the foreground. Raises InputError where
+    none of its pixels has a depth.
+    """
+    frame = view.frame
+    if frame.depth is None:
+        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one for the point cloud")
+    if frame.mask is not None:
+        inside = frame.mask > 0.5
+    else:
+        rows, cols = (np.arange(n) * m // n for n, m in zip(frame.depth.shape, view.foreground.shape))
+        inside = view.foreground.cpu().numpy()[np.ix_(rows, cols)]
+    points = structured_point_cloud(frame.depth, frame.camera)[inside & (frame.depth > 0)]
+    if len(points) == 0:
+        raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
+    if len(points) > most:
+        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
+    return points

@@ -1,0 +1,182 @@
+"""What is installed, what is at hand, where data is looked for, and the command that mends what is missing."""
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from packaging.requirements import InvalidRequirement, Requirement
+
+from zsp_lite.errors import InputError
+
+DATA_VARIABLE = "ZSP_LITE_DATA"  # one's own CO3D folder
+REPOSITORY = Path(__file__).resolve().parent.parent
+OK, NOTE, BAD = "ok", "note", "bad"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at. `state` is "ok", "note" (works without) or "bad" (an essential is missing); `remedy` is the
+    command or step that mends it, empty where there is nothing to mend."""
+
+    name: str
+    state: str
+    found: str
+    remedy: str = ""
+
+
+def examine(data: Path | None = None) -> list[Check]:
+    """All checks, in the order in which one would mend them. `data`: a CO3D folder to look at besides the usual ones."""
+    return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_data(data), _jupyter()]
+
+
+def healthy(checks: list[Check]) -> bool:
+    """Whether every essential is there."""
+    return all(check.state != BAD for check in checks)
+
+
+def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
+    """Where data is looked for, first match first: (how it was named, folder)."""
+    folders = [("--data", data)] if data is not None else []
+    if os.environ.get(DATA_VARIABLE):
+        folders.append((DATA_VARIABLE, Path(os.environ[DATA_VARIABLE])))
+    return [*folders, ("data_samples", sample_data())]
+
+
+def sample_data() -> Path:
+    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is in."""
+    here = Path("data_samples")
+    return here if here.is_dir() else REPOSITORY / "data_samples"
+
+
+def compare(requirement: Requirement, installed: str | None, pinned: str | None) -> Check:
+    """The state of one package: its installed version against the range it must be in and the version tested with."""
+    name, mend = requirement.name, f"{_pip()} install '{requirement.name}{requirement.specifier}'"
+    if installed is None:
+        return Check(name, BAD, f"not installed, expected {requirement.specifier or 'any version'}", mend)
+    if not requirement.specifier.contains(installed, prereleases=True):
+        return Check(name, BAD, f"{installed}, expected {requirement.specifier}", mend)
+    # A local label (torch's "+cpu") is another build of the same version.
+    if pinned is not None and installed.split("+")[0] != pinned:
+        return Check(name, NOTE, f"{installed}, tested with {pinned}", f"{_pip()} install '{name}=={pinned}'")
+    return Check(name, OK, installed)
+
+
+def read_pins(text: str) -> dict[str, str]:
+    """Package name (lower case) to version, from a requirements file of exact pins; other lines are passed over."""
+    pins = {}
+    for line in text.splitlines():
+        try:
+            requirement = Requirement(line)
+        except InvalidRequirement:  # a comment or an empty line
+            continue
+        exact = [part.version for part in requirement.specifier if part.operator == "=="]
+        if exact and (requirement.marker is None or requirement.marker.evaluate()):
+            pins[requirement.name.lower()] = exact[0]
+    return pins
+
+
+def _pip() -> str:
+    """pip of the interpreter that runs, which need not be the one that `pip` on the path belongs to."""
+    return f"{sys.executable} -m pip"
+
+
+def _python() -> Check:
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()} ({sys.executable})"
+    if sys.version_info < (3, 11):
+        return Check("Python", BAD, found, "make clean && make demo PYTHON=/path/to/python3.11")
+    return Check("Python", OK, found)
+
+
+def _packages() -> Iterator[Check]:
+    try:
+        requirements = importlib.metadata.requires("zsp-lite") or []
+    except importlib.metadata.PackageNotFoundError:
+        yield Check("zsp-lite", BAD, "runs from its folder, is not installed", f"{_pip()} install --no-deps -e {REPOSITORY}")
+        return
+    yield Check("zsp-lite", OK, importlib.metadata.version("zsp-lite"))
+    environment = REPOSITORY / "environment.txt"
+    pins = read_pins(environment.read_text()) if environment.is_file() else {}
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            installed = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            installed = None
+        yield compare(requirement, installed, pins.get(requirement.name.lower()))
+
+
+def _torch() -> Iterator[Check]:
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        yield Check("torch runs", BAD, f"cannot be imported: {_one_line(error)}", f"{_pip()} install --force-reinstall torch")
+        return
+    cuda = f", CUDA on {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else ", no CUDA (not needed)"
+    yield Check("torch runs", OK, f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs{cuda}")
+
+
+def _open3d() -> Check:
+    from zsp_lite.open3d_import import load_open3d
+
+    try:
+        version = load_open3d().__version__
+    except (ImportError, OSError) as error:
+        wheel = "open3d-cpu libusb-package" if sys.platform.startswith("linux") else "open3d"
+        remedy = f"{_pip()} install {wheel}"
+        return Check("open3d loads", BAD, f"cannot be loaded: {_one_line(error)}", remedy)
+    return Check("open3d loads", OK, version)
+
+
+def _backbones() -> Iterator[Check]:
+    try:
+        from zsp_lite.backbones import available_backbones
+    except (ImportError, OSError) as error:
+        yield Check("backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
+        return
+    for name, path in available_backbones().items():
+        if path is not None:
+            yield Check(f"backbone {name}", OK, str(path))
+        elif name == "zsp-tiny":
+            yield Check(f"backbone {name}", BAD, "weights are not in the package", "zsp-lite train, or reinstall zsp-lite")
+        else:
+            yield Check(f"backbone {name}", NOTE, "not downloaded", f"zsp-lite weights fetch {name}")
+
+
+def _data(data: Path | None) -> Iterator[Check]:
+    from zsp_lite.co3d import Co3D
+
+    for name, folder in data_folders(data):
+        sample = name == "data_samples"
+        remedy = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"
+        try:
+            categories = Co3D(folder).categories()
+        except InputError as error:
+            yield Check(f"data: {name}", NOTE if sample else BAD, str(error), remedy)
+            continue
+        if categories:
+            listed = ", ".join(categories[:6]) + (", ..." if len(categories) > 6 else "")
+            yield Check(f"data: {name}", OK, f"{folder}: {len(categories)} categories ({listed})")
+        else:
+            found = f"{folder}: no category (a folder with frame_annotations.jgz)"
+            yield Check(f"data: {name}", NOTE if sample else BAD, found, remedy)
+    if data is None and not os.environ.get(DATA_VARIABLE):
+        remedy = f"export {DATA_VARIABLE}=/path/to/co3d (only to use your own data)"
+        yield Check(f"data: {DATA_VARIABLE}", NOTE, "not set", remedy)
+
+
+def _jupyter() -> Check:
+    missing = [name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None]
+    if missing:
+        remedy = f"{_pip()} install {' '.join(missing)}"
+        return Check("Jupyter", NOTE, f"{', '.join(missing)} not installed (only for the notebooks)", remedy)
+    return Check("Jupyter", OK, f"jupyterlab {importlib.metadata.version('jupyterlab')}")
+
+
+def _one_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
