@@ -78,7 +78,7 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
     equal or collinear (the rotation about their line is then undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
-    scale, rotation, translation, conditioning = _umeyama(source, target, with_scale)
+    (scale,), (rotation,), (translation,), (conditioning,) = _umeyama(source[None], target[None], with_scale)
     if not conditioning > _COLLINEAR:
         raise InputError(f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
                          "expected at least 3 that span a plane")
@@ -126,30 +126,30 @@ def ransac(
     chosen = inlier[best]
 
     if counts[best] >= 3:
-        fit = _umeyama(source[chosen], target[chosen])
-        if fit[3] > _COLLINEAR_SAMPLE:
-            return Sim3(float(fit[0]), fit[1], fit[2]), chosen
+        fit_scale, fit_rotation, fit_translation, conditioning = _umeyama(source[None, chosen], target[None, chosen])
+        if conditioning[0] > _COLLINEAR_SAMPLE:
+            return Sim3(float(fit_scale[0]), fit_rotation[0], fit_translation[0]), chosen
     return Sim3(float(scale[best]), rotation[best], translation[best]), chosen
 
 
 def _umeyama(
-    source: Float[np.ndarray, "*batch n 3"], target: Float[np.ndarray, "*batch n 3"], with_scale: bool = True
-) -> tuple[np.ndarray, Float[np.ndarray, "*batch 3 3"], Float[np.ndarray, "*batch 3"], np.ndarray]:
+    source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
+) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
     """Umeyama on a batch of point sets: scale, rotation, translation, and the conditioning (see _COLLINEAR)."""
-    source_mean, target_mean = source.mean(axis=-2), target.mean(axis=-2)
-    centred_source, centred_target = source - source_mean[..., None, :], target - target_mean[..., None, :]
-    left, singular, right = np.linalg.svd(np.swapaxes(centred_target, -1, -2) @ centred_source)
+    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
+    left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
     # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
     flip = np.sign(np.linalg.det(left @ right))
-    left[..., :, 2] *= flip[..., None]
+    left[:, :, 2] *= flip[:, None]
     rotation = left @ right
     if with_scale:
-        spread = np.square(centred_source).sum(axis=(-1, -2))
-        scale = (singular[..., 0] + singular[..., 1] + flip * singular[..., 2]) / np.where(spread > 0, spread, 1)
+        spread = np.square(centred_source).sum(axis=(1, 2))
+        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(spread > 0, spread, 1)
     else:
-        scale = np.ones(singular.shape[:-1])
-    translation = target_mean - scale[..., None] * (rotation @ source_mean[..., None])[..., 0]
-    conditioning = singular[..., 1] / np.where(singular[..., 0] > 0, singular[..., 0], 1)
+        scale = np.ones(len(singular))
+    translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
+    conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
     return scale, rotation, translation, conditioning
 
 

@@ -1,0 +1,91 @@
+"""Views of a bumpy ellipsoid, ray-cast in closed form, and a backbone that knows the object's coordinates.
+
+The colours of the pictures are the object's own coordinates, so features made of them are perfect and any error left
+is the pipeline's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.cameras import Camera
+from zsp_lite.features import FeatureMap
+from zsp_lite.frames import Frame
+
+AXES = np.array([1.2, 0.8, 0.6])
+REACH = 1.6  # colours map [-REACH, REACH]
+
+
+def inside(points: np.ndarray) -> np.ndarray:
+    """Negative inside the object, (..., 3) -> (...); without any symmetry."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    bumps = 0.08 * np.sin(4 * x + 1) + 0.08 * np.sin(5 * y - 2 * z) + 0.06 * np.cos(6 * z + x)
+    return np.linalg.norm(points / AXES, axis=-1) - 1 - bumps
+
+
+def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 190.0) -> Camera:
+    """A camera at `distance` along `direction`, looking at the world's origin."""
+    forward = -np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    right = np.cross(forward, (0.1, 0.2, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), np.array([size[1], size[0]]) / 2, size)
+
+
+def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
+    """The object seen from a camera; `placement` maps object to world coordinates."""
+    height, width = camera.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
+    to_object = placement.inverse()
+    in_object = lambda depth: to_object.apply(camera.to_world(rays * depth[..., None]))  # noqa: E731
+    far = np.full((height, width), np.inf)
+    steps = np.linspace(1.5, 7.0, 111)
+    for near, beyond in zip(steps[-2::-1], steps[:0:-1]):
+        crossing = (inside(in_object(np.full_like(far, near))) > 0) & (
+            inside(in_object(np.full_like(far, beyond))) <= 0
+        )
+        far[crossing] = beyond
+    hit = np.isfinite(far)
+    high = np.where(hit, far, 1.0)
+    low = high - (steps[1] - steps[0])
+    for _ in range(20):
+        middle = (low + high) / 2
+        outside = inside(in_object(middle)) > 0
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    colour = np.rint((in_object(high) / REACH + 1) * 127).clip(1, 254)
+    rgb = np.where(hit[..., None], colour, 0).astype(np.uint8)
+    return Frame(rgb, np.where(hit, high, 0).astype(np.float32), hit.astype(np.float32), camera, name)
+
+
+@dataclass(frozen=True)
+class CoordinateBackbone:
+    """Fourier features of the object coordinates that `render` paints; black is background."""
+
+    grid: int = 28
+    frequencies: int = 32
+
+    def __call__(self, images) -> list[FeatureMap]:
+        return [self.features(np.asarray(image)) for image in images]
+
+    def features(self, image: np.ndarray) -> FeatureMap:
+        n, p = self.grid, len(image) // self.grid
+        patches = image.reshape(n, p, n, p, 3).swapaxes(1, 2).reshape(n, n, p * p, 3).astype(float)
+        painted = patches.min(axis=-1) > 0
+        share = painted.mean(axis=-1)
+        mean = (patches * painted[..., None]).sum(axis=2) / np.maximum(painted.sum(axis=-1), 1)[..., None]
+        coordinates = (mean / 127 - 1) * REACH
+        waves = np.random.default_rng(5).normal(0, 1.6, (3, self.frequencies))
+        keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
+        keys[share < 0.5] = 0.05 * np.random.default_rng(6).normal(size=keys.shape[-1])
+        keys = torch.as_tensor(keys, dtype=torch.float32)
+        saliency = torch.as_tensor(np.where(share < 0.5, 0, share), dtype=torch.float32)
+        return FeatureMap(keys, saliency, keys[share >= 0.5].mean(dim=0))
+
+
+def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placement: Sim3) -> Sim3:
+    """Reference-camera points to target-camera points, for the same object at two placements."""
+    first = Sim3(1.0, reference.R, reference.t) @ placement
+    return Sim3(1.0, target.R, target.t) @ target_placement @ first.inverse()

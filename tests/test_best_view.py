@@ -1,0 +1,73 @@
+"""The four view scores against values worked out by hand."""
+
+import numpy as np
+import pytest
+import torch
+
+from zsp_lite.best_view import VIEW_SELECTORS, Comparison, correspondence_score, cyclical_iou, global_score, mask_iou
+from zsp_lite.features import FeatureMap
+from zsp_lite.matching import Matches
+
+
+def matches(similarities) -> Matches:
+    k = len(similarities)
+    return Matches(
+        np.zeros((k, 2), int), np.zeros((k, 2), int), np.asarray(similarities, np.float32), np.zeros(k, np.float32)
+    )
+
+
+def test_the_correspondence_score_sums_the_distances_of_eq_3():
+    # d = sqrt(2 - 2 cos): cosines 1, 0.5 and -1 are at distances 0, 1 and 2.
+    assert correspondence_score(matches([1.0, 0.5, -1.0]), 3) == pytest.approx(-3)
+
+
+def test_missing_matches_count_as_orthogonal():
+    assert correspondence_score(matches([1.0]), 3) == pytest.approx(-2 * np.sqrt(2))
+    assert correspondence_score(matches([]), 2) == pytest.approx(-2 * np.sqrt(2))
+    # Two good matches of fifty do not beat fifty fair ones.
+    assert correspondence_score(matches([0.99] * 2), 50) < correspondence_score(matches([0.5] * 50), 50)
+
+
+def test_similarities_a_hair_above_one_are_at_distance_zero():
+    assert correspondence_score(matches([1.0 + 1e-7]), 1) == 0
+
+
+def feature_map(global_feature, saliency=None) -> FeatureMap:
+    saliency = torch.ones(2, 2) if saliency is None else torch.as_tensor(saliency)
+    return FeatureMap(torch.ones(*saliency.shape, 3), saliency, torch.as_tensor(global_feature, dtype=torch.float32))
+
+
+def test_the_global_score_is_the_cosine_whatever_the_lengths():
+    assert global_score(feature_map([3.0, 0.0]), feature_map([1.0, 1.0])) == pytest.approx(np.sqrt(0.5))
+
+
+def test_mask_iou_counts_shared_patches():
+    first, second = np.array([[1, 1], [0, 0]], bool), np.array([[1, 0], [1, 0]], bool)
+    assert mask_iou(first, second) == pytest.approx(1 / 3)
+    assert mask_iou(first, first) == 1
+    assert mask_iou(first & False, second & False) == 0
+
+
+def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
+    # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes to reference
+    # patch 0, and so comes back to target patch 0: from patch 3 that is 3 patches off, from 1.5 nothing else counts.
+    similarity = torch.zeros(6, 6)
+    similarity[[0, 1, 2], [0, 1, 2]] = torch.tensor([3.0, 2.0, 2.0])
+    similarity[0, 3:] = 1.0
+    everything = torch.ones(1, 6, dtype=torch.bool)
+    assert cyclical_iou(similarity, everything, everything) == pytest.approx(3 / 6)
+    first_four = everything.clone()
+    first_four[0, 4:] = False
+    assert cyclical_iou(similarity, everything, first_four) == pytest.approx(3 / 4)
+    # Off the reference's foreground a cycle does not count.
+    assert cyclical_iou(similarity, everything & (torch.arange(6) > 0), first_four) == pytest.approx(2 / 4)
+    assert cyclical_iou(similarity, everything, everything, threshold=3.0) == pytest.approx(4 / 6)
+
+
+def test_all_selectors_take_the_same_comparison():
+    grid = torch.ones(2, 2, dtype=torch.bool)
+    comparison = Comparison(
+        feature_map([1.0, 0.0]), feature_map([1.0, 0.0]), grid, grid, torch.eye(4), matches([1.0] * 4), 4
+    )
+    scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}
+    assert scores == {"correspond": 0, "global": 1, "saliency": 1, "cyclical": 1}

@@ -1,0 +1,219 @@
+"""The whole method with perfect features: what is left of the error, and how the pose behaves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+
+from zsp_lite.alignment import Sim3, umeyama
+from zsp_lite.cameras import Camera
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose, look, object_crop, patch_mask
+
+AT_HOME = Sim3.identity()
+ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
+DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
+
+
+@pytest.fixture(scope="module")
+def method():
+    return ZeroShotPose(CoordinateBackbone())
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
+
+
+@pytest.fixture(scope="module")
+def targets():
+    views = [look_at(ELSEWHERE.R @ np.array(direction), distance=4.5) for direction in DIRECTIONS]
+    return [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(views)]
+
+
+@pytest.fixture(scope="module")
+def estimate(method, reference, targets):
+    return method.estimate(reference, targets)
+
+
+def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, targets):
+    truth = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
+    assert rotation_error(estimate.sim3.R, truth.R) < 4
+    # Matches are whole patches apart from the truth, and least squares shrinks what is noisy.
+    assert estimate.sim3.scale == pytest.approx(truth.scale, rel=0.1)
+    centre = reference.camera.to_camera(np.zeros(3))
+    np.testing.assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
+    assert estimate.reliable and estimate.note == ""
+
+
+def test_the_best_view_looks_from_nearly_the_same_side(estimate, reference, targets):
+    errors = [
+        rotation_error(np.eye(3), true_pose(reference.camera, AT_HOME, t.camera, ELSEWHERE).R) for t in targets
+    ]
+    assert estimate.view == np.argmax(estimate.view_scores)
+    assert estimate.view in np.argsort(errors)[:2]
+
+
+def test_the_pose_is_the_fit_on_the_inlying_matches(estimate):
+    source, target = (points[estimate.inliers] for points in estimate.points)
+    assert estimate.inliers.sum() > 20
+    np.testing.assert_allclose(umeyama(source, target).matrix, estimate.sim3.matrix, atol=1e-9)
+    assert len(estimate.points[0]) == len(estimate.inliers) == len(estimate.matches.reference) <= 50
+
+
+def test_matched_points_are_the_same_point_of_the_object(estimate, reference, targets):
+    camera = targets[estimate.view].camera
+    first = reference.camera.to_world(estimate.points[0])
+    second = ELSEWHERE.inverse().apply(camera.to_world(estimate.points[1]))
+    assert np.median(np.linalg.norm(first - second, axis=1)) < 0.1
+
+
+def test_every_stage_is_timed(estimate):
+    assert list(estimate.timings) == ["crop", "features", "matching", "view", "alignment"]
+    assert all(seconds >= 0 for seconds in estimate.timings.values())
+
+
+def test_a_second_run_gives_the_same_numbers(method, estimate, reference, targets):
+    again = method.estimate(reference, targets)
+    assert (again.sim3.matrix == estimate.sim3.matrix).all() and (again.view_scores == estimate.view_scores).all()
+
+
+def turned(camera: Camera, turn: np.ndarray) -> Camera:
+    return replace(camera, R=camera.R @ turn.T)
+
+
+def test_turning_the_target_world_leaves_the_pose_between_cameras(method, estimate, reference, targets):
+    turn = look_at((0.2, 0.5, -1)).R
+    moved = [replace(frame, camera=turned(frame.camera, turn)) for frame in targets]
+    other = method.estimate(reference, moved)
+    np.testing.assert_allclose(other.sim3.matrix, estimate.sim3.matrix, atol=1e-12)
+    cameras = [frame.camera for frame in targets]
+    for before, after in zip(estimate.propagate(cameras), other.propagate([turned(c, turn) for c in cameras])):
+        np.testing.assert_allclose(after.matrix, before.matrix, atol=1e-9)
+
+
+def test_propagation_gives_the_pose_against_every_target_view(estimate, reference, targets):
+    poses = estimate.propagate([frame.camera for frame in targets])
+    np.testing.assert_allclose(poses[estimate.view].matrix, estimate.sim3.matrix, atol=1e-12)
+    for pose, frame in zip(poses, targets):
+        truth = true_pose(reference.camera, AT_HOME, frame.camera, ELSEWHERE)
+        # One rigid target: the error is the same in every view.
+        fitted = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
+        expected = rotation_error(estimate.sim3.R, fitted.R)
+        assert rotation_error(pose.R, truth.R) == pytest.approx(expected, abs=1e-6)
+
+
+def test_views_prepared_before_give_the_same_estimate(method, estimate, reference, targets):
+    views = look(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
+    shared = method.estimate_from_features(views[0], views[1:])
+    assert (shared.sim3.matrix == estimate.sim3.matrix).all()
+    assert list(shared.timings) == ["matching", "view", "alignment"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"kmeans": False},
+        {"k": 20},
+        {"foreground": "mask"},
+        {"cycle_from": "target"},
+        {"view_selector": "global"},
+        {"view_selector": "saliency"},
+        {"view_selector": "cyclical"},
+    ],
+    ids=str,
+)
+def test_with_perfect_features_no_setting_breaks_the_method(method, reference, targets, settings):
+    # The two nearest views only: what a selector picks of them can be aligned.
+    pair = [targets[0], targets[4]]
+    estimate = replace(method, **settings).estimate(reference, pair)
+    truth = true_pose(reference.camera, AT_HOME, pair[estimate.view].camera, ELSEWHERE)
+    assert rotation_error(estimate.sim3.R, truth.R) < 8
+
+
+def test_depth_with_holes_still_gives_the_pose(method, reference, targets):
+    rng = np.random.default_rng(0)
+    holes = lambda frame: replace(frame, depth=frame.depth * (rng.random(frame.depth.shape) > 0.4))  # noqa: E731
+    estimate = method.estimate(holes(reference), [holes(frame) for frame in targets])
+    truth = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
+    assert rotation_error(estimate.sim3.R, truth.R) < 6
+
+
+def test_a_frame_without_a_mask_is_taken_whole(reference):
+    whole = object_crop(replace(reference, mask=None))
+    assert whole.rgb.shape == (224, 224, 3)
+    np.testing.assert_allclose(whole.camera.principal_point, 112)
+
+
+def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
+    mask = np.zeros(reference.mask.shape, np.float32)
+    mask[:71, :90] = 1  # just over a quarter of 140 x 180 pixels
+    assert patch_mask(replace(reference, mask=mask), (1, 1)).item()
+    mask[69:] = 0
+    assert not patch_mask(replace(reference, mask=mask), (1, 1)).item()
+
+
+class TwoPatchBackbone(CoordinateBackbone):
+    """Perfect features with a foreground of two patches: never four matches."""
+
+    def features(self, image):
+        found = super().features(image)
+        saliency = torch.zeros_like(found.saliency)
+        saliency[14, 14:16] = 1
+        return FeatureMap(found.keys, saliency, found.global_feature)
+
+
+class NothingBackbone(CoordinateBackbone):
+    def features(self, image):
+        found = super().features(image)
+        return FeatureMap(found.keys, torch.zeros_like(found.saliency), found.global_feature)
+
+
+@pytest.mark.parametrize("backbone", [TwoPatchBackbone(), NothingBackbone()])
+def test_too_few_matches_fall_back_to_the_best_view_and_say_so(backbone, reference, targets):
+    estimate = ZeroShotPose(backbone).estimate(reference, targets)
+    assert not estimate.reliable and "best view" in estimate.note and "at least 4" in estimate.note
+    assert (estimate.sim3.R == np.eye(3)).all() and not estimate.inliers.any()
+    # The object's middle still lands on the target's middle: both crops hold the object alone.
+    middle = estimate.sim3.apply(reference.camera.to_camera(np.zeros(3)))
+    truth = targets[estimate.view].camera.to_camera(ELSEWHERE.t)
+    assert np.linalg.norm(middle - truth) < 0.5
+
+
+def test_collinear_points_fall_back_and_say_so(method, reference):
+    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a line.
+    flat = replace(reference, depth=np.full_like(reference.depth, 4.0))
+    views = look(method.backbone, [object_crop(flat)] * 2)
+    for view in views:
+        view.foreground[:] = False
+        view.foreground[:, 14] = True
+    estimate = method.estimate_from_features(views[0], views[1:])
+    assert not estimate.reliable and "collinear" in estimate.note
+
+
+def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
+    empty = replace(reference, mask=np.zeros_like(reference.mask))
+    no_depth, no_known = replace(reference, depth=None), replace(reference, depth=np.zeros_like(reference.depth))
+    for frame, word in ((empty, "mask"), (no_depth, "depth"), (no_known, "depth")):
+        with pytest.raises(InputError, match=word) as error:
+            method.estimate(frame, targets)
+        assert "reference" in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(InputError, match="no target"):
+        method.estimate(reference, [])
+    with pytest.raises(InputError, match="mask"):
+        replace(method, foreground="mask").estimate(replace(reference, mask=None), targets)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"k": 0}, {"threshold": -1}],
+    ids=str,
+)
+def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(settings):
+    with pytest.raises(InputError):
+        ZeroShotPose(CoordinateBackbone(), **settings)
+    assert ZeroShotPose(CoordinateBackbone(), k=30).k == 30

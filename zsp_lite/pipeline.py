@@ -1,0 +1,267 @@
+"""The method from frames to a pose, composed of the stages' plain functions (paper fig. 2 and sec. 3)."""
+
+import time
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from zsp_lite.alignment import Sim3, ransac
+from zsp_lite.best_view import VIEW_SELECTORS, Comparison
+from zsp_lite.cameras import Camera
+from zsp_lite.depth import patch_points
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.frames import Frame, crop_to_object, resize_frame
+from zsp_lite.matching import Matches, match, similarities
+
+if TYPE_CHECKING:
+    from zsp_lite.backbones import Backbone
+
+IMAGE_SIZE = 224
+# Thin parts (a chair's legs) never fill half a patch.
+_MASK_PATCH = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame cropped to its object, with its features: what one image brings to every pair it takes part in."""
+
+    frame: Frame
+    features: FeatureMap
+    foreground: Bool[torch.Tensor, "rows cols"]
+
+    @cached_property
+    def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
+
+        Worked out when first asked for: of N target views only the chosen one's are needed.
+        Raises InputError where the frame has no known depth.
+        """
+        name = self.frame.name or "frame"
+        if self.frame.depth is None:
+            raise InputError(f"{name}: no depth map, expected one to lift matches to 3D")
+        try:
+            return patch_points(self.frame.depth, self.frame.camera, self.features.grid)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """The pose of the reference object in a target view, and how it came about.
+
+    sim3: reference-camera points to camera points of the chosen target view.  view: its index.
+    matches: between the reference and that view.  inliers: (K,) which of them the fit used.
+    points: their 3D points in the reference's and the target's camera frame, (K, 3) each.
+    view_scores: (N,) of all target views, higher is better.  timings: seconds per stage.
+    target_camera: of the chosen view.  flags: one line for each reason not to trust the estimate, usually none.
+    reference_view, target_views: crops, features and foregrounds that went in.
+    """
+
+    sim3: Sim3
+    view: int
+    matches: Matches
+    inliers: Bool[np.ndarray, "k"]
+    points: tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]
+    view_scores: Float[np.ndarray, "n"]
+    timings: dict[str, float]
+    target_camera: Camera
+    reference_view: View
+    target_views: tuple[View, ...]
+    flags: tuple[str, ...] = ()
+
+    @property
+    def reliable(self) -> bool:
+        """Whether nothing was flagged; it says nothing about how right a fitted pose is."""
+        return not self.flags
+
+    @property
+    def note(self) -> str:
+        """The flags as one line."""
+        return "; ".join(self.flags)
+
+    def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
+        """Pose of the reference against other cameras of the target sequence (sec. 4.4): reference-camera points to
+        each camera's points, through the known world-to-camera transforms."""
+        best = self.target_camera
+        poses = []
+        for camera in cameras:
+            turn = camera.R @ best.R.T
+            poses.append(Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3)
+        return poses
+
+
+@dataclass(frozen=True)
+class ZeroShotPose:
+    """The method with its settings; the defaults are the paper's.
+
+    k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 3.1).
+    view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in scene
+    units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
+    foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
+    cycle_from: "reference" as in the paper, or "target" as in its published code.
+    Raises InputError for a setting out of its range.
+    """
+
+    backbone: "Backbone"
+    k: int = 50
+    kmeans: bool = True
+    view_selector: str = "correspond"
+    trials: int = 1000
+    threshold: float = 0.2
+    sample_size: int = 4
+    saliency_threshold: float = 0.05
+    foreground: Literal["saliency", "mask"] = "saliency"
+    cycle_from: Literal["reference", "target"] = "reference"
+    seed: int = 0
+
+    def __post_init__(self):
+        for name, value, allowed in (
+            ("view_selector", self.view_selector, tuple(VIEW_SELECTORS)),
+            ("foreground", self.foreground, ("saliency", "mask")),
+            ("cycle_from", self.cycle_from, ("reference", "target")),
+        ):
+            if value not in allowed:
+                raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
+        if self.k < 1 or self.trials < 1 or self.sample_size < 3 or not self.threshold > 0:
+            raise InputError(f"k={self.k}, trials={self.trials}, sample_size={self.sample_size}, threshold="
+                             f"{self.threshold}; expected k, trials >= 1, sample_size >= 3, threshold > 0")
+
+    def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
+        """The pose of the reference's object in the best of N target views of another object of its category.
+
+        A frame without a mask is taken whole. Where the matches of the best view cannot carry a fit (fewer than
+        sample_size, collinear, or of no plausible scale) the estimate is the best view itself: identity rotation,
+        translation and scale from the foregrounds' centroids and spreads, and a flag that says so.
+        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen target.
+        """
+        timings: dict[str, float] = {}
+        with _timed(timings, "crop"):
+            frames = [object_crop(frame) for frame in (reference, *targets)]
+        with _timed(timings, "features"):
+            views = look(self.backbone, frames, self.foreground, self.saliency_threshold)
+        return self.estimate_from_features(views[0], views[1:], timings)
+
+    def estimate_from_features(
+        self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
+    ) -> PoseEstimate:
+        """`estimate`, from views that were prepared before and may be shared between pairs and settings."""
+        if not targets:
+            raise InputError("no target views, expected at least one")
+        timings = dict(timings or {})
+        with _timed(timings, "matching"):
+            features = [target.features for target in targets]
+            comparisons = [
+                Comparison(
+                    reference.features,
+                    target.features,
+                    reference.foreground,
+                    target.foreground,
+                    sim,
+                    match(
+                        reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
+                        ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim,
+                    ),
+                    self.k,
+                )
+                for target, sim in zip(targets, similarities(reference.features, features))
+            ]  # fmt: skip
+        with _timed(timings, "view"):
+            scores = np.array([VIEW_SELECTORS[self.view_selector](comparison) for comparison in comparisons])
+            best = int(scores.argmax())
+            matches = comparisons[best].matches
+        with _timed(timings, "alignment"):
+            points = match_points(reference, targets[best], matches)
+            flags: tuple[str, ...] = ()
+            try:
+                sim3, inliers = ransac(
+                    *points, threshold=self.threshold, trials=self.trials, sample_size=self.sample_size, seed=self.seed
+                )
+            except InputError as error:
+                sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
+                flags = (f"pose is the best view's, not a fit: {error}",)
+        return PoseEstimate(
+            sim3, best, matches, inliers, points, scores, timings, targets[best].frame.camera,
+            reference, tuple(targets), flags,
+        )  # fmt: skip
+
+
+def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
+    """The frame's object crop, resized to (size, size) without keeping its aspect (supplement, "Object crops").
+
+    A frame without a mask is taken whole. Raises InputError for an empty mask.
+    """
+    return resize_frame(frame if frame.mask is None else crop_to_object(frame), (size, size))
+
+
+def look(
+    backbone: "Backbone",
+    frames: Sequence[Frame],
+    foreground: str = "saliency",
+    saliency_threshold: float = 0.05,
+) -> list[View]:
+    """Views of cropped frames: features in one batch, and which patches are the object.
+
+    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a quarter of
+    the patch). Raises InputError for "mask" where a frame has none.
+    """
+    features = backbone([frame.rgb for frame in frames])
+    return [
+        View(
+            frame,
+            found,
+            found.foreground(saliency_threshold)
+            if foreground == "saliency"
+            else patch_mask(frame, found.grid).to(found.keys.device),
+        )
+        for frame, found in zip(frames, features)
+    ]
+
+
+def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
+    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
+    if frame.mask is None:
+        raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
+    covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(covered >= _MASK_PATCH)
+
+
+def match_points(
+    reference: View, target: View, matches: Matches
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+    """The matches' 3D points, each in its own camera frame (sec. 3.3)."""
+    return reference.patch_points[0][tuple(matches.reference.T)], target.patch_points[0][tuple(matches.target.T)]
+
+
+def view_alignment(reference: View, target: View) -> Sim3:
+    """The reference as if seen from the target's viewpoint ("Ours-BV"): identity rotation, and the scale and
+    translation that bring the foreground points' spread and centroid onto the target's."""
+    first, second = _foreground_points(reference), _foreground_points(target)
+    spread = np.sqrt(np.square(first - first.mean(axis=0)).sum(axis=1).mean())
+    target_spread = np.sqrt(np.square(second - second.mean(axis=0)).sum(axis=1).mean())
+    scale = float(target_spread / spread) if spread > 0 and target_spread > 0 else 1.0
+    return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
+
+
+def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
+    points, known = view.patch_points
+    foreground = np.asarray(view.foreground.cpu())
+    # Best first: measured points of the object; then any measured point; a view with neither was refused before.
+    for chosen in (foreground & known, known):
+        if chosen.any():
+            return points[chosen]
+    return points.reshape(-1, 3)
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str):
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
