@@ -7,12 +7,15 @@ The view with the highest score is chosen.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches, cyclical_distances
+
+Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
 # A match that could not be made counts like one between orthogonal descriptors.
 _ORTHOGONAL = 2**0.5
@@ -48,7 +51,7 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
     return float(F.cosine_similarity(first, second, dim=0))
 
 
-def mask_iou(first: Bool[torch.Tensor, "rows cols"], second: Bool[torch.Tensor, "rows cols"]) -> float:
+def mask_iou(first: Mask, second: Mask) -> float:
     """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two foregrounds."""
     first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
