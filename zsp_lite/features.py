@@ -1,8 +1,8 @@
 """What a backbone says about one image, and the log-binned descriptors built on it (Amir et al. 2021).
 
-A descriptor has 17 bins: the 3x3 neighbourhood of a patch at stride 1, and around it the eight neighbours at stride
-3 of the keys averaged over 3x3. `log_bin` writes that down literally and needs 17 times the memory of the keys;
-`matching.similarity` compares such descriptors without ever making them.
+A descriptor has 17 bins: the 3x3 neighbourhood of a patch at stride 1, and around it the eight neighbours at
+stride 3 of the keys averaged over 3x3. `log_bin` writes that down literally and needs 17 times the memory of
+the keys; `matching.similarity` compares such descriptors without ever making them.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Grid = tuple[int, int]  # (rows, columns) of patches
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Descriptors on the patch grid, saliency in [0, 1] and one global feature. Raises InputError on misfits."""
+    """Descriptors on the patch grid, saliency in [0, 1] and one global feature. InputError on misfits."""
 
     keys: Float[Tensor, "h w d"]
     saliency: Float[Tensor, "h w"]
@@ -28,10 +28,10 @@ class FeatureMap:
 
     def __post_init__(self):
         if self.keys.ndim != 3 or 0 in self.keys.shape:
-            raise InputError(f"FeatureMap: keys have shape {tuple(self.keys.shape)}, expected (H, W, D), none 0")
+            raise InputError(f"FeatureMap: keys have shape {tuple(self.keys.shape)}, expected (H, W, D)")
         if self.saliency.shape != self.keys.shape[:2]:
             raise InputError(
-                f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the keys' grid {self.grid}"
+                f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
 
     @property
@@ -45,10 +45,10 @@ class FeatureMap:
 
 @lru_cache(maxsize=32)
 def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
-    """For each bin and patch (row-major), the flat index of the patch that fills it; positions clamp at the border.
+    """For each bin and patch (row-major) the flat index of the patch that fills it, clamped at the border.
 
-    Bins 0 to 8 read the raw keys (offsets -1, 0, 1, row-major), bins 9 to 16 the pooled keys (offsets -3, 0, 3,
-    row-major, without the centre).
+    Bins 0 to 8 read the raw keys (offsets -1, 0, 1, row-major), bins 9 to 16 the pooled keys (offsets -3, 0,
+    3, row-major, without the centre).
     """
     near = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
@@ -56,7 +56,8 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     with torch.inference_mode(False):  # kept for later callers, who may want gradients
         rows, columns = torch.arange(height)[:, None], torch.arange(width)
         filled = [
-            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1) for dy, dx in near + far
+            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1)
+            for dy, dx in near + far
         ]
         return torch.stack(filled).flatten(1)
 
@@ -78,12 +79,12 @@ def average_pool(x: Tensor, axis: int) -> Tensor:
 
 
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
-    """The 17 bins of every patch one after the other, in `bin_indices`' order. Raises InputError on bad shapes."""
+    """The 17 bins of every patch one after the other, in `bin_indices`' order. InputError on bad shapes."""
     x = torch.as_tensor(x)
     if x.ndim != 4 or 0 in x.shape:
         raise InputError(f"log_bin: x has shape {tuple(x.shape)}, expected (B, H, W, D), none of them 0")
     b, h, w, d = x.shape
     pooled = average_pool(average_pool(x, 1), 2)
     index = bin_indices((h, w)).to(x.device)
-    bins = torch.cat([x.flatten(1, 2)[:, index[:9]], pooled.flatten(1, 2)[:, index[9:]]], dim=1)  # (B, 17, H*W, D)
-    return bins.transpose(1, 2).reshape(b, h, w, 17 * d)
+    near, far = x.flatten(1, 2)[:, index[:9]], pooled.flatten(1, 2)[:, index[9:]]  # (B, 9 or 8, H*W, D)
+    return torch.cat([near, far], dim=1).transpose(1, 2).reshape(b, h, w, 17 * d)

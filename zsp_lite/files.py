@@ -44,3 +44,10 @@ def path_inside(root: str | Path, relative: str) -> Path:
     if not inside:
         raise InputError(f"path {relative!r} leaves the data folder {root}; expected a path inside it")
     return resolved
+
+
+def plain_name(name: str, what: str) -> str:
+    """`name`, where it is fit to be one folder's or file's; InputError where it would lead elsewhere."""
+    if not isinstance(name, str) or not name or name.startswith(".") or any(c in '/\\:\0' for c in name):
+        raise InputError(f"{what} name is {name!r}, expected a plain folder name")
+    return name

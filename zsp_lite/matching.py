@@ -1,13 +1,13 @@
 """Semantic correspondences between two images from cyclical distances (section 4.1, eq. 2, and supplement).
 
-`similarity` is the cosine of log-binned descriptors, `cyclical_distances` follows each patch to the other image and
-back, `match` keeps the 2K patches that come back nearest and thins them to K by k-means.
+`similarity` is the cosine of log-binned descriptors, `cyclical_distances` follows each patch to the other
+image and back, `match` keeps the 2K patches that come back nearest and thins them to K by k-means.
 
-Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two of them is a sum over
-bins of products of keys, and every such product stands already in one small matrix S of all keys against all keys,
-only shifted on both images at once. With J_s[S](r1,c1,r2,c2) = sum over i in (-1,0,1) of S(r1+si, c1, r2+si, c2) and
-likewise for columns, and with P the 3x3 pooling on both images, the whole is
-J_1 J_1' S + (J_3 J_3' - 1) P S: a dozen additions of S to itself.
+Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two of them is a sum
+over bins of products of keys, and every such product stands already in one small matrix S of all keys against
+all keys, only shifted on both images at once. With J_s[S](r1,c1,r2,c2) = sum over i in (-1,0,1) of S(r1+si,
+c1, r2+si, c2) and likewise for columns, and with P the 3x3 pooling on both images, the whole is J_1 J_1' S +
+(J_3 J_3' - 1) P S: a dozen additions of S to itself.
 """
 
 import warnings
@@ -42,10 +42,10 @@ class Matches:
 
 
 def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
-    """Cosine of the log-binned descriptors of all patches of one image against all of the other, both row-major.
+    """Cosine of the log-binned descriptors of all patches of one image against all of the other, row-major.
 
-    ref and target are FeatureMaps or keys (H1, W1, D), (H2, W2, D). Descriptors without length have similarity 0.
-    Raises InputError on other shapes.
+    ref and target are FeatureMaps or keys (H1, W1, D), (H2, W2, D). Descriptors without length have
+    similarity 0. Raises InputError on other shapes.
     """
     return similarities(ref, [target])[0]
 
@@ -72,7 +72,7 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
 ) -> tuple[Int[Tensor, "n1"], Int[Tensor, "n2"]]:
-    """For each row its most similar column, and for each column its most similar row (eq. 2's two argmins)."""
+    """For each row its most similar column, for each column its most similar row (the argmins of eq. 2)."""
     sim = torch.as_tensor(sim)
     return sim.argmax(dim=1), sim.argmax(dim=0)
 
@@ -85,16 +85,16 @@ def cyclical_distances(
     fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     published: bool = False,
 ) -> Float[Tensor, "h1 w1"]:
-    """Cyclical distance map C_u = -d(u, u') in patches (eq. 2): u's neighbour v in image 2, v's neighbour u' back.
+    """Cyclical distance map C_u = -d(u, u') in patches, eq. 2: v is u's neighbour in image 2, u' is v's in image 1.
 
-    -inf where u, v or u' is off the foreground. published=True masks as the published code does: u' need not be on
-    the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and looks for the
-    mark in each coordinate by itself). Raises InputError where shapes do not fit.
+    -inf where u, v or u' is off the foreground. published=True masks as the published code does: u' need not
+    be on the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and
+    looks for the mark in each coordinate by itself). Raises InputError where shapes do not fit.
     """
     sim = torch.as_tensor(sim)
     n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
     if tuple(sim.shape) != (n1, n2):
-        raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, expected {(n1, n2)} for the grids")
+        raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, grids expect {(n1, n2)}")
     on1, on2 = _mask(fg1, grid1, "fg1", sim.device), _mask(fg2, grid2, "fg2", sim.device)
     forth, back = nearest_neighbours(sim)
     u = torch.arange(n1, device=sim.device)
@@ -121,13 +121,13 @@ def match(
 ) -> Matches:
     """At most k correspondences between two feature maps (section 4.1; supplement, "K-Means clustering").
 
-    The 2k patches with the least cyclical distance (ties: more similar first, then row-major) are clustered by
-    k-means on their descriptors into k clusters, and each cluster gives its most salient patch. kmeans=False takes
-    the k best patches. Fewer valid cycles than 2k: what there is, down to none.
+    The 2k patches with the least cyclical distance (ties: more similar first, then row-major) are clustered
+    by k-means on their descriptors into k clusters, and each cluster gives its most salient patch.
+    kmeans=False takes the k best patches. Fewer valid cycles than 2k: what there is, down to none.
 
-    cycle_from="reference" is the paper's way. "target" is the published code's: cycles start in the target, clusters
-    and salience are the target's, and `cyclical_distances` masks in its published form.
-    Foreground is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
+    cycle_from="reference" is the paper's way. "target" is the published code's: cycles start in the target,
+    clusters and salience are the target's, and `cyclical_distances` masks in its published form. Foreground
+    is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
     """
     if k < 1:
         raise InputError(f"match: k is {k}, expected at least 1")
@@ -160,7 +160,7 @@ def match(
 def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
     keys = torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
     if keys.ndim != 3 or 0 in keys.shape:
-        raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D), none of them 0")
+        raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D)")
     return keys
 
 
@@ -169,7 +169,7 @@ def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, "n"
         return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
     mask = torch.as_tensor(mask, device=device)
     if tuple(mask.shape) != grid:
-        raise InputError(f"cyclical_distances: {name} has shape {tuple(mask.shape)}, expected the grid {grid}")
+        raise InputError(f"cyclical_distances: {name} has shape {tuple(mask.shape)}, expected {grid}")
     return mask.flatten().bool()
 
 
@@ -181,7 +181,7 @@ def _bin_products(product: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1
         return _joint_shifts(x, 1), _joint_shifts(pooled, 3), pooled
 
     def columns(x: Tensor) -> Tensor:
-        # Swapping rows and columns makes the inner runs of memory long; a copy costs less than short runs would.
+        # Swapping rows and columns makes the inner runs of memory long: cheaper than many short ones.
         return x.permute(1, 0, 3, 2).contiguous()
 
     near, far, centre = (columns(x) for x in rows(product))
@@ -222,7 +222,8 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
     """k-means labels of m points known by their inner products.
 
     The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
-    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only faster.
+    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only
+    faster.
     """
     values, vectors = np.linalg.eigh(gram)
     points = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -232,7 +233,9 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
 
 
-def _most_salient(labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]) -> Int[np.ndarray, "clusters"]:
+def _most_salient(
+    labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]
+) -> Int[np.ndarray, "clusters"]:
     """Index of each cluster's most salient point (ties: the first), ascending."""
     order = np.lexsort((np.arange(len(labels)), -salience, labels))
     _, first = np.unique(labels[order], return_index=True)

@@ -1,4 +1,4 @@
-"""Evaluation categories with a plug or a battery. Each generator builds one object: front +x, up +z, left +y."""
+"""Evaluation categories with a plug or a battery. Each builds one object: front +x, up +z, left +y."""
 
 import numpy as np
 

@@ -157,11 +157,11 @@ def losses(model: Trainee, batch: Batch, stage: Stage, weight: float, config: Tr
     )  # fmt: skip
     total = weight * match + stage.helpers * (geometry + attention)
     figures = dict(loss=total, match=match, geometry=geometry, attention=attention)
-    return total, {name: float(value) for name, value in figures.items()} | dict(accuracy=accuracy, iou=iou)
+    return total, {name: value.item() for name, value in figures.items()} | dict(accuracy=accuracy, iou=iou)
 
 
 @torch.no_grad()
-def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 184, objects: int = 40) -> dict[str, float]:
+def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 128, objects: int = 24) -> dict[str, float]:
     """Match accuracy and saliency IoU on TRAINING-category objects that no step has seen; same crops every time."""
     rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)
     hits, ious = [], []
@@ -247,7 +247,7 @@ def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log
         if step % log_every == 0 or step == config.steps:
             row = dict(step=step, seconds=round(time.monotonic() - start), side=stage.side, weight=round(weight, 3))
             row |= {name: round(value, 4) for name, value in smooth.items()}
-            if step % (5 * log_every) == 0 or step == config.steps:
+            if step % (10 * log_every) == 0 or step == config.steps:
                 row |= {name: round(value, 4) for name, value in held_out_accuracy(average, held_out).items()}
             log_file.write(json.dumps(row) + "\n")
             log_file.flush()
