@@ -1,7 +1,7 @@
 """Pinhole cameras: OpenCV conventions inside, exact conversion from and to PyTorch3D (CO3D v1 and v2).
 
-Inside the library a camera maps world points as column vectors, `x_cam = R @ x_world + t`, +x right, +y down, +z
-forward, and its pixel coordinates are (x, y) with pixel centres at half-integers: the image covers
+Inside the library a camera maps world points as column vectors, `x_cam = R @ x_world + t`, +x right, +y down,
++z forward, and its pixel coordinates are (x, y) with pixel centres at half-integers: the image covers
 [0, W] x [0, H].
 """
 
@@ -29,9 +29,9 @@ _ROTATION_TOLERANCE = 1e-3
 class Camera:
     """A calibrated view of the world.
 
-    `R` (3, 3) and `t` (3,): world to camera; `focal` (2,) and `principal_point` (2,): (x, y), pixels; `size`: image
-    (height, width), pixels. Lengths are in the unit of the world. Raises InputError on values that are not finite,
-    an `R` that is not a rotation (to 1e-3), a focal length or size that is not positive.
+    `R` (3, 3) and `t` (3,): world to camera; `focal` (2,) and `principal_point` (2,): (x, y), pixels; `size`:
+    image (height, width), pixels. Lengths are in the unit of the world. Raises InputError on values that are
+    not finite, an `R` that is not a rotation (to 1e-3), a focal length or size that is not positive.
     """
 
     R: Float[np.ndarray, "3 3"]
@@ -61,9 +61,9 @@ class Camera:
     ) -> "Camera":
         """The camera of a CO3D viewpoint.
 
-        `R` (3, 3) and `T` (3,) act on row vectors, `X_cam = X_world @ R + T`, +x left, +y up; `focal_length` (2,) and
-        `principal_point` (2,) are in the units of `intrinsics_format`; `size` is the image's (height, width). Raises
-        InputError on another format and on what `Camera` refuses.
+        `R` (3, 3) and `T` (3,) act on row vectors, `X_cam = X_world @ R + T`, +x left, +y up; `focal_length`
+        (2,) and `principal_point` (2,) are in the units of `intrinsics_format`; `size` is the image's
+        (height, width). Raises InputError on another format and on what `Camera` refuses.
         """
         R, T = _finite(R, (3, 3), "viewpoint R"), _finite(T, (3,), "viewpoint T")
         focal_length = _finite(focal_length, (2,), "viewpoint focal_length")
@@ -115,8 +115,8 @@ class Camera:
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
         """Pixels (x, y) and depths of world points.
 
-        Depth is the distance along +z. Points at depth 0 have pixels that are not finite, and those at a negative
-        depth lie behind the camera: look at the depth before using the pixel.
+        Depth is the distance along +z. Points at depth 0 have pixels that are not finite, and those at a
+        negative depth lie behind the camera: look at the depth before using the pixel.
         """
         in_camera = self.to_camera(points)
         depth = in_camera[..., 2]

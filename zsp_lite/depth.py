@@ -31,8 +31,8 @@ def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) 
 def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
     """Depth (float32) with the unknown pixels filled by OpenCV's Navier-Stokes in-painting.
 
-    `radius` is in pixels. Known pixels keep their values; filled ones stay between the smallest and largest known
-    depth. Raises InputError where no pixel is known.
+    `radius` is in pixels. Known pixels keep their values; filled ones stay between the smallest and largest
+    known depth. Raises InputError where no pixel is known.
     """
     depth = np.ascontiguousarray(depth, dtype=np.float32)
     known = np.isfinite(depth) & (depth > 0)
@@ -61,9 +61,9 @@ def patch_points(
     """One camera-frame point per patch of a (rows, cols) grid, and whether a known depth stands behind it.
 
     A patch's point is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
-    silhouette the nearer surface is the object, and a single stray pixel does not decide. A patch without a known
-    depth takes the in-painted depth at its central pixel. Raises InputError where the whole map is unknown, the
-    camera has another size, or the grid is finer than the image.
+    silhouette the nearer surface is the object, and a single stray pixel does not decide. A patch without a
+    known depth takes the in-painted depth at its central pixel. Raises InputError where the whole map is
+    unknown, the camera has another size, or the grid is finer than the image.
     """
     depth = np.asarray(depth, dtype=np.float32)
     _check_size(depth, camera)
@@ -71,7 +71,8 @@ def patch_points(
         raise InputError(f"patch grid is {tuple(grid)}, expected between 1 and the image's {depth.shape}")
     (rows, row_valid, row_middle), (cols, col_valid, col_middle) = (_bands(*pair) for pair in zip(depth.shape, grid))
 
-    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where nothing is known.
+    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where nothing is
+    # known.
     shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
     pixel = np.broadcast_to(rows[:, None, :, None] * depth.shape[1] + cols[None, :, None, :], shape)
     pixel = pixel.reshape(*shape[:2], -1)

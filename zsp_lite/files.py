@@ -10,8 +10,8 @@ from zsp_lite.errors import InputError
 def write_atomic(path: str | Path, data: bytes) -> None:
     """Write `data` to `path` so that a reader sees the old file or the new one, never half of one.
 
-    Missing folders are made. The bytes go to a temporary neighbour first (same folder, hence same file system),
-    which then takes the name.
+    Missing folders are made. The bytes go to a temporary neighbour first (same folder, hence same file
+    system), which then takes the name.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

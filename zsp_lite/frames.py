@@ -15,10 +15,11 @@ from zsp_lite.files import read_bytes, write_atomic
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image, and, where known, its depth (0 = unknown pixel), object mask (probability in [0, 1]) and name.
+    """An image, and, where known, its depth (0 = unknown pixel), object mask (probability in [0, 1]) and
+    name.
 
-    Depth is along +z in the unit of the camera's world. Raises InputError where the parts do not fit together or hold
-    values outside their range.
+    Depth is along +z in the unit of the camera's world. Raises InputError where the parts do not fit together
+    or hold values outside their range.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -53,10 +54,12 @@ class Frame:
 
 
 def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
-    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown and kept in the image.
+    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown and kept in the
+    image.
 
-    Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where no pixel
-    passes, the threshold is lowered in steps of 0.05, down to "above 0". Raises InputError on an empty mask.
+    Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where
+    no pixel passes, the threshold is lowered in steps of 0.05, down to "above 0". Raises InputError on an
+    empty mask.
     """
     mask = np.asarray(mask)
     if mask.ndim != 2 or not (mask > 0).any():
@@ -97,8 +100,8 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """The frame resized to (height, width), not keeping its aspect.
 
-    Colours are averaged over the area when shrinking, interpolated otherwise; depth takes the pixel under the new
-    pixel's centre, so that no depth is made up across an edge or a hole; the mask is interpolated.
+    Colours are averaged over the area when shrinking, interpolated otherwise; depth takes the pixel under the
+    new pixel's centre, so that no depth is made up across an edge or a hole; the mask is interpolated.
     """
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size

@@ -1,0 +1,254 @@
+"""CO3D folders, v1 and v2: a reader that loads only what is asked for, and a writer for the same layout."""
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float64, Real, UInt8
+
+from zsp_lite.annotations import (
+    FRAMES_FILE,
+    SEQUENCES_FILE,
+    DepthAnnotation,
+    FrameAnnotation,
+    FrameIndex,
+    FrameKey,
+    ImageAnnotation,
+    MaskAnnotation,
+    PointCloudAnnotation,
+    SequenceAnnotation,
+    Viewpoint,
+    compress,
+    decode,
+    decompress,
+    read_frame_index,
+)
+from zsp_lite.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
+from zsp_lite.errors import InputError
+from zsp_lite.files import path_inside, plain_name, read_bytes, write_atomic
+from zsp_lite.frames import (
+    Frame,
+    read_depth,
+    read_image,
+    read_mask,
+    write_binary_mask,
+    write_depth,
+    write_image,
+    write_mask,
+)
+from zsp_lite.ply import read_ply, write_ply
+
+
+class Co3D:
+    """The categories of a CO3D folder.
+
+    Reads what is on disk when a category is first asked for. The JSON of the category used last stays in
+    memory (about 100 MB for the largest), so work through categories one after the other.
+    """
+
+    def __init__(self, root: str | Path):
+        """Raises InputError where `root` is not a folder."""
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise InputError(f"data folder {root} does not exist, expected a folder with CATEGORY/{FRAMES_FILE}")
+        self._index: tuple[str, FrameIndex] | None = None
+        self._sequences: dict[str, list[SequenceAnnotation]] = {}
+
+    def categories(self) -> list[str]:
+        """Names of the folders that hold frame annotations, sorted."""
+        return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
+
+    def sequences(self, category: str) -> list[SequenceAnnotation]:
+        """The category's sequences in file order. Raises InputError on what cannot be read or lacks a field."""
+        if category not in self._sequences:
+            path = self._category_folder(category) / SEQUENCES_FILE
+            self._sequences[category] = decode(decompress(path), list[SequenceAnnotation], path)
+        return list(self._sequences[category])
+
+    def select(
+        self, category: str, viewpoint_quality: float = 1.25, point_cloud_quality: float = 0.3, top: int | None = 10
+    ) -> list[SequenceAnnotation]:
+        """The sequences worth labelling: both scores above their bounds, best point clouds first, at most
+        `top`.
+
+        The paper's supplementary, "Labelled categories"; a score that is not given passes no bound.
+        """
+        scored = []
+        for sequence in self.sequences(category):
+            score = sequence.point_cloud.quality_score if sequence.point_cloud else None
+            views = sequence.viewpoint_quality_score
+            if score is not None and score > point_cloud_quality and views is not None and views > viewpoint_quality:
+                scored.append((-score, sequence.sequence_name, sequence))
+        return [sequence for *_, sequence in sorted(scored, key=lambda item: item[:2])[:top]]
+
+    def frame_list(self, category: str) -> list[FrameKey]:
+        """Which frame stands at each position of the category's annotation file (what upstream's ids count)."""
+        return self._frame_index(category).keys
+
+    def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
+        """The sequence's frames by frame number. Raises InputError on an unknown sequence or a missing field."""
+        index = self._frame_index(category)
+        return [index.frame(position) for position in index.positions(sequence)]
+
+    def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
+        """One frame by its number, which is not its position in `frames` where frames are missing."""
+        index = self._frame_index(category)
+        for position in index.positions(sequence):
+            if index.keys[position].frame_number == frame_number:
+                return index.frame(position)
+        raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
+
+    def load(self, annotation: FrameAnnotation) -> Frame:
+        """The frame's image, camera and, where annotated, depth and mask.
+
+        Depth is unknown (0) where its file or its depth mask says so. Raises InputError where the annotation
+        has no viewpoint, a path leaves the data folder, or a file is missing, corrupt or of another size than
+        annotated.
+        """
+        name = f"{annotation.sequence_name}/{annotation.frame_number}"
+        view, size = annotation.viewpoint, annotation.image.size
+        if view is None:
+            raise InputError(f"frame {name} has no viewpoint, expected a camera")
+        try:
+            camera = Camera.from_pytorch3d(
+                view.R, view.T, view.focal_length, view.principal_point, size, view.intrinsics_format
+            )
+        except InputError as error:
+            raise InputError(f"frame {name}: {error}") from error
+        rgb = self._read(read_image, annotation.image.path, size)
+        mask = None if annotation.mask is None else self._read(read_mask, annotation.mask.path, size)
+        depth = None
+        if annotation.depth is not None:
+            reader = functools.partial(read_depth, scale_adjustment=annotation.depth.scale_adjustment)
+            depth = self._read(reader, annotation.depth.path, size)
+            if annotation.depth.mask_path is not None:
+                depth = np.where(self._read(read_mask, annotation.depth.mask_path, size) > 0, depth, np.float32(0))
+        return Frame(rgb, depth, mask, camera, name)
+
+    def point_cloud(
+        self, category: str, sequence: str
+    ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
+        """World points and colours of the sequence's point cloud. Raises InputError where there is none."""
+        for annotation in self.sequences(category):
+            if annotation.sequence_name == sequence:
+                if annotation.point_cloud is None:
+                    raise InputError(f"sequence {category}/{sequence} has no point cloud")
+                return read_ply(path_inside(self.root, annotation.point_cloud.path))
+        raise InputError(f"category {category} has no sequence {sequence!r}")
+
+    def set_lists(self, category: str) -> dict[str, dict[str, list[tuple[str, int, str]]]]:
+        """The published splits, {file stem: {subset: [(sequence, frame number, image path), ...]}}, {}
+        without any.
+
+        v1 has one `set_lists.json`, v2 a folder `set_lists/` of them.
+        """
+        folder = self._category_folder(category)
+        paths = [folder / "set_lists.json"] if (folder / "set_lists.json").is_file() else []
+        paths += sorted((folder / "set_lists").glob("*.json"))
+        kind = dict[str, list[tuple[str, int, str]]]
+        return {path.stem: decode(read_bytes(path, "set list"), kind, path) for path in paths}
+
+    def _read(self, reader: Callable[[Path], np.ndarray], relative: str, size: tuple[int, int]) -> np.ndarray:
+        path = path_inside(self.root, relative)
+        image = reader(path)
+        if image.shape[:2] != tuple(size):
+            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}")
+        return image
+
+    def _category_folder(self, category: str) -> Path:
+        folder = self.root / plain_name(category, "category")
+        if not (folder / FRAMES_FILE).is_file():
+            known = ", ".join(self.categories()) or "no category"
+            raise InputError(f"category {category!r} is not in {self.root}, which has {known}")
+        return folder
+
+    def _frame_index(self, category: str) -> FrameIndex:
+        if self._index is None or self._index[0] != category:
+            self._index = None  # free the last category's JSON before the next one is read
+            self._index = category, read_frame_index(self._category_folder(category) / FRAMES_FILE)
+        return self._index[1]
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceData:
+    """A sequence to be written: frames and their times (s), point cloud in the world of the frames, and scores."""
+
+    name: str
+    frames: Sequence[Frame]
+    timestamps: Sequence[float]
+    points: Real[np.ndarray, "n 3"]
+    colours: UInt8[np.ndarray, "n 3"]
+    normals: Real[np.ndarray, "n 3"] | None = None
+    viewpoint_quality: float | None = None
+    point_cloud_quality: float | None = None
+    depth_scale_adjustment: float = 1.0  # what a stored depth is to be multiplied by
+
+
+def write_co3d(
+    root: str | Path,
+    category: str,
+    sequences: Iterable[SequenceData],
+    quality: int = 92,
+    intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
+) -> None:
+    """Write sequences into `root / category` in CO3D's layout; the same input gives the same bytes.
+
+    Sequences that are there already stay; one of the same name is replaced. `quality` is JPEG's (0 to 100),
+    `intrinsics_format` v1's or v2's. The annotations are brought up to date after each sequence, each file in
+    one step, so an interrupted run leaves a folder that reads. Not for two writers in one category at a time.
+    Raises InputError on names that are not plain and on sequences whose parts do not fit together.
+    """
+    root, folder = Path(root), Path(root) / plain_name(category, "category")
+    frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
+    entries, keys = [], []
+    if frames_path.is_file():
+        index = read_frame_index(frames_path)
+        entries, keys = index.entries, index.keys
+    listed = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path) if sequences_path.is_file() else []
+    listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in listed]
+
+    for sequence in sequences:
+        annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
+        kept = [position for position, key in enumerate(keys) if key.sequence_name != sequence.name]
+        entries = [entries[position] for position in kept] + annotations
+        keys = [keys[position] for position in kept]
+        keys += [FrameKey(frame.sequence_name, frame.frame_number) for frame in annotations]
+        listed = [item for item in listed if item[0] != sequence.name] + [(sequence.name, annotation)]
+        write_atomic(frames_path, compress(msgspec.json.encode(entries)))
+        write_atomic(sequences_path, compress(msgspec.json.encode([entry for _, entry in listed])))
+
+
+def _write_sequence(
+    root: Path, category: str, sequence: SequenceData, quality: int, intrinsics_format: str
+) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
+    base = f"{category}/{plain_name(sequence.name, 'sequence')}"
+    if len(sequence.frames) != len(sequence.timestamps):
+        raise InputError(f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps")
+    annotations = []
+    for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps)):
+        stem = f"frame{number + 1:06d}"
+        image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
+        write_image(root / image.path, frame.rgb, quality)
+        depth = mask = None
+        if frame.depth is not None:
+            path, mask_path = f"{base}/depths/{stem}.jpg.geometric.png", f"{base}/depth_masks/{stem}.png"
+            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
+            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
+            write_binary_mask(root / mask_path, frame.depth > 0)
+        if frame.mask is not None:
+            # Summed over the stored 8-bit values: integers add up to the same on every machine.
+            mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
+            mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
+            write_mask(root / mask.path, frame.mask)
+        view = frame.camera.to_pytorch3d(intrinsics_format)
+        view = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in view.items()}
+        meta = {"frame_splits": [], "eval_batch_maps": []} if intrinsics_format == NDC_ISOTROPIC else msgspec.UNSET
+        annotations.append(
+            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, Viewpoint(**view), meta)
+        )
+    cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
+    write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
+    return annotations, SequenceAnnotation(sequence.name, category, None, cloud, sequence.viewpoint_quality)
