@@ -85,7 +85,7 @@ def cyclical_distances(
     fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     published: bool = False,
 ) -> Float[Tensor, "h1 w1"]:
-    """Cyclical distance map C_u = -d(u, u') in patches, eq. 2: v is u's neighbour in image 2, u' is v's in image 1.
+    """Cyclical distance map C_u = -d(u, u') in patches (eq. 2): u's neighbour is v in image 2, v's is u'.
 
     -inf where u, v or u' is off the foreground. published=True masks as the published code does: u' need not
     be on the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and

@@ -30,10 +30,10 @@ class Tokens:
 class TrainingTokens:
     """Everything a loss may want from one forward pass, with gradients."""
 
-    tokens: Float[Tensor, "batch n+1 dim"]  # normalised output of the last block, CLS first
+    tokens: Float[Tensor, "batch tokens dim"]  # normalised output of the last block, CLS first
     keys: Float[Tensor, "batch n dim"]  # raw keys of the patches at the key block
     key_input: Float[Tensor, "batch n dim"]  # the normalised patch tokens that those keys are a linear map of
-    cls_logits: Float[Tensor, "batch heads n+1"]  # last block, CLS to all tokens, scaled, no softmax; float32
+    cls_logits: Float[Tensor, "batch heads tokens"]  # last block, CLS to all tokens, scaled, no softmax; float32
     grid: tuple[int, int]
 
 
@@ -172,7 +172,7 @@ class VisionTransformer(nn.Module):
                 nn.init.trunc_normal_(module.weight, std=0.02)
                 nn.init.zeros_(module.bias)
 
-    def position_embedding(self, grid: tuple[int, int]) -> Float[Tensor, "1 n+1 dim"]:
+    def position_embedding(self, grid: tuple[int, int]) -> Float[Tensor, "1 tokens dim"]:
         """The stored embedding, or its bicubic interpolation where the input's patch grid is another."""
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if grid == (side, side):
@@ -196,7 +196,7 @@ class VisionTransformer(nn.Module):
         x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
         return x + self.position_embedding(grid), grid
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch n+1 dim"]:
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch tokens dim"]:
         """Normalised output tokens, CLS first."""
         x, _ = self.embed(images)
         for block in self.blocks:

@@ -1,0 +1,242 @@
+"""Backbones by name or by checkpoint file, and what makes one: images in, one FeatureMap each out.
+
+The released DINO models (Caron et al. 2021) are plain data below; "zsp-tiny" is this project's own small
+model, part of the package. Any checkpoint in the DINO layout works by its path; its geometry is read off its
+shapes.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from zsp_lite.checkpoints import build_vit, read_checkpoint
+from zsp_lite.download import cache_folder, fetch
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.vit import VisionTransformer
+
+Image = (
+    Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]
+    | Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
+)
+Precision = Literal["float32", "bfloat16"]
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # $ZSP_LITE_DINO_URL overrides it
+TINY = Path(__file__).parent / "weights" / "zsp-tiny.safetensors"
+
+
+@dataclass(frozen=True)
+class Release:
+    """A checkpoint that others host."""
+
+    file: str  # below DINO_URL
+    md5_prefix: str
+    size: int | None = None  # bytes, where known
+
+    @property
+    def url(self) -> str:
+        return os.environ.get("ZSP_LITE_DINO_URL", DINO_URL).rstrip("/") + "/" + self.file
+
+    @property
+    def path(self) -> Path:
+        return cache_folder() / Path(self.file).name
+
+
+RELEASES = {
+    "dino_vits8": Release("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
+    "dino_vits16": Release("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
+    "dino_vitb8": Release("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
+    "dino_vitb16": Release("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
+}
+
+
+class Backbone:
+    """A vision transformer ready for the method: call it on a list of images.
+
+    Attributes: name, image_size (pixels, square), patch_size, embed_dim, key_block (0-based), saliency_heads,
+    device, precision, batch_size, model.
+    """
+
+    def __init__(
+        self,
+        model: VisionTransformer,
+        name: str,
+        key_block: int | None = None,
+        saliency_heads: Sequence[int] | None = None,
+        device: str | torch.device | None = None,
+        precision: Precision = "float32",
+        batch_size: int = 8,
+    ):
+        if precision not in ("float32", "bfloat16"):
+            raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
+        if batch_size < 1:
+            raise InputError(f"batch_size: expected at least 1, got {batch_size}")
+        if key_block is None:
+            key_block = min(9, model.depth - 1)  # the paper's ninth layer
+        if saliency_heads is None:
+            # Of DINO's ViT-S these heads see objects best (Amir et al. 2021); of others nothing is known.
+            small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
+            saliency_heads = (0, 2, 4, 5) if small else range(model.num_heads)
+        saliency_heads = tuple(int(head) for head in saliency_heads)
+        if not 0 <= key_block < model.depth:
+            raise InputError(f"{name}: key_block is {key_block}, expected 0 to {model.depth - 1}")
+        if not saliency_heads or not set(saliency_heads) <= set(range(model.num_heads)):
+            raise InputError(
+                f"{name}: saliency_heads are {saliency_heads}, expected some of 0 to {model.num_heads - 1}"
+            )
+        self.name, self.key_block, self.saliency_heads = name, key_block, saliency_heads
+        self.precision, self.batch_size = precision, batch_size
+        self.image_size, self.patch_size, self.embed_dim = model.image_size, model.patch_size, model.embed_dim
+        self.device = _device(device)
+        self.model = model.to(self.device).eval().requires_grad_(False)
+
+    def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
+        """Features of (H, W, 3) images, uint8 or float in [0, 1], of any sizes, in float32 on its device.
+
+        Images are resized to the model's square (224 pixels) without keeping their aspect, as in the paper.
+        Saliency is the CLS attention averaged over the saliency heads, minimum to 0, maximum to 1. Raises
+        InputError on others.
+        """
+        features = []
+        for first in range(0, len(images), self.batch_size):
+            batch = prepare_images(images[first : first + self.batch_size], self.image_size, first)
+            features += self._extract(batch.to(self.device))
+        return features
+
+    def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
+        half = self.precision == "bfloat16"
+        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=half):
+            mean, std = (batch.new_tensor(x).view(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_STD))
+            tokens = self.model.extract((batch - mean) / std, self.key_block)
+            saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
+            low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
+            saliency = (saliency - low) / (high - low).clamp_min(1e-12)
+            grids = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
+        # Copies made outside inference mode: ordinary tensors, on which a trainable layer may be put, and
+        # which do not keep the whole batch's queries, keys and values alive.
+        return [FeatureMap(*(x.to(torch.float32, copy=True) for x in one)) for one in zip(*grids)]
+
+
+def load_backbone(
+    name_or_path: str | Path = "zsp-tiny",
+    device: str | torch.device | None = None,
+    *,
+    num_heads: int | None = None,
+    key_block: int | None = None,
+    saliency_heads: Sequence[int] | None = None,
+    precision: Precision = "float32",
+    batch_size: int = 8,
+) -> Backbone:
+    """A backbone by name ("zsp-tiny", "dino_vits8", ...: see `available_backbones`) or by checkpoint file.
+
+    DINO models are downloaded on first use to `cache_folder()`. A checkpoint is a .safetensors file or a
+    torch file of tensors alone, also nested under "teacher", "state_dict" or "model". num_heads, key_block
+    (0-based) and saliency_heads default to the file's metadata, then to the DINO conventions. device: None
+    takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises InputError
+    for unknown names, downloads that fail (saying what to do) and files that are not such a checkpoint.
+    """
+    name = str(name_or_path)
+    path = Path(name).expanduser()
+    if name in available_backbones():
+        path, label = download(name), name
+    elif path.is_file():
+        label = path.stem
+    else:
+        raise InputError(f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}")
+    weights, metadata = read_checkpoint(path)
+    model = build_vit(weights, num_heads or _metadata_int(metadata, "num_heads", path), path.name)
+    if key_block is None:
+        key_block = _metadata_int(metadata, "key_block", path)
+    if saliency_heads is None and "saliency_heads" in metadata:
+        saliency_heads = _metadata_ints(metadata, "saliency_heads", path)
+    return Backbone(model, label, key_block, saliency_heads, device, precision, batch_size)
+
+
+def available_backbones() -> dict[str, Path | None]:
+    """Every backbone that has a name, with its file, or None where that is not at hand."""
+    paths = {"zsp-tiny": TINY} | {name: release.path for name, release in RELEASES.items()}
+    return {name: path if path.is_file() else None for name, path in paths.items()}
+
+
+def download(name: str) -> Path:
+    """The file of a named backbone, fetched now where it is not at hand. Raises InputError saying what to do."""
+    if name == "zsp-tiny":
+        if not TINY.is_file():
+            raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")
+        return TINY
+    if name not in RELEASES:
+        raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
+    release = RELEASES[name]
+    try:
+        return fetch(release.url, release.path, release.size, release.md5_prefix)
+    except InputError as error:
+        raise InputError(
+            f"{name}: {error}; fetch that file elsewhere and put it at {release.path}, or use zsp-tiny"
+        ) from error
+
+
+def prepare_images(
+    images: Sequence[Image], size: int = 224, first: int = 0
+) -> Float[Tensor, "b 3 s s"]:
+    """Images (H, W, 3), uint8 or float in [0, 1], as one batch in [0, 1], resized (bilinear, antialiased).
+
+    `first` is the number of the first image in error messages. Raises InputError on other types, shapes or
+    values.
+    """
+    prepared = []
+    for index, image in enumerate(images, first):
+        try:
+            # A copy, since arrays may be read-only or flipped views, which torch does not take.
+            image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"image {index}: not an array of numbers ({type(image).__name__})") from error
+        if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+            raise InputError(f"image {index}: expected shape (H, W, 3), got {tuple(image.shape)}")
+        if image.dtype == torch.uint8:
+            image = image.to(torch.float32) / 255
+        elif image.is_floating_point():
+            image = image.to(torch.float32)
+            if not bool(((image >= 0) & (image <= 1)).all()):  # false for NaN too
+                low, high = image.min().item(), image.max().item()
+                raise InputError(f"image {index}: expected floats in [0, 1], got {low:g} to {high:g}")
+        else:
+            raise InputError(f"image {index}: expected uint8 or float in [0, 1], got {image.dtype}")
+        image = image.permute(2, 0, 1)[None]
+        if image.shape[2:] != (size, size):
+            image = F.interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=True)
+        prepared.append(image)
+    return torch.cat(prepared)
+
+
+def _device(device: str | torch.device | None) -> torch.device:
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error
+
+
+def _metadata_ints(metadata: dict[str, str], key: str, path: Path) -> list[int]:
+    try:
+        return [int(x) for x in metadata[key].strip("()[] ").split(",") if x.strip()]
+    except ValueError as error:
+        raise InputError(f"checkpoint {path}: metadata {key} {metadata[key]!r} is not integers") from error
+
+
+def _metadata_int(metadata: dict[str, str], key: str, path: Path) -> int | None:
+    values = _metadata_ints(metadata, key, path) if key in metadata else [None]
+    if len(values) != 1:
+        raise InputError(f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected one integer")
+    return values[0]

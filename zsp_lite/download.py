@@ -1,0 +1,103 @@
+"""The only place that downloads: one file over HTTP, resumed where it stopped, checked, then named."""
+
+import hashlib
+import http.client
+import os
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from tqdm import tqdm
+
+from zsp_lite.errors import InputError
+
+CHUNK = 1 << 18  # bytes
+
+
+def cache_folder() -> Path:
+    """Where downloads are kept: $ZSP_LITE_CACHE, or ~/.cache/zsp-lite."""
+    return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
+
+
+def fetch(
+    url: str, path: str | Path, size: int | None = None, md5_prefix: str = "", timeout: float = 30.0
+) -> Path:
+    """Fetch `url` to `path` unless it is there; returns `path`.
+
+    Bytes gather in `path`.part; a later call, or the next of three attempts, asks the server for the rest
+    only. The file takes its name after its size (bytes, where known) and MD5 prefix were found right. Raises
+    InputError where the server cannot be reached, keeps breaking off, or sent another file.
+    """
+    path = Path(path)
+    if path.exists():
+        return path
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for _ in range(3):
+            if _fetch_rest(url, part, size, timeout):
+                break
+        else:
+            raise InputError(
+                f"download of {url} broke off three times, last at {part.stat().st_size} bytes; "
+                f"call again to resume"
+            )
+        _check(url, part, size, md5_prefix)
+        os.replace(part, path)
+    except urllib.error.HTTPError as error:
+        raise InputError(f"download of {url} failed: HTTP {error.code} {error.reason}") from error
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "reason", error)
+        raise InputError(f"download of {url} failed: {reason}") from error
+    return path
+
+
+def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
+    """One request for what `part` lacks; True when the transfer is complete, False when it broke off."""
+    start = part.stat().st_size if part.exists() else 0
+    if size is not None and start == size:
+        return True
+    if size is not None and start > size:
+        start = 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
+    try:
+        response = urllib.request.urlopen(request, timeout=timeout)
+    except urllib.error.HTTPError as error:
+        if error.code != 416:  # "range not satisfiable": nothing beyond what we have, or another file by now
+            raise
+        if error.headers.get("Content-Range", "") == f"bytes */{start}":
+            return True
+        part.unlink()
+        return False
+    with response:
+        if start and not (
+            response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
+        ):
+            start = 0  # no Range support: the server sends everything again
+        length = response.headers.get("Content-Length")
+        total = start + int(length) if length is not None else None
+        bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)
+        with bar, open(part, "ab" if start else "wb") as file:
+            try:
+                while chunk := response.read(CHUNK):
+                    file.write(chunk)
+                    bar.update(len(chunk))
+            except (http.client.IncompleteRead, ConnectionError, TimeoutError):
+                return False
+            received = file.tell()
+    return total is None or received >= total
+
+
+def _check(url: str, part: Path, size: int | None, md5_prefix: str) -> None:
+    with open(part, "rb") as file:
+        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+    received = part.stat().st_size
+    if (size is None or received == size) and digest.startswith(md5_prefix):
+        return
+    part.unlink()  # to resume from wrong bytes would fail for ever
+    raise InputError(
+        f"download of {url} gave {received} bytes with MD5 {digest[:6]}, expected "
+        f"{size if size is not None else 'any number of'} bytes with MD5 {md5_prefix or '(any)'}; removed"
+    )
