@@ -22,12 +22,13 @@ _raises = pytest.raises
 
 @contextlib.contextmanager
 def _unchecked(expectation):
+    before = config.jaxtyping_disable
     config.update("jaxtyping_disable", True)
     try:
         with expectation as caught:
             yield caught
     finally:
-        config.update("jaxtyping_disable", False)
+        config.update("jaxtyping_disable", before)
 
 
 @wraps(_raises)
@@ -43,3 +44,31 @@ def raises(expected, *args, **kwargs):
 
 
 pytest.raises = raises
+
+
+@pytest.fixture(scope="session")
+def ellipsoids(tmp_path_factory):
+    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with labels.
+
+    Sequence "b" stands in a world that is turned, moved and unlike that of "a", the reference of the labels.
+    """
+    import numpy as np
+    from synthetic_views import look_at, render
+
+    from zsp_lite.alignment import Sim3
+    from zsp_lite.co3d import Co3D, SequenceData, write_co3d
+    from zsp_lite.labels import PoseLabel, write_label
+
+    root = tmp_path_factory.mktemp("co3d")
+    turn = look_at((0.3, -1.0, 0.4)).R
+    placements = {"a": Sim3.identity(), "b": Sim3(1.0, turn, np.array([0.1, -0.2, 0.1]))}
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    sequences = []
+    for name, placement in placements.items():
+        angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
+        frames = [render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}") for i, a in enumerate(angles)]
+        colours = np.full((50, 3), 128, np.uint8)
+        sequences.append(SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0))
+        write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
+    write_co3d(root, "ellipsoid", sequences, quality=98)
+    return Co3D(root)
