@@ -17,8 +17,8 @@ from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 
 _DEPTH_NOISE = 0.005  # of the depth, at the object
-# Unknown share of the object's and of the floor's pixels, drawn per sequence; the wall is too far to be known.
-_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.18, 0.38)
+# Unknown share of the object's and of the floor's pixels, drawn per sequence; the wall is too far away.
+_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.15, 0.35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ def smooth_noise(rng: np.random.Generator, size: tuple[int, int], sigma: float) 
 def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
     """How readily stereo would match each pixel, (H, W), in no particular unit.
 
-    High where the picture has texture at a coarse scale; low at depth edges and at grazing angles; the rest is
-    luck, in patches.
+    High where the picture has texture at a coarse scale; low at depth edges and at grazing angles; the rest
+    is luck, in patches.
     """
     rng = np.random.default_rng(seed)
     scale = min(view.mask.shape) / 100
@@ -61,11 +61,11 @@ def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float
 
 
 def stereo_depth(
-    view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.3
+    view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.25
 ) -> Float[np.ndarray, "h w"]:
     """Depth (float32, 0 = unknown) as stereo would give it, with the wanted shares of unknown pixels.
 
-    The shares hold for the object's pixels and for those of the floor. The noise is partly correlated; it is
+    The shares hold for the object's pixels and for those of the floor. The noise is mostly correlated; it is
     0.5 % of the depth at the object and grows with the square of the depth, as stereo's does.
     """
     rng = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ def stereo_depth(
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], np.clip(holes, 0, 1)))
     near = np.median(view.depth[view.mask])
-    noise = 0.8 * smooth_noise(rng, view.mask.shape, 2.0) + 0.6 * rng.standard_normal(view.mask.shape)
+    noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(view.mask.shape)
     noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
@@ -112,7 +112,7 @@ def fused_cloud(
 
 
 def observe(
-    sequence: RenderedSequence, name: str, seed: int | Sequence[int]
+    sequence: RenderedSequence, name: str, seed: int | np.random.Generator
 ) -> tuple[SequenceData, RenderedSequence]:
     """The sequence as CO3D would hold it, and its exact twin in the same unit.
 
@@ -126,7 +126,7 @@ def observe(
         shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)
         depths.append(stereo_depth(view, rng, *shares))
         masks.append(soft_mask(view.mask, rng))
-    cloud = fused_cloud(sequence.views, depths, int(rng.integers(5000, 10001)), rng)
+    cloud = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
     factor = 1 / cloud.points.std(0).mean()
     exact = rescaled(sequence, factor)
     frames = [

@@ -1,6 +1,5 @@
 """A hand-held camera walks around an object: the renderings of one sequence, in a world of its own."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from zsp_lite.synthetic.assembly import Shape
 from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.render import Rendering, Scene, orbit_pose
 
-_ASPECTS = ((1, 1), (4, 3), (3, 4), (3, 2), (2, 3))  # height : width
+_ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 _FRAME_MARGIN = 0.03  # the object keeps this share of each image side free at either end
 
 
@@ -38,7 +37,7 @@ class RenderedSequence:
 
 
 def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
-    """(height, width) of a square, portrait or landscape picture whose shorter side is `image_size` pixels."""
+    """(height, width) of a square, upright or wide picture whose shorter side is `image_size` pixels."""
     rng = np.random.default_rng(seed)
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     unit = image_size / min(tall, wide)
@@ -62,7 +61,7 @@ def handheld_sweep(
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
-    elevation = np.radians(rng.uniform(16, 28) + rng.uniform(3, 9) * wave(1, rng.choice([1, 2])))
+    elevation = np.radians(rng.uniform(19, 30) + rng.uniform(3, 9) * wave(1, rng.choice([1, 2])))
     elevation = np.clip(elevation + np.radians(rng.normal(0, 1, frames)), np.radians(10), np.radians(35))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
@@ -82,13 +81,13 @@ def handheld_sweep(
 
 
 def render_sequence(
-    shape: Shape, seed: int | Sequence[int], frames: int, image_size: int
+    shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int
 ) -> RenderedSequence:
     """Render `frames` views around `shape`; the same seed gives the same pictures.
 
     The shorter image side has `image_size` pixels. The world is the first camera's frame, so where the object
-    stands in it, and where it faces, says nothing about its category. The room always has a floor: structure from
-    motion needs something that stands still around the object.
+    stands in it, and where it faces, says nothing about its category. The room always has a floor: structure
+    from motion needs something that stands still around the object.
     """
     rng = np.random.default_rng(seed)
     scene = Scene(shape)
