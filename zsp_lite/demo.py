@@ -1,17 +1,17 @@
 """One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks reuse."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.backbones import Backbone
 from zsp_lite.co3d import Co3D
 from zsp_lite.depth import structured_point_cloud
 from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame
 from zsp_lite.labels import read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
@@ -51,7 +51,7 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
     return pairs
 
 
-def run_demo(dataset: Co3D, backbone: Backbone) -> Iterator[DemoResult]:
+def run_demo(dataset: Co3D, backbone: Callable[[Sequence[np.ndarray]], list[FeatureMap]]) -> Iterator[DemoResult]:
     """The estimates for `demo_pairs`, one after the other, with the paper's settings."""
     method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
@@ -63,12 +63,10 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
 
     Raises InputError where a frame or a label of the pair is missing.
     """
-    reference_frames = dataset.frames(pair.category, pair.reference_sequence)
-    target_frames = dataset.frames(pair.category, pair.target_sequence)
-    by_number = {frame.frame_number: frame for frame in reference_frames}
-    target_by_number = {frame.frame_number: frame for frame in target_frames}
-    reference = dataset.load(by_number[pair.reference_frame])
-    targets = [dataset.load(target_by_number[number]) for number in pair.target_frames]
+    reference = dataset.load(dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame))
+    targets = [
+        dataset.load(dataset.frame(pair.category, pair.target_sequence, number)) for number in pair.target_frames
+    ]
 
     start = time.perf_counter()
     estimate = method.estimate(reference, targets)
@@ -83,8 +81,9 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
         labels[pair.target_sequence], targets[estimate.view].camera,
     )  # fmt: skip
     error = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
-    spread = np.linspace(0, len(target_frames) - 1, min(_SEQUENCE_FRAMES, len(target_frames))).round().astype(int)
-    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(target_frames[i]) for i in spread))
+    sequence = dataset.frames(pair.category, pair.target_sequence)
+    spread = np.linspace(0, len(sequence), _SEQUENCE_FRAMES, endpoint=False).astype(int)
+    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(spread)))
 
 
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:

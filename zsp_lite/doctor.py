@@ -141,16 +141,19 @@ def _backbones() -> Iterator[Check]:
         return
     for name, path in available_backbones().items():
         if path is not None:
-            yield Check(f"backbone {name}", OK, str(path))
+            yield Check(f"backbone {name}", OK, f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
         elif name == "zsp-tiny":
-            yield Check(f"backbone {name}", BAD, "weights are not in the package", "zsp-lite train, or reinstall zsp-lite")
+            yield Check(f"backbone {name}", BAD, "its weights are not in the package", "reinstall zsp-lite, or zsp-lite train")
         else:
             yield Check(f"backbone {name}", NOTE, "not downloaded", f"zsp-lite weights fetch {name}")
 
 
 def _data(data: Path | None) -> Iterator[Check]:
-    from zsp_lite.co3d import Co3D
-
+    try:
+        from zsp_lite.co3d import Co3D
+    except (ImportError, OSError) as error:
+        yield Check("data", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
+        return
     for name, folder in data_folders(data):
         sample = name == "data_samples"
         remedy = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"

@@ -1,0 +1,115 @@
+"""The command line: help for everything, one line for bad input, never a traceback."""
+
+import subprocess
+import sys
+
+import pytest
+
+from zsp_lite import cli, errors
+
+COMMANDS = ("demo", "benchmark", "synth", "weights", "train", "profile", "doctor")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_with_an_example(command, capsys):
+    with pytest.raises(SystemExit) as exit:
+        cli.main([command, "--help"])
+    assert exit.value.code == 0
+    text = capsys.readouterr().out
+    assert "examples:" in text and f"  zsp-lite {command}" in text
+
+
+def test_help_lists_every_command(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert all(f"\n    {command}" in text for command in COMMANDS)
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; from zsp_lite.cli import build_parser; build_parser(); print('torch' in sys.modules)"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["demo", "--speed", "3"],
+        ["benchmark", "--pairs", "0"],
+        ["benchmark", "--methods", ","],
+        ["train", "--shorten", "nan"],
+        ["train", "--seed", "-1"],
+        ["synth", "--out", "x"],
+        ["synth", "--preset", "a", "--category", "b", "--out", "x"],
+        ["weights", "burn"],
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(arguments, capsys):
+    with pytest.raises(SystemExit) as exit:
+        cli.main(arguments)
+    assert exit.value.code == 2
+    assert_one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (["demo", "--data", "no/such/folder"], "no/such/folder"),
+        (["demo", "--backbone", "resnet"], "resnet"),
+        (["benchmark", "--data", "no/such/folder"], "no/such/folder"),
+        (["benchmark", "--methods", "magic"], "magic"),
+        (["weights", "fetch"], "expected one of zsp-tiny"),
+        (["weights", "fetch", "resnet"], "resnet"),
+        (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, names, capsys, ellipsoids):
+    data = [] if "--data" in arguments or arguments[0] == "weights" else ["--data", str(ellipsoids.root)]
+    assert cli.main(arguments + data) == 2
+    assert names in assert_one_line(capsys)
+
+
+def test_a_category_that_is_not_there_is_named_with_those_that_are(capsys, ellipsoids):
+    assert cli.main(["benchmark", "--data", str(ellipsoids.root), "--categories", "ellipsoid,cube"]) == 2
+    assert "cube" in (line := assert_one_line(capsys)) and "ellipsoid" in line
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (errors.InputError("two\nlines"), 2),
+        (PermissionError(13, "Permission denied", "/there"), 2),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_what_goes_wrong_inside_a_command_is_one_line(error, code, monkeypatch, capsys):
+    def fail(arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "_doctor", fail)
+    assert cli.main(["doctor"]) == code
+    assert_one_line(capsys)
+
+
+def test_the_doctor_names_each_thing_and_says_what_is_missing(capsys, ellipsoids):
+    code = cli.main(["doctor", "--data", str(ellipsoids.root)])
+    text = capsys.readouterr().out
+    for name in ("Python", "torch", "open3d loads", "backbone zsp-tiny", "data: --data", "Jupyter"):
+        assert name in text
+    assert (code == 0) == ("All essentials are there." in text)
+
+
+def test_the_weights_list_has_every_name(capsys):
+    assert cli.main(["weights", "list"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
+
+
+def assert_one_line(capsys) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("zsp-lite: ") and captured.err.count("\n") == 1
+    return captured.err

@@ -1,0 +1,65 @@
+"""The doctor sees what is missing and names the command that mends it."""
+
+import pytest
+from packaging.requirements import Requirement
+
+from zsp_lite import doctor
+from zsp_lite.doctor import BAD, NOTE, OK, Check
+
+
+@pytest.mark.parametrize(
+    ("installed", "pinned", "state"),
+    [
+        ("2.13.0", "2.13.0", OK),
+        ("2.13.0+cpu", "2.13.0", OK),  # another build of the pinned version
+        ("2.14.0", "2.13.0", NOTE),
+        ("2.14.0", None, OK),
+        ("1.9.0", "2.13.0", BAD),
+        (None, "2.13.0", BAD),
+    ],
+)
+def test_a_package_is_held_against_its_range_and_its_pin(installed, pinned, state):
+    check = doctor.compare(Requirement("torch>=2.4"), installed, pinned)
+    assert check.state == state
+    assert bool(check.remedy) == (state != OK)
+
+
+def test_pins_are_read_for_this_platform_only():
+    text = "# comment\n\ntorch==2.13.0\nNumPy==2.0 ; python_version >= '3.11'\nopen3d==1.0 ; python_version < '3'\nloose>=1\n"
+    assert doctor.read_pins(text) == {"torch": "2.13.0", "numpy": "2.0"}
+
+
+def test_the_tested_environment_pins_every_dependency_within_its_range():
+    import tomllib
+
+    pins = doctor.read_pins((doctor.REPOSITORY / "environment.txt").read_text())
+    project = tomllib.loads((doctor.REPOSITORY / "pyproject.toml").read_text())["project"]
+    optional = [one for extra in ("notebooks", "test") for one in project["optional-dependencies"][extra]]
+    for requirement in map(Requirement, project["dependencies"] + optional):
+        if requirement.marker is None or requirement.marker.evaluate():
+            assert pins[requirement.name] in requirement.specifier, requirement
+
+
+def test_one_missing_essential_is_enough_to_be_unhealthy():
+    fine, extra, broken = Check("a", OK, ""), Check("b", NOTE, "", "do"), Check("c", BAD, "", "do")
+    assert doctor.healthy([fine, extra]) and not doctor.healthy([fine, broken])
+
+
+def test_data_is_looked_for_in_the_given_folder_then_the_variable_then_the_samples(monkeypatch, tmp_path):
+    monkeypatch.setenv(doctor.DATA_VARIABLE, "/from/variable")
+    names = [name for name, _ in doctor.data_folders(tmp_path)]
+    assert names == ["--data", doctor.DATA_VARIABLE, "data_samples"]
+    monkeypatch.delenv(doctor.DATA_VARIABLE)
+    assert [name for name, _ in doctor.data_folders()] == ["data_samples"]
+
+
+def test_categories_found_are_named(ellipsoids):
+    found = {check.name: check for check in doctor.examine(ellipsoids.root)}
+    assert found["data: --data"].state == OK and "ellipsoid" in found["data: --data"].found
+
+
+def test_a_folder_that_is_not_there_is_bad_where_it_was_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setenv(doctor.DATA_VARIABLE, str(tmp_path / "nowhere"))
+    found = {check.name: check for check in doctor.examine()}
+    assert found[f"data: {doctor.DATA_VARIABLE}"].state == BAD
+    assert all(check.remedy for check in found.values() if check.state != OK)

@@ -1,0 +1,105 @@
+"""The demo on a folder with a known answer, and the page made of it."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from synthetic_views import CoordinateBackbone
+
+from zsp_lite.demo import demo_pairs, object_cloud, run_demo
+from zsp_lite.report import page, table_row, write_report
+
+
+@pytest.fixture(scope="module")
+def results(ellipsoids):
+    return list(run_demo(ellipsoids, CoordinateBackbone()))
+
+
+@pytest.fixture(scope="module")
+def text(results):
+    return page(results, "some/folder", "synthetic ellipsoids <made here>", "coordinates")
+
+
+def test_the_demo_finds_the_pose_where_features_are_perfect(results):
+    assert [result.pair.category for result in results] == ["ellipsoid"]
+    assert results[0].error < 6
+    assert results[0].estimate.inliers.sum() > 20
+
+
+def test_pairs_are_the_same_every_time(ellipsoids):
+    assert demo_pairs(ellipsoids) == demo_pairs(ellipsoids)
+
+
+def test_shipped_evaluation_pairs_come_first(ellipsoids):
+    from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+
+    pairs = sample_pairs(ellipsoids, "ellipsoid", 3, 2, seed=11)
+    path = upstream_pairs_path(ellipsoids.root, "ellipsoid", 3, 2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_upstream_pairs(path, pairs, ellipsoids)
+    assert demo_pairs(ellipsoids, n_targets=2) == pairs[:1]
+
+
+def test_the_object_cloud_is_the_visible_surface(results):
+    cloud = object_cloud(results[0].estimate.reference_view, most=500)
+    assert cloud.shape == (500, 3)
+    # The cameras stand 4 away from the middle of an object that reaches 1.6.
+    assert (np.abs(cloud[:, 2] - 4) < 1.7).all()
+
+
+def test_the_table_says_what_the_estimate_says(results):
+    category, view, inliers, error, seconds = table_row(results[0])
+    estimate = results[0].estimate
+    assert (category, view) == ("ellipsoid", f"{estimate.view + 1} of 5")
+    assert inliers == f"{estimate.inliers.sum()} of {len(estimate.inliers)}"
+    assert error.endswith("°") and seconds.endswith(" s")
+
+
+class Outline(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.images, self.links, self.open = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        if tag == "img":
+            self.images.append(attributes)
+        self.links += [attributes[name] for name in ("src", "href") if name in attributes]
+        if tag not in ("img", "meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_well_formed_and_needs_nothing_beside_itself(text):
+    outline = Outline()
+    outline.feed(text)
+    assert not outline.open
+    assert outline.links and all(link.startswith(("data:image/", "#pair-")) for link in outline.links)
+    assert len(text) < 12_000_000
+
+
+def test_every_stage_is_on_the_page_and_every_picture_is_described(text):
+    outline = Outline()
+    outline.feed(text)
+    for stage in ("Reference and target views", "Saliency", "Cyclical distances", "Correspondences",
+                  "Aligned point clouds", "The pose over the target sequence"):  # fmt: skip
+        assert text.count(f"<h3>{stage}</h3>") == 1
+    assert len(outline.images) == 5
+    assert all(len(image["alt"]) > 20 for image in outline.images)
+
+
+def test_plotly_is_inline_once_and_draws_each_scene(text):
+    assert len(re.findall(r"Plotly\.newPlot\(", text)) == 1
+    assert "plotly.js v" in text
+
+
+def test_what_comes_from_outside_is_escaped(text):
+    assert "&lt;made here&gt;" in text and "<made here>" not in text
+
+
+def test_the_report_is_written_where_asked(results, tmp_path):
+    path = write_report(tmp_path / "deep" / "report.html", results, "folder", "note", "name")
+    assert path.read_text().startswith("<!doctype html>")

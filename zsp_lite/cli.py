@@ -1,0 +1,318 @@
+"""The command `zsp-lite`: arguments in, library calls, what they found as text. Nothing is computed here.
+
+What a subcommand needs is imported inside it, so that `--help` answers at once.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from zsp_lite.errors import InputError
+
+SYNTHETIC_NOTE = (
+    "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and soft masks as "
+    "CO3D has them. No photograph, and no object or category that the backbone was trained on."
+)
+USER_NOTE = "a folder in CO3D's layout, as given."
+
+
+class Parser(argparse.ArgumentParser):
+    """Answers wrong usage with one line on stderr and exit code 2."""
+
+    def error(self, message: str):
+        self.exit(2, f"zsp-lite: error: {message} (see: {self.prog} --help)\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, 1 (a check failed), 2 (bad input), 130 (interrupted)."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        return arguments.run(arguments) or 0
+    except InputError as error:
+        message = str(error)
+    except OSError as error:  # a folder that may not be written, a full disk
+        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    except KeyboardInterrupt:
+        print("zsp-lite: interrupted", file=sys.stderr)
+        return 130
+    print(f"zsp-lite: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        prog="zsp-lite",
+        description="Zero-shot category-level object pose estimation: demo, benchmark, data, backbone.",
+        epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr, exit code 2.",
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
+    for add in (_add_demo, _add_benchmark, _add_synth, _add_weights, _add_train, _add_profile, _add_doctor):
+        add(commands)
+    return parser
+
+
+def _command(commands, name: str, run: Callable, summary: str, examples: Sequence[str]) -> Parser:
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog="examples:\n" + "\n".join(f"  zsp-lite {example}" for example in examples),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected a positive whole number")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected a whole number, 0 or more")
+    return int(text)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected a positive number")
+    return value
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas")
+    return names
+
+
+def _add_data(parser: Parser) -> None:
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR",
+        help="a folder in CO3D's layout (default: $ZSP_LITE_DATA, else data_samples)",
+    )  # fmt: skip
+
+
+def _add_backbone(parser: Parser) -> None:
+    parser.add_argument(
+        "--backbone", default="zsp-tiny", metavar="NAME",
+        help="zsp-tiny, dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, or a checkpoint file (default: zsp-tiny)",
+    )  # fmt: skip
+
+
+def _add_demo(commands) -> None:
+    parser = _command(
+        commands, "demo", _demo, "one pair of each category, end to end: a table, and a report with every stage",
+        ["demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"],
+    )  # fmt: skip
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)")
+    _add_backbone(parser)
+    parser.add_argument("--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="default: outputs/demo")
+
+
+def _demo(arguments: argparse.Namespace) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")  # draws files, needs no display
+    from rich.console import Console
+    from rich.table import Table
+
+    from zsp_lite.backbones import load_backbone
+    from zsp_lite.co3d import Co3D
+    from zsp_lite.demo import run_demo
+    from zsp_lite.doctor import sample_data
+    from zsp_lite.report import table_row, write_report
+    from zsp_lite.synthetic.export import SETTINGS_FILE
+
+    console = Console()
+    folder = arguments.data or sample_data()
+    note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
+    table = Table(title=f"One pair of each category in {folder}, backbone {arguments.backbone}")
+    for column in ("category", "chosen view", "inliers", "rotation error", "time"):
+        table.add_column(column, justify="left" if column == "category" else "right")
+    results = []
+    with console.status("estimating"):
+        for result in run_demo(Co3D(folder), load_backbone(arguments.backbone)):
+            results.append(result)
+            table.add_row(*table_row(result))
+    console.print(table)
+    with console.status("writing the report"):
+        path = write_report(arguments.out / "report.html", results, str(folder), note, arguments.backbone)
+    console.print(f"Data: {note}", highlight=False)
+    console.print(f"Every stage in pictures: {path}", soft_wrap=True)
+
+
+def _add_benchmark(commands) -> None:
+    parser = _command(
+        commands, "benchmark", _benchmark, "rotation errors over many pairs: summary.json, pairs.jsonl and a table",
+        ["benchmark", "benchmark --data outputs/eval --pairs 30 --methods ours,ours-bv,rootsift --out outputs/benchmark"],
+    )  # fmt: skip
+    _add_data(parser)
+    _add_backbone(parser)
+    parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all of the folder's")
+    parser.add_argument("--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)")
+    parser.add_argument("--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)")
+    parser.add_argument(
+        "--methods", type=_names, default=["ours", "ours-bv", "rootsift"], metavar="A,B",
+        help="rows of the table (default: ours,ours-bv,rootsift)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=_seed, default=0, help="of the pairs drawn (default: 0)")
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmark"), metavar="DIR")
+
+
+def _benchmark(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from tqdm import tqdm
+
+    from zsp_lite.benchmark.run import evaluate
+    from zsp_lite.doctor import data_folders
+
+    root = data_folders(arguments.data)[0][1]
+    with tqdm(unit="pair", delay=1, disable=None) as bar:  # silent where the input is refused, and in logs
+
+        def progress(done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.refresh()
+
+        summary = evaluate(
+            root, arguments.backbone, arguments.methods, arguments.pairs, arguments.targets, arguments.seed,
+            arguments.out, arguments.categories, progress,
+        )  # fmt: skip
+    table = Table(title=f"{root}, backbone {arguments.backbone}, {arguments.targets} target views")
+    for column in ("method", "pairs", "median (degrees)", "Acc30 (%)", "95 % interval", "Acc15 (%)"):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for name, figures in summary["methods"].items():
+        low, high = figures["acc30_ci"]
+        table.add_row(
+            name, str(figures["n"]), f"{figures['median']:.1f}", f"{figures['acc30']:.1f}", f"{low:.1f} to {high:.1f}",
+            f"{figures['acc15']:.1f}",
+        )  # fmt: skip
+    console = Console()
+    console.print(table)
+    console.print(f"Written: {arguments.out / 'summary.json'}", soft_wrap=True)
+
+
+def _add_synth(commands) -> None:
+    parser = _command(
+        commands, "synth", _synth, "make procedural objects as a folder in CO3D's layout, bit for bit from a seed",
+        [
+            "synth --preset samples --out data_samples",
+            "synth --preset eval --out outputs/eval",
+            "synth --category chair --category teddybear --sequences 4 --frames 24 --seed 7 --out outputs/mine",
+        ],
+    )  # fmt: skip
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--preset", metavar="NAME", help="samples (what data_samples/ holds) or eval")
+    what.add_argument("--category", action="append", metavar="NAME", help="a category; may be given more than once")
+    parser.add_argument("--sequences", type=_count, default=4, metavar="N", help="per category (default: 4)")
+    parser.add_argument("--frames", type=_count, default=24, metavar="N", help="per sequence (default: 24)")
+    parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _synth(arguments: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from zsp_lite.synthetic.export import export_categories, export_preset
+
+    out, seed = arguments.out, arguments.seed
+    if arguments.preset:
+        export_preset(arguments.preset, out, seed, progress=tqdm)
+    else:
+        export_categories(arguments.category, out, arguments.sequences, arguments.frames, seed, progress=tqdm)
+    print(f"Written: {out}")
+
+
+def _add_weights(commands) -> None:
+    parser = _command(
+        commands, "weights", _weights, "backbones: which are at hand, fetch one, check a file",
+        ["weights list", "weights fetch dino_vits8", "weights verify dino_vits8", "weights verify path/to/checkpoint.pth"],
+    )  # fmt: skip
+    parser.add_argument("action", choices=("list", "fetch", "verify"))
+    parser.add_argument("name", nargs="?", help="a backbone's name (verify: or a checkpoint file)")
+
+
+def _weights(arguments: argparse.Namespace) -> None:
+    from zsp_lite.backbones import available_backbones, download, load_backbone
+
+    backbones, name = available_backbones(), arguments.name
+    if arguments.action == "list":
+        for known, path in backbones.items():
+            print(f"{known:12} {path or f'not at hand: zsp-lite weights fetch {known}'}")
+        return
+    if name is None:
+        raise InputError(f"weights {arguments.action} needs a name, expected one of {', '.join(backbones)}")
+    if arguments.action == "fetch":
+        print(f"At hand: {download(name)}")
+        return
+    if name in backbones and backbones[name] is None:
+        raise InputError(f"{name} is not at hand; zsp-lite weights fetch {name}")
+    load_backbone(name)  # refuses what is damaged, not finite or of another layout
+    print(f"{name}: complete, and loads")
+
+
+def _add_train(commands) -> None:
+    parser = _command(
+        commands, "train", _train, "train the embedded backbone from random weights, or resume a run; hours on a CPU",
+        ["train --out outputs/train", "train --out outputs/try --shorten 0.02 --objects 60"],
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("outputs/train"), metavar="DIR",
+                        help="config, log, checkpoint and weights; a run found there is resumed (default: outputs/train)")  # fmt: skip
+    parser.add_argument("--renders", type=Path, metavar="DIR", help="training renders (default: OUT/renders)")
+    parser.add_argument("--objects", type=_count, metavar="N", help="training objects (default: the configuration's)")
+    parser.add_argument("--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F")
+    parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    from zsp_lite.training.train import TrainingConfig, train
+
+    config = TrainingConfig(seed=arguments.seed).shortened(arguments.shorten)
+    if arguments.objects:
+        config = replace(config, objects=arguments.objects)
+    print(f"Written: {train(config, arguments.out, arguments.renders)}")
+
+
+def _add_profile(commands) -> None:
+    _command(
+        commands, "profile", _profile, "time and memory of every stage, against the plain loops they replace", ["profile"]
+    )
+
+
+def _profile(arguments: argparse.Namespace) -> None:
+    from zsp_lite.benchmark.profile import profile
+
+    for line in profile():
+        print(line)
+
+
+def _add_doctor(commands) -> None:
+    parser = _command(
+        commands, "doctor", _doctor, "what is installed and at hand, and the command that mends what is missing",
+        ["doctor", "doctor --data path/to/co3d"],
+    )  # fmt: skip
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a CO3D folder to look at besides the usual ones")
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from zsp_lite.doctor import BAD, examine, healthy
+
+    checks = examine(arguments.data)
+    width = max(len(check.name) for check in checks)
+    for check in checks:
+        print(f"{check.state:4}  {check.name:{width}}  {check.found}")
+        if check.remedy:
+            print(f"{'':4}  {'':{width}}  -> {check.remedy}")
+    missing = [check.name for check in checks if check.state == BAD]
+    print("All essentials are there." if not missing else f"Missing or broken: {', '.join(missing)}.")
+    return 0 if healthy(checks) else 1
