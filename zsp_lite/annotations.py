@@ -41,7 +41,9 @@ class MaskAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 
 class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """PyTorch3D camera: row vectors, +x left, +y up; intrinsics in the units of `intrinsics_format` (absent in v1)."""
+    """PyTorch3D camera: row vectors, +x left, +y up; intrinsics in the units of `intrinsics_format`
+    (absent in v1).
+    """
 
     R: tuple[Triple, Triple, Triple]
     T: Triple
@@ -51,7 +53,9 @@ class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class FrameAnnotation(msgspec.Struct, frozen=True):
-    """One frame: its 0-based number in its sequence, its time (s), its files and its camera; `meta` is v2's."""
+    """One frame: its 0-based number in its sequence, its time (s), its files and its camera; `meta` is
+    v2's.
+    """
 
     sequence_name: str
     frame_number: int
@@ -105,7 +109,10 @@ class FrameIndex:
         return self.of_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """The decoded entry. Raises InputError that names the file, the frame and the field that does not fit."""
+        """The decoded entry.
+
+        Raises InputError that names the file, the frame and the field that does not fit.
+        """
         key = self.keys[position]
         where = f"{self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
         return decode(self.entries[position], FrameAnnotation, where)

@@ -44,7 +44,9 @@ class Camera:
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("principal_point", (2,))):
             object.__setattr__(self, name, _finite(getattr(self, name), shape, f"camera {name}"))
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
-            raise InputError(f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
+            raise InputError(
+                f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1"
+            )
         if (self.focal <= 0).any():
             raise InputError(f"camera focal is {self.focal.tolist()}, expected positive pixels")
         object.__setattr__(self, "size", _image_size(self.size))
@@ -71,10 +73,14 @@ class Camera:
         size = _image_size(size)
         scale, centre = _ndc(size, intrinsics_format)
         # NDC's axes point left and up like the camera's, pixels' right and down: hence the minus.
-        return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
+        return cls(
+            _AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size
+        )
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy float64."""
+        """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy
+        float64.
+        """
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,
@@ -125,7 +131,7 @@ class Camera:
         return pixels, depth
 
     def unproject_camera(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"]
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float
     ) -> Float[np.ndarray, "*batch 3"]:
         """Camera-frame points seen at `pixels` (x, y) at `depth` along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
@@ -133,7 +139,7 @@ class Camera:
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
 
     def unproject(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"]
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float
     ) -> Float[np.ndarray, "*batch 3"]:
         """World points seen at `pixels` (x, y) at `depth`: the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
@@ -147,7 +153,9 @@ class Camera:
         """The camera of the image resized to (height, width): both intrinsics scale, per axis."""
         size = _image_size(size)
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
-        return replace(self, focal=self.focal * scale, principal_point=self.principal_point * scale, size=size)
+        return replace(
+            self, focal=self.focal * scale, principal_point=self.principal_point * scale, size=size
+        )
 
 
 def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:

@@ -53,7 +53,9 @@ class Co3D:
         """Raises InputError where `root` is not a folder."""
         self.root = Path(root)
         if not self.root.is_dir():
-            raise InputError(f"data folder {root} does not exist, expected a folder with CATEGORY/{FRAMES_FILE}")
+            raise InputError(
+                f"data folder {root} does not exist, expected a folder with CATEGORY/{FRAMES_FILE}"
+            )
         self._index: tuple[str, FrameIndex] | None = None
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 
@@ -62,14 +64,21 @@ class Co3D:
         return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
 
     def sequences(self, category: str) -> list[SequenceAnnotation]:
-        """The category's sequences in file order. Raises InputError on what cannot be read or lacks a field."""
+        """The category's sequences in file order.
+
+        Raises InputError on what cannot be read or lacks a field.
+        """
         if category not in self._sequences:
             path = self._category_folder(category) / SEQUENCES_FILE
             self._sequences[category] = decode(decompress(path), list[SequenceAnnotation], path)
         return list(self._sequences[category])
 
     def select(
-        self, category: str, viewpoint_quality: float = 1.25, point_cloud_quality: float = 0.3, top: int | None = 10
+        self,
+        category: str,
+        viewpoint_quality: float = 1.25,
+        point_cloud_quality: float = 0.3,
+        top: int | None = 10,
     ) -> list[SequenceAnnotation]:
         """The sequences worth labelling: both scores above their bounds, best point clouds first, at most
         `top`.
@@ -78,18 +87,21 @@ class Co3D:
         """
         scored = []
         for sequence in self.sequences(category):
-            score = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            views = sequence.viewpoint_quality_score
-            if score is not None and score > point_cloud_quality and views is not None and views > viewpoint_quality:
+            cloud, views = sequence.point_cloud, sequence.viewpoint_quality_score
+            score = None if cloud is None else cloud.quality_score
+            if None not in (score, views) and score > point_cloud_quality and views > viewpoint_quality:
                 scored.append((-score, sequence.sequence_name, sequence))
         return [sequence for *_, sequence in sorted(scored, key=lambda item: item[:2])[:top]]
 
     def frame_list(self, category: str) -> list[FrameKey]:
-        """Which frame stands at each position of the category's annotation file (what upstream's ids count)."""
+        """Which frame stands at each position of the annotation file (what upstream's ids count)."""
         return self._frame_index(category).keys
 
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
-        """The sequence's frames by frame number. Raises InputError on an unknown sequence or a missing field."""
+        """The sequence's frames by frame number.
+
+        Raises InputError on an unknown sequence or a missing field.
+        """
         index = self._frame_index(category)
         return [index.frame(position) for position in index.positions(sequence)]
 
@@ -125,7 +137,8 @@ class Co3D:
             reader = functools.partial(read_depth, scale_adjustment=annotation.depth.scale_adjustment)
             depth = self._read(reader, annotation.depth.path, size)
             if annotation.depth.mask_path is not None:
-                depth = np.where(self._read(read_mask, annotation.depth.mask_path, size) > 0, depth, np.float32(0))
+                usable = self._read(read_mask, annotation.depth.mask_path, size) > 0
+                depth = np.where(usable, depth, np.float32(0))
         return Frame(rgb, depth, mask, camera, name)
 
     def point_cloud(
@@ -155,7 +168,9 @@ class Co3D:
         path = path_inside(self.root, relative)
         image = reader(path)
         if image.shape[:2] != tuple(size):
-            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}")
+            raise InputError(
+                f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}"
+            )
         return image
 
     def _category_folder(self, category: str) -> Path:
@@ -174,7 +189,7 @@ class Co3D:
 
 @dataclass(frozen=True, eq=False)
 class SequenceData:
-    """A sequence to be written: frames and their times (s), point cloud in the world of the frames, and scores."""
+    """A sequence to be written: frames, their times (s), the point cloud in the frames' world, and scores."""
 
     name: str
     frames: Sequence[Frame]
@@ -207,8 +222,10 @@ def write_co3d(
     if frames_path.is_file():
         index = read_frame_index(frames_path)
         entries, keys = index.entries, index.keys
-    listed = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path) if sequences_path.is_file() else []
-    listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in listed]
+    listed = []
+    if sequences_path.is_file():
+        raws = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path)
+        listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in raws]
 
     for sequence in sequences:
         annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
@@ -226,9 +243,11 @@ def _write_sequence(
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     if len(sequence.frames) != len(sequence.timestamps):
-        raise InputError(f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps")
+        raise InputError(
+            f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps"
+        )
     annotations = []
-    for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps)):
+    for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps, strict=True)):
         stem = f"frame{number + 1:06d}"
         image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
         write_image(root / image.path, frame.rgb, quality)
@@ -244,10 +263,12 @@ def _write_sequence(
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)
         view = frame.camera.to_pytorch3d(intrinsics_format)
-        view = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in view.items()}
-        meta = {"frame_splits": [], "eval_batch_maps": []} if intrinsics_format == NDC_ISOTROPIC else msgspec.UNSET
+        arrays = {name: value.tolist() for name, value in view.items() if isinstance(value, np.ndarray)}
+        view = Viewpoint(**view | arrays)
+        is_v2 = intrinsics_format == NDC_ISOTROPIC
+        meta = {"frame_splits": [], "eval_batch_maps": []} if is_v2 else msgspec.UNSET
         annotations.append(
-            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, Viewpoint(**view), meta)
+            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta)
         )
     cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)

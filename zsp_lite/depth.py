@@ -37,7 +37,9 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     depth = np.ascontiguousarray(depth, dtype=np.float32)
     known = np.isfinite(depth) & (depth > 0)
     if not known.any():
-        raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
+        raise InputError(
+            f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0"
+        )
     if known.all():
         return depth.copy()
     low, high = depth[known].min(), depth[known].max()
@@ -67,16 +69,16 @@ def patch_points(
     """
     depth = np.asarray(depth, dtype=np.float32)
     _check_size(depth, camera)
-    if not all(0 < cells <= pixels for cells, pixels in zip(grid, depth.shape)):
+    if not all(0 < cells <= pixels for cells, pixels in zip(grid, depth.shape, strict=True)):
         raise InputError(f"patch grid is {tuple(grid)}, expected between 1 and the image's {depth.shape}")
-    (rows, row_valid, row_middle), (cols, col_valid, col_middle) = (_bands(*pair) for pair in zip(depth.shape, grid))
+    rows, row_valid, row_middle = _bands(depth.shape[0], grid[0])
+    cols, col_valid, col_middle = _bands(depth.shape[1], grid[1])
 
-    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where nothing is
-    # known.
+    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where unknown.
     shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
     pixel = np.broadcast_to(rows[:, None, :, None] * depth.shape[1] + cols[None, :, None, :], shape)
     pixel = pixel.reshape(*shape[:2], -1)
-    valid = np.broadcast_to(row_valid[:, None, :, None] & col_valid[None, :, None, :], shape).reshape(pixel.shape)
+    valid = (row_valid[:, None, :, None] & col_valid[None, :, None, :]).reshape(pixel.shape)
     values = depth.ravel()[pixel]
     values = np.where(valid & np.isfinite(values) & (values > 0), values, np.inf)
 
@@ -84,15 +86,18 @@ def patch_points(
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
     chosen = np.take_along_axis(np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1)
-    index = np.where(known, np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
-                     row_middle[:, None] * depth.shape[1] + col_middle)
+    index = np.where(
+        known,
+        np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
+        row_middle[:, None] * depth.shape[1] + col_middle,
+    )
     filled = depth if known.all() else inpaint_depth(depth)
     y, x = np.divmod(index, depth.shape[1])
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), filled.ravel()[index]), known
 
 
 def _bands(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`count` bands over `length` pixels: pixel indices (count, widest), which are the band's own, band centres."""
+    """`count` bands over `length` pixels: indices (count, widest), which are the band's own, band centres."""
     edges = np.arange(count + 1) * length // count
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]

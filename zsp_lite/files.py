@@ -25,7 +25,7 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:
-    """The bytes of `path`; InputError naming `what` ("image", "frame annotations", ...) where it cannot be read."""
+    """The bytes of `path`; InputError naming `what` it should be ("image", ...) where it cannot be read."""
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -34,7 +34,9 @@ def read_bytes(path: str | Path, what: str) -> bytes:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """`root / relative`, resolved; InputError where that leaves `root` (by `..`, an absolute path or a link)."""
+    """`root / relative`, resolved; InputError where that leaves `root` (by `..`, an absolute path or a
+    link).
+    """
     resolved_root = Path(root).resolve()
     try:
         resolved = (resolved_root / relative).resolve()
@@ -48,6 +50,6 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 def plain_name(name: str, what: str) -> str:
     """`name`, where it is fit to be one folder's or file's; InputError where it would lead elsewhere."""
-    if not isinstance(name, str) or not name or name.startswith(".") or any(c in '/\\:\0' for c in name):
+    if not isinstance(name, str) or not name or name.startswith(".") or any(c in "/\\:\0" for c in name):
         raise InputError(f"{what} name is {name!r}, expected a plain folder name")
     return name

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Real, UInt8
+from jaxtyping import Bool, Float32, Real, UInt8
 
 from zsp_lite.cameras import Box, Camera
 from zsp_lite.depth import decode_depth, encode_depth
@@ -15,8 +15,7 @@ from zsp_lite.files import read_bytes, write_atomic
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image, and, where known, its depth (0 = unknown pixel), object mask (probability in [0, 1]) and
-    name.
+    """An image and, where known, its depth (0 = unknown pixel) and object mask (probability in [0, 1]).
 
     Depth is along +z in the unit of the camera's world. Raises InputError where the parts do not fit together
     or hold values outside their range.
@@ -31,10 +30,12 @@ class Frame:
     def __post_init__(self):
         rgb = np.asarray(self.rgb)
         if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-            raise InputError(f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)")
+            raise InputError(
+                f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)"
+            )
         if rgb.shape[:2] != self.camera.size:
             raise InputError(
-                f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's image size {self.camera.size}"
+                f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's {self.camera.size}"
             )
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", np.inf), ("mask", 1.0)):
@@ -42,10 +43,14 @@ class Frame:
                 continue
             values = np.asarray(getattr(self, name), dtype=np.float32)
             if values.shape != rgb.shape[:2]:
-                raise InputError(f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}")
+                raise InputError(
+                    f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}"
+                )
             if not np.isfinite(values).all() or values.min() < 0 or values.max() > top:
                 expected = "values in [0, 1]" if name == "mask" else "finite values, 0 where unknown"
-                raise InputError(f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}")
+                raise InputError(
+                    f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}"
+                )
             object.__setattr__(self, name, values)
 
     @property
@@ -54,12 +59,11 @@ class Frame:
 
 
 def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
-    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown and kept in the
-    image.
+    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown, within the image.
 
     Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where
-    no pixel passes, the threshold is lowered in steps of 0.05, down to "above 0". Raises InputError on an
-    empty mask.
+    no pixel passes, the threshold is lowered in steps of 0.05, down to "above 0".
+    Raises InputError on an empty mask.
     """
     mask = np.asarray(mask)
     if mask.ndim != 2 or not (mask > 0).any():
@@ -72,7 +76,10 @@ def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: f
 
 
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
-    """The frame cut to its object's box (see `object_box`). Raises InputError without a mask or with an empty one."""
+    """The frame cut to its object's box (see `object_box`).
+
+    Raises InputError without a mask or with an empty one.
+    """
     if frame.mask is None:
         raise InputError(f"{frame._label} has no object mask, expected one to crop to")
     try:
@@ -86,7 +93,9 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
     top, left, height, width = box
     image_height, image_width = frame.camera.size
     if min(box) < 0 or height == 0 or width == 0 or top + height > image_height or left + width > image_width:
-        raise InputError(f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}")
+        raise InputError(
+            f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}"
+        )
     cut = np.s_[top : top + height, left : left + width]
     return replace(
         frame,
@@ -106,26 +115,36 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     shrinks = height <= old_height and width <= old_width
-    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    rgb = cv2.resize(
+        frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
     depth, mask = frame.depth, frame.mask
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
         depth = depth[np.ix_(rows, cols)]
     if mask is not None:
-        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
+        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(
+            0, 1
+        )
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """An image file's colours, in the pixel grid as stored. Raises InputError where it is missing or corrupt."""
+    """An image file's colours, in the pixel grid as stored.
+
+    Raises InputError where it is missing or corrupt.
+    """
     # An orientation tag would turn the picture against the camera that belongs to its stored pixels.
     image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """An 8-bit (or 1-bit) mask file as probabilities in [0, 1]. Raises InputError where missing or corrupt."""
+    """An 8-bit (or 1-bit) mask file as probabilities in [0, 1].
+
+    Raises InputError where missing or corrupt.
+    """
     return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
@@ -176,7 +195,9 @@ def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     except cv2.error:  # a header that promises more pixels than OpenCV accepts
         image = None
     if image is None:
-        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG")
+        raise InputError(
+            f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG"
+        )
     return image
 
 

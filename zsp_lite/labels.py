@@ -22,15 +22,21 @@ from zsp_lite.files import plain_name, read_bytes, write_atomic
 _RIGID_TOLERANCE = 1e-3
 
 
+_Row = tuple[float, float, float, float]
+
+
 class _LabelFile(msgspec.Struct):
-    trans: list[list[float]]
+    trans: tuple[_Row, _Row, _Row, _Row]
     seq: str
     reference_seq: str
 
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """`trans` (4, 4) takes points of `reference_seq`'s cloud into `seq`'s world. InputError where it is not rigid."""
+    """`trans` (4, 4) takes points of `reference_seq`'s cloud into `seq`'s world.
+
+    InputError where it is not rigid.
+    """
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -40,19 +46,29 @@ class PoseLabel:
         try:
             trans = np.array(self.trans, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"label of {self.seq} has trans {self.trans!r}, expected a 4x4 matrix") from error
+            raise InputError(
+                f"label of {self.seq} has trans {self.trans!r}, expected a 4x4 matrix"
+            ) from error
         if trans.shape != (4, 4) or not np.isfinite(trans).all():
             raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a finite 4x4 matrix")
         rotation = trans[:3, :3]
-        deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
+        deviation = max(
+            np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max()
+        )
         if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid motion of unit scale")
+            raise InputError(
+                f"label of {self.seq} has trans {trans.tolist()}, expected a rigid motion of unit scale"
+            )
         object.__setattr__(self, "trans", trans)
 
 
 def label_folder(root: str | Path, category: str) -> Path:
-    """Where the category's labels are or would be: ROOT/class_labels, or upstream's ROOT/data/class_labels."""
-    folders = [Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")]
+    """Where the category's labels are or would be: ROOT/class_labels, or upstream's
+    ROOT/data/class_labels.
+    """
+    folders = [
+        Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")
+    ]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
@@ -66,9 +82,11 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     for path in sorted(label_folder(root, category).glob("*.json")):
         label = decode(read_bytes(path, "label"), _LabelFile, path)
         if label.seq != path.stem:
-            raise InputError(f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as its name says")
+            raise InputError(
+                f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as its name says"
+            )
         try:
-            labels[label.seq] = PoseLabel(label.trans, label.seq, label.reference_seq)
+            labels[label.seq] = PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
     return labels
@@ -85,8 +103,7 @@ def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Ground truth: what takes points of reference camera a's frame to target camera b's frame (column
-    vectors).
+    """Ground truth: what takes points of reference camera a's frame to target camera b's frame.
 
     `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`: the supplementary's composition, whose matrices act on row
     vectors and so stand in the other order. Raises InputError where the labels belong to different reference
@@ -94,7 +111,7 @@ def relative_pose(
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(
-            f"labels of {label_a.seq} and {label_b.seq} refer to {label_a.reference_seq} and {label_b.reference_seq}, "
-            "expected one reference sequence"
+            f"labels of {label_a.seq} and {label_b.seq} refer to {label_a.reference_seq} and "
+            f"{label_b.reference_seq}, expected one reference sequence"
         )
     return camera_b.matrix @ label_b.trans @ np.linalg.inv(label_a.trans) @ np.linalg.inv(camera_a.matrix)

@@ -35,11 +35,12 @@ class Pair:
     def key(self) -> str:
         """Names the pair in results: equal for equal pairs, different for different ones."""
         targets = ",".join(map(str, self.target_frames))
-        return f"{self.category}/{self.reference_sequence}:{self.reference_frame}/{self.target_sequence}:{targets}"
+        reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
+        return f"{reference}/{self.target_sequence}:{targets}"
 
     @property
     def seed(self) -> int:
-        """What every draw on this pair starts from: a function of the key alone, the same on every machine."""
+        """What every draw on this pair starts from: a function of the key alone."""
         return _stable_hash(self.key)
 
 
@@ -65,9 +66,10 @@ def sample_pairs(
     if len(sequences) < 2:
         raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
     for name in sequences:
-        if len(numbers.get(name, ())) < n_targets:
+        count = len(numbers.get(name, ()))
+        if count < n_targets:
             raise InputError(
-                f"labelled sequence {category}/{name} has {len(numbers.get(name, ()))} frames, expected {n_targets}"
+                f"labelled sequence {category}/{name} has {count} frames, expected at least {n_targets}"
             )
     numbers = {name: sorted(numbers[name]) for name in sequences}
 
@@ -85,7 +87,8 @@ def sample_pairs(
 
 def upstream_pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
     """Where a data folder keeps its evaluation set: ROOT/determ_eval/{n}samples_{N}tgt/CATEGORY.pt."""
-    return Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt" / f"{plain_name(category, 'category')}.pt"
+    folder = Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt"
+    return folder / f"{plain_name(category, 'category')}.pt"
 
 
 def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
@@ -106,24 +109,32 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
         where = f"evaluation pairs {path}, pair {number}"
         missing = [name for name in _FIELDS if not isinstance(item, dict) or name not in item]
         if missing:
-            raise InputError(f"{where}: missing {', '.join(missing)}, expected a dict of {', '.join(_FIELDS)}")
+            raise InputError(
+                f"{where}: missing {', '.join(missing)}, expected a dict of {', '.join(_FIELDS)}"
+            )
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)
         if not isinstance(target_ids, (list, tuple, torch.Tensor)) or len(target_ids) == 0:
-            raise InputError(f"{where}: all_target_id is {target_ids!r}, expected positions in the frame list")
-        pairs.append(Pair(
-            category,
-            reference,
-            _frame_number(dataset, category, reference, reference_id, where),
-            target,
-            tuple(_frame_number(dataset, category, target, position, where) for position in target_ids),
-        ))
+            raise InputError(
+                f"{where}: all_target_id is {target_ids!r}, expected positions in the frame list"
+            )
+        pairs.append(
+            Pair(
+                category,
+                reference,
+                _frame_number(dataset, category, reference, reference_id, where),
+                target,
+                tuple(_frame_number(dataset, category, target, position, where) for position in target_ids),
+            )
+        )
     return pairs
 
 
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
     """Write pairs in the upstream form; InputError where the data set lacks one of their frames."""
     positions = {
-        category: {(key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))}
+        category: {
+            (key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))
+        }
         for category in dict.fromkeys(pair.category for pair in pairs)
     }
     items = []
@@ -135,7 +146,7 @@ def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D)
         except KeyError as error:
             raise InputError(f"pair {pair.key}: the data set has no frame {error.args[0]}") from error
         values = (pair.category, pair.reference_sequence, reference_id, pair.target_sequence, target_ids)
-        items.append(dict(zip(_FIELDS, values)))
+        items.append(dict(zip(_FIELDS, values, strict=True)))
     buffer = io.BytesIO()  # a file name would go into the archive, and equal pairs would differ
     torch.save(items, buffer)
     write_atomic(path, buffer.getvalue())
@@ -149,7 +160,9 @@ def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: 
     if not isinstance(position, int) or not 0 <= position < len(frames):
         raise InputError(f"{where}: frame id is {position!r}, expected 0 to {len(frames) - 1}")
     if frames[position].sequence_name != sequence:
-        raise InputError(f"{where}: frame id {position} is of {frames[position].sequence_name}, expected {sequence}")
+        raise InputError(
+            f"{where}: frame id {position} is of {frames[position].sequence_name}, expected {sequence}"
+        )
     return frames[position].frame_number
 
 

@@ -8,13 +8,13 @@ from jaxtyping import Float64, Real, UInt8
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}
+_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+_SIZED_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_TYPES = dict(zip(_NAMES + _SIZED_NAMES, _CODES + _CODES, strict=True))
 _VERTEX = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    + [(name, "u1") for name in ("red", "green", "blue")]
 )
 
 
@@ -24,14 +24,20 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a cloud the way CO3D has it: binary, float positions and normals (zeros where none), 8-bit colours."""
+    """Write a cloud as CO3D does: binary, float positions and normals (zeros where none), 8-bit colours."""
     vertices = np.zeros(len(points), dtype=_VERTEX)
-    for names, values in (("xyz", points), (("nx", "ny", "nz"), normals), (("red", "green", "blue"), colours)):
+    for names, values in (
+        ("xyz", points),
+        (("nx", "ny", "nz"), normals),
+        (("red", "green", "blue"), colours),
+    ):
         if values is None:
             continue
         if np.shape(values) != (len(vertices), 3):
-            raise InputError(f"point cloud {path} has {tuple(names)} of shape {np.shape(values)}, "
-                             f"expected {(len(vertices), 3)}")
+            raise InputError(
+                f"point cloud {path} has {tuple(names)} of shape {np.shape(values)}, "
+                f"expected {(len(vertices), 3)}"
+            )
         for axis, name in enumerate(names):
             vertices[name] = np.asarray(values)[:, axis]
     properties = "".join(
@@ -42,8 +48,7 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-    """Positions and, where the file has them, colours of a binary or ASCII PLY; what else it holds is left
-    out.
+    """Positions and, where the file has them, colours of a binary or ASCII PLY; the rest is left out.
 
     Colours stored as numbers in [0, 1] come back as 8 bit. Raises InputError where the file is missing, cut
     off, not a point cloud, or has positions that are not finite.

@@ -52,7 +52,9 @@ def annotation_benchmark(frames: int = 86_000) -> dict:
     """
     with tempfile.TemporaryDirectory() as root:
         size = _write_category(Path(root), frames)
-        done = subprocess.run([sys.executable, "-c", _MEASURE, root], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", _MEASURE, root], capture_output=True, text=True, check=True
+        )
     figures = json.loads(done.stdout)
     json_mb = size / 2**20
     return {**figures, "json_mb": json_mb, "extra_memory_mb": figures["memory_mb"] - json_mb}
@@ -99,7 +101,10 @@ def _entry(index: int, draws: list[float]) -> dict:
         # Members that the reader does not know, as later versions have them: they cost time to skip.
         "meta": {
             "frame_type": "train_known",
-            "frame_splits": [f"{kind}_{split}" for kind in ("fewview", "manyview", "singlesequence")
-                             for split in ("train_known", "dev_known", "test_unseen")],
+            "frame_splits": [
+                f"{kind}_{split}"
+                for kind in ("fewview", "manyview", "singlesequence")
+                for split in ("train_known", "dev_known", "test_unseen")
+            ],
         },
     }

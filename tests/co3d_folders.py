@@ -1,0 +1,50 @@
+"""Small made-up sequences and cameras for the tests of what reads and writes them."""
+
+import gzip
+import json
+
+import numpy as np
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.cameras import Camera
+from zsp_lite.co3d import SequenceData
+from zsp_lite.frames import Frame
+
+coordinates = st.floats(-10, 10, allow_subnormal=False)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
+    """A camera anywhere, with any aspect and unequal focal lengths."""
+    rng = np.random.default_rng(seed)
+    size = size or tuple(int(side) for side in rng.integers(8, 2000, 2))
+    rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    focal = rng.uniform(0.5, 3, 2) * max(size)
+    return Camera(rotation, rng.normal(size=3) * 3, focal, rng.uniform(0.2, 0.8, 2) * size[::-1], size)
+
+
+def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options) -> SequenceData:
+    """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a hole."""
+    rng = np.random.default_rng([seed, *name.encode()])
+    height, width = 24, 32
+    y, x = np.mgrid[:height, :width]
+    made = []
+    for number in range(frames):
+        camera = random_camera(int(rng.integers(2**31)), (height, width))
+        rgb = np.stack([8 * x % 256, 10 * y % 256, np.full_like(x, 40 * number)], axis=-1).astype(np.uint8)
+        depth = rng.uniform(1, 4, (height, width)).astype(np.float32)
+        depth[5:12, 3 : 9 + number] = 0
+        mask = ((y - 12) ** 2 + (x - 16) ** 2 < 64).astype(np.float32)
+        made.append(Frame(rgb, depth, mask, camera))
+    points = rng.normal(size=(50, 3))
+    colours = rng.integers(0, 256, (50, 3)).astype(np.uint8)
+    times = [0.2 * number for number in range(frames)]
+    return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
+
+
+def edit_json(path, change) -> None:
+    """Rewrite a gzipped JSON file with `change` applied to its content."""
+    content = json.loads(gzip.decompress(path.read_bytes()))
+    changed = change(content)
+    path.write_bytes(gzip.compress(json.dumps(content if changed is None else changed).encode()))

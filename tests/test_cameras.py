@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+from co3d_folders import coordinates, random_camera, seeds
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from zsp_lite.cameras import Camera
+from zsp_lite.errors import InputError
+
+FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
+SIZE = (480, 640)
+
+
+def view(**changes):
+    values = {"R": np.eye(3), "t": [0, 0, 2], "focal": [500, 500], "principal_point": [320, 240], "size": SIZE}
+    return Camera(**(values | changes))
+
+
+def visible_points(seed: int) -> tuple[Camera, np.ndarray]:
+    camera = random_camera(seed)
+    in_camera = np.random.default_rng(seed).uniform([-2, -2, 0.5], [2, 2, 8], (20, 3))
+    return camera, camera.to_world(in_camera)
+
+
+@given(seeds, st.sampled_from(FORMATS))
+def test_conversion_to_pytorch3d_and_back_changes_nothing(seed, intrinsics_format):
+    camera = random_camera(seed)
+    back = Camera.from_pytorch3d(**camera.to_pytorch3d(intrinsics_format), size=camera.size)
+    for name in ("R", "t", "focal", "principal_point"):
+        np.testing.assert_allclose(getattr(back, name), getattr(camera, name), rtol=1e-9, atol=1e-9)
+    assert back.size == camera.size
+
+
+@given(seeds, st.sampled_from(FORMATS))
+def test_a_pytorch3d_viewpoint_survives_the_way_there_and_back(seed, intrinsics_format):
+    rng = np.random.default_rng(seed)
+    given_view = {
+        "R": random_camera(seed).R,
+        "T": rng.normal(size=3),
+        "focal_length": rng.uniform(1, 5, 2),
+        "principal_point": rng.uniform(-0.5, 0.5, 2),
+        "intrinsics_format": intrinsics_format,
+    }
+    size = tuple(int(side) for side in rng.integers(8, 2000, 2))
+    back = Camera.from_pytorch3d(**given_view, size=size).to_pytorch3d(intrinsics_format)
+    for name in ("R", "T", "focal_length", "principal_point"):
+        np.testing.assert_allclose(back[name], given_view[name], rtol=1e-9, atol=1e-9)
+
+
+@given(seeds, st.sampled_from(FORMATS))
+def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsics_format):
+    camera, points = visible_points(seed)
+    other = camera.to_pytorch3d(intrinsics_format)
+    row = points @ other["R"] + other["T"]
+    ndc = other["focal_length"] * row[:, :2] / row[:, 2:] + other["principal_point"]
+    height, width = camera.size
+    per_ndc = np.array([width, height]) / 2 if intrinsics_format == FORMATS[0] else min(height, width) / 2
+    pixels, depth = camera.project(points)
+    np.testing.assert_allclose(pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
+
+
+def test_v1_intrinsics_worked_out_by_hand():
+    camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200))
+    np.testing.assert_allclose(camera.focal, [200, 150])
+    np.testing.assert_allclose(camera.principal_point, [90, 60])
+
+
+def test_v2_intrinsics_worked_out_by_hand():
+    camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200), "ndc_isotropic")
+    np.testing.assert_allclose(camera.focal, [100, 150])
+    np.testing.assert_allclose(camera.principal_point, [95, 60])
+
+
+def test_what_is_left_and_up_in_pytorch3d_has_small_pixel_coordinates():
+    camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 0], [1, 1], [0, 0], (100, 100))
+    pixel, depth = camera.project(np.array([0.5, 0.5, 1.0]))  # +x is left, +y is up there
+    np.testing.assert_allclose(pixel, [25, 25])
+    assert depth == 1
+
+
+@given(seeds)
+def test_unproject_undoes_project(seed):
+    camera, points = visible_points(seed)
+    np.testing.assert_allclose(camera.unproject(*camera.project(points)), points, rtol=1e-9, atol=1e-9)
+
+
+@given(seeds)
+def test_matrix_and_intrinsics_compose_to_project(seed):
+    camera, points = visible_points(seed)
+    homogeneous = np.c_[points, np.ones(len(points))]
+    image = (camera.K @ (camera.matrix @ homogeneous.T)[:3]).T
+    pixels, depth = camera.project(points)
+    np.testing.assert_allclose(image[:, :2] / image[:, 2:], pixels, rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(camera.to_camera(camera.centre), 0, atol=1e-9)
+
+
+@given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
+def test_cropping_shifts_pixels_by_the_corner_of_the_box(seed, top, left, height, width):
+    camera, points = visible_points(seed)
+    cropped = camera.crop((top, left, height, width))
+    np.testing.assert_allclose(cropped.project(points)[0] + (left, top), camera.project(points)[0], rtol=1e-9)
+    assert cropped.size == (height, width)
+
+
+@given(seeds, st.integers(1, 500), st.integers(1, 500))
+def test_resizing_scales_pixels_and_keeps_depth(seed, height, width):
+    camera, points = visible_points(seed)
+    resized = camera.resize((height, width))
+    scale = np.array([width / camera.size[1], height / camera.size[0]])
+    np.testing.assert_allclose(resized.project(points)[0], camera.project(points)[0] * scale, rtol=1e-9)
+    np.testing.assert_array_equal(resized.project(points)[1], camera.project(points)[1])
+    assert resized.size == (height, width)
+
+
+@given(arrays(np.float64, (2, 3, 3), elements=coordinates))
+def test_points_come_in_batches_of_any_shape(points):
+    camera = random_camera(5)
+    pixels, depth = camera.project(points)
+    assert pixels.shape == (2, 3, 2) and depth.shape == (2, 3)
+    np.testing.assert_allclose(camera.to_world(camera.to_camera(points)), points, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
+        ({"R": 2 * np.eye(3)}, "expected a rotation"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
+        ({"R": np.full((3, 3), np.nan)}, "R is not finite"),
+        ({"t": [0, 0, np.inf]}, "t is not finite"),
+        ({"t": "somewhere"}, "t is 'somewhere'"),
+        ({"focal": [500, 0]}, "expected positive pixels"),
+        ({"principal_point": [np.nan, 0]}, "principal_point is not finite"),
+        ({"size": (0, 5)}, "expected positive"),
+        ({"size": 5}, "image size is 5"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        view(**changes)
+
+
+def test_an_unknown_intrinsics_format_is_refused():
+    with pytest.raises(InputError, match="'pixels'"):
+        view().to_pytorch3d("pixels")

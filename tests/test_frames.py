@@ -1,0 +1,181 @@
+import os
+
+import cv2
+import numpy as np
+import pytest
+from co3d_folders import random_camera, seeds, sequence_data
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsp_lite.errors import InputError
+from zsp_lite.files import write_atomic
+from zsp_lite.frames import (
+    Frame,
+    crop_to_object,
+    object_box,
+    read_depth,
+    read_image,
+    read_mask,
+    resize_frame,
+    write_binary_mask,
+    write_depth,
+    write_image,
+    write_mask,
+)
+
+SIZE = (24, 32)
+
+
+def frame(**changes):
+    values = {"rgb": np.zeros((*SIZE, 3), np.uint8), "depth": None, "mask": None, "camera": random_camera(0, SIZE)}
+    return Frame(**(values | changes))
+
+
+def square_mask(top, left, height, width, value=1.0):
+    mask = np.zeros((100, 200), np.float32)
+    mask[top : top + height, left : left + width] = value
+    return mask
+
+
+def test_the_box_grows_by_a_tenth_half_of_it_on_each_side():
+    assert object_box(square_mask(20, 40, 40, 60)) == (18, 37, 44, 66)
+
+
+def test_the_box_stays_in_the_image():
+    assert object_box(square_mask(0, 0, 100, 200)) == (0, 0, 100, 200)
+    assert object_box(square_mask(0, 180, 40, 20)) == (0, 179, 42, 21)
+
+
+def test_pixels_at_the_threshold_do_not_count():
+    mask = square_mask(20, 40, 40, 60) + square_mask(0, 0, 5, 5, 0.4)
+    assert object_box(mask, padding=0) == (20, 40, 40, 60)
+
+
+@given(st.floats(0.002, 1))
+def test_the_threshold_gives_way_until_something_passes(value):
+    assert object_box(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
+
+
+def test_a_lowered_threshold_keeps_the_surest_pixels():
+    mask = square_mask(20, 40, 40, 60, 0.1) + square_mask(30, 50, 10, 10, 0.2)
+    assert object_box(mask, padding=0) == (30, 50, 10, 10)
+
+
+def test_an_empty_or_missing_mask_is_refused():
+    with pytest.raises(InputError, match="is empty"):
+        object_box(np.zeros((5, 5)))
+    with pytest.raises(InputError, match="frame seen has no object mask"):
+        crop_to_object(frame(name="seen"))
+    with pytest.raises(InputError, match="frame seen: object mask"):
+        crop_to_object(frame(name="seen", mask=np.zeros(SIZE)))
+
+
+def test_cropping_keeps_every_pixels_world_point():
+    whole = sequence_data("one").frames[0]
+    cropped = crop_to_object(whole)
+    top, left, height, width = object_box(whole.mask)
+    assert cropped.camera.size == cropped.rgb.shape[:2] == cropped.depth.shape == cropped.mask.shape == (height, width)
+    np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
+    pixel = np.array([3.5, 2.5])
+    np.testing.assert_allclose(
+        cropped.camera.unproject(pixel, 2.0), whole.camera.unproject(pixel + (left, top), 2.0), atol=1e-12
+    )
+
+
+@settings(deadline=None)
+@given(seeds, st.integers(1, 60), st.integers(1, 60))
+def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, width):
+    whole = sequence_data("one", frames=1, seed=seed).frames[0]
+    small = resize_frame(whole, (height, width))
+    rows = np.floor((np.arange(height) + 0.5) * SIZE[0] / height).astype(int)
+    cols = np.floor((np.arange(width) + 0.5) * SIZE[1] / width).astype(int)
+    np.testing.assert_array_equal(small.depth, whole.depth[rows][:, cols])
+    assert small.camera.size == small.rgb.shape[:2] == small.mask.shape == (height, width)
+
+
+def test_shrinking_averages_colours_over_the_area():
+    rgb = np.zeros((*SIZE, 3), np.uint8)
+    rgb[::2] = 200
+    assert (resize_frame(frame(rgb=rgb), (12, 16)).rgb == 100).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
+        ({"rgb": np.zeros(SIZE, np.uint8)}, "expected uint8"),
+        ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is \(5, 5\) pixels"),
+        ({"depth": np.zeros((5, 5), np.float32)}, r"depth has shape \(5, 5\)"),
+        ({"depth": np.full(SIZE, np.nan, np.float32)}, "depth holds nan"),
+        ({"depth": np.full(SIZE, -1, np.float32)}, "depth holds -1"),
+        ({"mask": np.full(SIZE, 1.5, np.float32)}, "mask holds 1.5"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused_by_name(changes, message):
+    with pytest.raises(InputError, match=message):
+        frame(**changes)
+
+
+def test_depth_and_masks_survive_their_files(tmp_path):
+    rng = np.random.default_rng(0)
+    depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
+    write_depth(tmp_path / "depth.png", depth, 2.0)
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
+    mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
+    write_mask(tmp_path / "mask.png", mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
+
+
+def test_depth_masks_are_one_bit_files(tmp_path):
+    known = np.random.default_rng(0).random(SIZE) < 0.5
+    write_binary_mask(tmp_path / "known.png", known)
+    np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), known)
+    assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header
+
+
+def test_a_smooth_picture_survives_jpeg_with_its_channels_in_order(tmp_path):
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    rgb = np.stack([200 + 0 * x, 3 * x, 2 * y], axis=-1).astype(np.uint8)
+    write_image(tmp_path / "image.jpg", rgb, quality=95)
+    assert np.abs(read_image(tmp_path / "image.jpg").astype(int) - rgb).max() < 12
+
+
+@pytest.mark.parametrize("read", [read_image, read_mask, read_depth])
+def test_missing_and_corrupt_files_are_refused_by_name(tmp_path, read):
+    with pytest.raises(InputError, match=r"gone\.png cannot be read"):
+        read(tmp_path / "gone.png")
+    rng = np.random.default_rng(0)
+    write_depth(tmp_path / "whole.png", rng.uniform(1, 2, SIZE))
+    data = (tmp_path / "whole.png").read_bytes()
+    flipped = data[:200] + bytes([data[200] ^ 255]) + data[201:]
+    for damaged in (b"", b"no picture", data[: len(data) // 2], flipped):
+        (tmp_path / "bad.png").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"bad\.png cannot be decoded"):
+            read(tmp_path / "bad.png")
+
+
+def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path):
+    write_image(tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+    data = (tmp_path / "image.jpg").read_bytes()
+    (tmp_path / "image.jpg").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="expected a complete JPEG"):
+        read_image(tmp_path / "image.jpg")
+
+
+def test_an_8_bit_picture_is_no_depth(tmp_path):
+    cv2.imwrite(str(tmp_path / "depth.png"), np.zeros(SIZE, np.uint8))
+    with pytest.raises(InputError, match="16-bit"):
+        read_depth(tmp_path / "depth.png")
+
+
+def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    write_atomic(tmp_path / "file", b"old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomic(tmp_path / "file", b"new")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_bytes() == b"old"
