@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Integer, Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
+from matplotlib.patheffects import Normal, Stroke
 
 from zsp_lite.cameras import Camera
 from zsp_lite.errors import InputError
@@ -42,9 +43,9 @@ def show_images(
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(size * columns, (size * aspect + 0.3) * rows), squeeze=False, layout="constrained"
-    )
+    title_height = 0.1 + 0.2 * max((title.count("\n") + 1 for title in titles or []), default=0)
+    height = (size * aspect + title_height) * rows
+    figure, grid = plt.subplots(rows, columns, figsize=(size * columns, height), squeeze=False, layout="constrained")
     axes = list(grid.flat)
     for axis in axes:
         axis.set_axis_off()
@@ -124,7 +125,9 @@ def draw_matches(
     for a, b, good, colour in sorted(
         zip(reference_pixels, target_pixels, inliers, colours), key=lambda match: match[2]
     ):
-        look = {"color": colour, "linewidth": 1.6} if good else {"color": "0.35", "linewidth": 0.8, "linestyle": (0, (4, 3))}
+        look = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
+        if good:  # the white border keeps it visible on dark images too
+            look = {"color": colour, "linewidth": 1.8, "path_effects": [Stroke(linewidth=3, foreground="white"), Normal()]}
         figure.add_artist(ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, zorder=5, **look))
         for axis, pixel in ((left, a), (right, b)):
             axis.plot(
@@ -193,9 +196,12 @@ def draw_axes(
             continue
         axis.annotate(
             "", end, pixels[0], zorder=6, annotation_clip=False,
-            arrowprops={"arrowstyle": "-|>", "color": _AXIS_COLOURS[name], "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0},
+            arrowprops={"arrowstyle": "-|>", "color": _AXIS_COLOURS[name], "linewidth": 2, "shrinkA": 0, "shrinkB": 0},
         )
-        axis.text(*end, name, color=_AXIS_COLOURS[name], fontsize=_FONT, weight="bold", bbox=_WHITE_BOX, zorder=7)
+        axis.text(
+            *end, name, color=_AXIS_COLOURS[name], fontsize=_FONT, weight="bold", zorder=7, ha="center", va="center",
+            path_effects=[Stroke(linewidth=3, foreground="white"), Normal()],
+        )
     _keep_limits(axis, camera.size)
 
 

@@ -31,7 +31,7 @@ th:first-child, td:first-child { text-align: left; } a { color: var(--accent); }
 section { border-top: 3px solid var(--ink); padding-top: .9rem; margin-top: 2.4rem; }
 .stages { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 1.4rem; margin-top: 1rem; }
 .wide { grid-column: 1 / -1; } figure { margin: 0; min-width: 0; } figcaption { color: var(--soft); font-size: .92rem; margin-top: .3rem; }
-img { max-width: 100%; height: auto; display: block; } .flag { border-left: 4px solid #d55e00; padding-left: .7rem; }
+img { max-width: 100%; height: auto; display: block; } .wide img { min-width: 620px; } .flag { border-left: 4px solid #d55e00; padding-left: .7rem; }
 """
 
 
@@ -171,7 +171,8 @@ def _propagated(result: DemoResult) -> Figure:
     cloud = object_cloud(result.estimate.reference_view, most=1500)
     colours = plots.coordinate_colours(cloud)
     frames = result.sequence
-    figure, axes = plots.show_images([frame.rgb for frame in frames], [f"view {i + 1}" for i in range(len(frames))], size=1.9)
+    titles = [f"view {i + 1}" for i in range(len(frames))]
+    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=3)
     length = 1.2 * float(cloud.std(axis=0).mean())
     for axis, frame, pose in zip(axes, frames, result.estimate.propagate([frame.camera for frame in frames])):
         plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
@@ -196,8 +197,8 @@ def _best_views(result: DemoResult):
 def _figure(title: str, figure: Figure, wide: bool, alt: str, caption: str) -> str:
     source = _inline_image(figure)
     return (
-        f'<figure{" class=wide" if wide else ""}><h3>{html.escape(title)}</h3>'
-        f'<img alt="{html.escape(alt)}" src="{source}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+        f'<figure{" class=wide" if wide else ""}><h3>{html.escape(title)}</h3><div class="scroll">'
+        f'<img alt="{html.escape(alt)}" src="{source}"></div><figcaption>{html.escape(caption)}</figcaption></figure>'
     )
 
 

@@ -48,7 +48,7 @@ def aligned_clouds(
         scene={
             **{f"{axis}axis": {"title": {"text": label}, "range": span} for axis, label, span in _axes(kept)},
             "aspectmode": "cube",
-            "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.7, "y": -0.5, "z": -1.6}},
+            "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.8, "y": -0.6, "z": -1.9}},
         },
     )
     return figure
