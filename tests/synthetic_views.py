@@ -41,17 +41,17 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
     to_object = placement.inverse()
     in_object = lambda depth: to_object.apply(camera.to_world(rays * depth[..., None]))  # noqa: E731
-    far = np.full((height, width), np.inf)
-    steps = np.linspace(1.5, 7.0, 111)
-    for near, beyond in zip(steps[-2::-1], steps[:0:-1]):
-        crossing = (inside(in_object(np.full_like(far, near))) > 0) & (
-            inside(in_object(np.full_like(far, beyond))) <= 0
-        )
-        far[crossing] = beyond
+    # From far to near, so that the crossing found last is the nearest one.
+    far, behind = np.full((height, width), np.inf), np.zeros((height, width), dtype=bool)
+    steps = np.linspace(7.0, 1.5, 56)
+    for depth in steps:
+        now = inside(in_object(np.full((height, width), depth))) <= 0
+        far[behind & ~now] = depth + steps[0] - steps[1]
+        behind = now
     hit = np.isfinite(far)
     high = np.where(hit, far, 1.0)
-    low = high - (steps[1] - steps[0])
-    for _ in range(20):
+    low = high - (steps[0] - steps[1])
+    for _ in range(14):
         middle = (low + high) / 2
         outside = inside(in_object(middle)) > 0
         low, high = np.where(outside, middle, low), np.where(outside, high, middle)

@@ -19,6 +19,11 @@ ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
 DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
 
 
+def turned(camera: Camera, turn: np.ndarray) -> Camera:
+    """The same camera in a world that was turned about its origin."""
+    return replace(camera, R=camera.R @ turn.T)
+
+
 @pytest.fixture(scope="module")
 def method():
     return ZeroShotPose(CoordinateBackbone())
@@ -31,7 +36,8 @@ def reference():
 
 @pytest.fixture(scope="module")
 def targets():
-    views = [look_at(ELSEWHERE.R @ np.array(direction), distance=4.5) for direction in DIRECTIONS]
+    # Upright cameras around the object; it and they are turned with its world.
+    views = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS]
     return [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(views)]
 
 
@@ -80,10 +86,6 @@ def test_every_stage_is_timed(estimate):
 def test_a_second_run_gives_the_same_numbers(method, estimate, reference, targets):
     again = method.estimate(reference, targets)
     assert (again.sim3.matrix == estimate.sim3.matrix).all() and (again.view_scores == estimate.view_scores).all()
-
-
-def turned(camera: Camera, turn: np.ndarray) -> Camera:
-    return replace(camera, R=camera.R @ turn.T)
 
 
 def test_turning_the_target_world_leaves_the_pose_between_cameras(method, estimate, reference, targets):

@@ -207,22 +207,22 @@ def look(
     foreground: str = "saliency",
     saliency_threshold: float = 0.05,
 ) -> list[View]:
-    """Views of cropped frames: features in one batch, and which patches are the object.
+    """Views of cropped frames, their features computed in one batch.  foreground: see `frame_view`."""
+    features = backbone([frame.rgb for frame in frames])
+    return [frame_view(frame, found, foreground, saliency_threshold) for frame, found in zip(frames, features)]
+
+
+def frame_view(
+    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = 0.05
+) -> View:
+    """A cropped frame with its features, and which patches are the object.
 
     foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a quarter of
-    the patch). Raises InputError for "mask" where a frame has none.
+    the patch). Raises InputError for "mask" where the frame has none.
     """
-    features = backbone([frame.rgb for frame in frames])
-    return [
-        View(
-            frame,
-            found,
-            found.foreground(saliency_threshold)
-            if foreground == "saliency"
-            else patch_mask(frame, found.grid).to(found.keys.device),
-        )
-        for frame, found in zip(frames, features)
-    ]
+    if foreground == "mask":
+        return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device))
+    return View(frame, features, features.foreground(saliency_threshold))
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:

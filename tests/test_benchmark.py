@@ -1,0 +1,210 @@
+"""The benchmark on a small CO3D folder whose features are perfect, so that every figure is known."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_views import CoordinateBackbone, look_at, render
+
+import zsp_lite
+from zsp_lite.alignment import Sim3
+from zsp_lite.backbones import Backbone
+from zsp_lite.benchmark.run import METHODS, category_pairs, evaluate, random_backbone, read_records
+from zsp_lite.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.errors import InputError
+from zsp_lite.labels import PoseLabel, write_label
+from zsp_lite.pairs import sample_pairs, write_upstream_pairs
+from zsp_lite.vit import VisionTransformer
+
+SEQUENCES = ("100_a", "200_b", "300_c")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two categories of three sequences: one object, put into each sequence's world in its own way."""
+    root = tmp_path_factory.mktemp("co3d")
+    for offset, category in enumerate(("lump", "pebble")):
+        sequences = []
+        for index, name in enumerate(SEQUENCES):
+            turn = np.eye(3) if index == 0 else look_at(np.eye(3)[index] + (0.3, 0.2, 0.1 + offset)).R
+            placement = Sim3(1.0, turn, np.zeros(3))
+            angles = np.linspace(0, 2 * np.pi, 8, endpoint=False) + 0.3 * index
+            # Upright cameras around the object; the world they stand in is turned.
+            views = [look_at((np.cos(a), np.sin(a), 0.4), size=(90, 100), focal=120.0) for a in angles]
+            cameras = [replace(camera, R=camera.R @ turn.T) for camera in views]
+            frames = tuple(render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras))
+            sequences.append(SequenceData(name, frames, tuple(map(float, range(8))), np.eye(3), np.zeros((3, 3), np.uint8)))
+            trans = np.eye(4)
+            trans[:3, :3] = turn
+            write_label(root, category, PoseLabel(trans, name, SEQUENCES[0]))
+        write_co3d(root, category, sequences, quality=100)
+    return root
+
+
+BACKBONE = CoordinateBackbone()
+
+
+@pytest.fixture(scope="module")
+def run(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    seen = []
+    summary = evaluate(
+        folder, BACKBONE, ("ours", "ours-bv", "oracle-view"), 6, 5, out=out, progress=lambda *step: seen.append(step)
+    )
+    return out, summary, seen
+
+
+def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_not(run):
+    _, summary, _ = run
+    ours, view = summary["methods"]["ours"], summary["methods"]["ours-bv"]
+    assert ours["acc30"] >= 90 and ours["median"] < 10
+    assert view["median"] > ours["median"]
+    assert ours["failed"] == 0
+
+
+def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
+    out, summary, _ = run
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert {"data", "backbone", "methods", "timings", "saliency_iou"} <= summary.keys()
+    for row in summary["methods"].values():
+        assert {"n", "median", "acc30", "acc15", "acc30_ci", "per_category"} <= row.keys()
+        assert row["n"] == 12 and row["per_category"].keys() == {"lump", "pebble"}
+        assert row["per_category"]["lump"]["n"] == 6
+        assert row["acc30_ci"][0] <= row["acc30"] <= row["acc30_ci"][1]
+    assert {"matching", "view", "alignment", "features_per_frame"} <= summary["timings"].keys()
+
+
+def test_the_summary_is_the_statistics_of_the_pairs(run):
+    out, summary, _ = run
+    errors = [record["methods"]["ours"]["error"] for record in read_records(out / "pairs.jsonl").values()]
+    assert len(errors) == 12
+    assert summary["methods"]["ours"]["median"] == np.median(errors)
+    assert summary["methods"]["ours"]["acc15"] == pytest.approx(100 * np.mean(np.array(errors) < 15))
+
+
+def test_painted_foregrounds_agree_with_the_masks(run):
+    _, summary, _ = run
+    assert summary["saliency_iou"].keys() == {"lump", "pebble", "mean"}
+    assert all(value > 0.8 for value in summary["saliency_iou"].values())
+
+
+def test_progress_counts_every_pair(run):
+    assert run[2] == [(i, 12) for i in range(1, 13)]
+
+
+def test_a_second_run_computes_nothing_again_and_says_the_same(run, folder):
+    out, summary, _ = run
+
+    class Never(CoordinateBackbone):
+        def __call__(self, images):
+            raise AssertionError("nothing is left to compute")
+
+    Never.__name__ = "CoordinateBackbone"
+    lines = (out / "pairs.jsonl").read_bytes()
+    assert evaluate(folder, Never(), ("ours", "ours-bv", "oracle-view"), 6, 5, out=out) == summary
+    assert (out / "pairs.jsonl").read_bytes() == lines
+
+
+def test_an_interrupted_run_continues_to_the_same_errors(run, folder, tmp_path):
+    out, summary, _ = run
+    lines = (out / "pairs.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "run.json").write_bytes((out / "run.json").read_bytes())
+    (tmp_path / "pairs.jsonl").write_bytes(b"".join(lines[:4]) + lines[4][:37])
+    again = evaluate(folder, BACKBONE, ("ours", "ours-bv", "oracle-view"), 6, 5, out=tmp_path)
+    assert again["methods"] == summary["methods"]
+    assert len((tmp_path / "pairs.jsonl").read_bytes().splitlines()) == 12
+
+
+def test_a_method_added_later_leaves_the_others_as_they_were(folder, tmp_path):
+    settings = {"pairs": 3, "targets": 2, "out": tmp_path, "categories": ["lump"]}
+    alone = evaluate(folder, BACKBONE, ("ours",), **settings)
+    both = evaluate(folder, BACKBONE, ("ours", "rootsift"), **settings)
+    assert both["methods"]["ours"] == alone["methods"]["ours"]
+    assert both["methods"]["rootsift"]["n"] == 3
+    assert both["against_ours"]["rootsift"]["accuracy_gain"] == pytest.approx(
+        both["methods"]["ours"]["acc30"] - both["methods"]["rootsift"]["acc30"]
+    )
+
+
+def test_results_do_not_depend_on_which_other_categories_run(run, folder, tmp_path):
+    _, summary, _ = run
+    alone = evaluate(folder, BACKBONE, ("ours",), 6, 5, out=tmp_path, categories=["pebble"])
+    assert alone["methods"]["ours"]["per_category"]["pebble"] == summary["methods"]["ours"]["per_category"]["pebble"]
+
+
+def test_the_true_view_is_never_worse_to_start_from_than_the_chosen_one(run):
+    records = read_records(run[0] / "pairs.jsonl").values()
+    assert all(record["methods"]["oracle-view"]["view"] in range(5) for record in records)
+    assert run[1]["methods"]["oracle-view"]["acc30"] >= 90
+
+
+def test_shipped_pairs_come_first_and_only_where_there_are_enough(folder, tmp_path):
+    dataset = Co3D(folder)
+    sampled = sample_pairs(dataset, "lump", 4, 3, seed=9)
+    path = folder / "determ_eval" / "4samples_3tgt" / "lump.pt"
+    write_upstream_pairs(path, sampled, dataset)
+    assert category_pairs(dataset, "lump", 3, 3) == sampled[:3]
+    assert category_pairs(dataset, "lump", 5, 3, seed=1) == sample_pairs(dataset, "lump", 5, 3, seed=1)
+
+
+def test_frames_that_cannot_be_used_count_as_failures(folder, tmp_path):
+    class Blind(CoordinateBackbone):
+        def features(self, image):
+            raise InputError("blind")
+
+    summary = evaluate(folder, Blind(), ("ours",), 2, 5, out=tmp_path, categories=["lump"])
+    row = summary["methods"]["ours"]
+    assert row["failed"] == row["n"] == 2 and row["acc30"] == 0 and row["median"] == 180
+
+
+def test_a_folder_of_another_run_is_refused(run, folder):
+    with pytest.raises(InputError, match="pairs"):
+        evaluate(folder, BACKBONE, ("ours",), 7, 5, out=run[0])
+    with pytest.raises(InputError, match="backbone"):
+        evaluate(folder, _Renamed(), ("ours",), 6, 5, out=run[0])
+
+
+class _Renamed(CoordinateBackbone):
+    pass
+
+
+def test_unknown_methods_categories_and_folders_are_refused(folder, tmp_path):
+    with pytest.raises(InputError, match="nonesuch"):
+        evaluate(folder, BACKBONE, ("nonesuch",), out=tmp_path)
+    with pytest.raises(InputError, match="teapot"):
+        evaluate(folder, BACKBONE, categories=["teapot"], out=tmp_path)
+    with pytest.raises(InputError, match="nowhere"):
+        evaluate(tmp_path / "nowhere", BACKBONE, out=tmp_path)
+
+
+def test_a_damaged_record_is_named_by_its_line(tmp_path):
+    (tmp_path / "pairs.jsonl").write_text('{"key": "a", "methods": {}, "saliency_iou": {}}\nnonsense\n')
+    with pytest.raises(InputError, match="line 2"):
+        read_records(tmp_path / "pairs.jsonl")
+
+
+def test_every_method_is_a_valid_configuration():
+    for method in METHODS.values():
+        replace(zsp_lite.ZeroShotPose(BACKBONE), **method.settings)
+
+
+def test_a_random_backbone_has_the_shape_of_the_other_and_its_own_weights():
+    like = Backbone(VisionTransformer(32, 8, 12, 2, 3), "small", key_block=1)
+    first, second = random_backbone(like), random_backbone(like)
+    shapes = {key: value.shape for key, value in like.model.state_dict().items()}
+    assert {key: value.shape for key, value in first.model.state_dict().items()} == shapes
+    weight = "blocks.0.attn.qkv.weight"
+    assert (first.model.state_dict()[weight] == second.model.state_dict()[weight]).all()
+    assert (first.model.state_dict()[weight] != like.model.state_dict()[weight]).any()
+    with pytest.raises(InputError, match="random"):
+        random_backbone(BACKBONE)
+
+
+def test_the_package_exports_its_vocabulary_without_importing_torch():
+    import subprocess
+    import sys
+
+    code = "import sys, zsp_lite; assert 'torch' not in sys.modules; print(zsp_lite.__version__)"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    assert all(hasattr(zsp_lite, name) for name in zsp_lite.__all__)
