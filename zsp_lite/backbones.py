@@ -24,8 +24,8 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.vit import VisionTransformer
 
 Image = (
-    Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]
-    | Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
+    Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"]
+    | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 )
 Precision = Literal["float32", "bfloat16"]
 
@@ -169,7 +169,7 @@ def available_backbones() -> dict[str, Path | None]:
 
 
 def download(name: str) -> Path:
-    """The file of a named backbone, fetched now where it is not at hand. Raises InputError saying what to do."""
+    """The file of a named backbone, fetched if it is not at hand. Raises InputError saying what to do."""
     if name == "zsp-tiny":
         if not TINY.is_file():
             raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")

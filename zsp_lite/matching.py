@@ -25,7 +25,7 @@ from torch import Tensor
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
 
-Keys = FeatureMap | Float[Tensor, "h w d"] | Float[np.ndarray, "h w d"]
+Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ class TrainingTokens:
     tokens: Float[Tensor, "batch tokens dim"]  # normalised output of the last block, CLS first
     keys: Float[Tensor, "batch n dim"]  # raw keys of the patches at the key block
     key_input: Float[Tensor, "batch n dim"]  # the normalised patch tokens that those keys are a linear map of
-    cls_logits: Float[Tensor, "batch heads tokens"]  # last block, CLS to all tokens, scaled, no softmax; float32
+    cls_logits: Float[Tensor, "batch heads tokens"]  # last block, CLS to all, scaled, no softmax; float32
     grid: tuple[int, int]
 
 

@@ -13,10 +13,12 @@ from zsp_lite.features import FeatureMap
 class RootSift:
     """Called like a Backbone: images in, one FeatureMap each out, keys (28, 28, 128), saliency all ones.
 
-    One upright SIFT descriptor (Lowe 2004) per patch centre of the image at 224 pixels, `keypoint_size`
-    pixels wide, then RootSIFT (Arandjelovic and Zisserman 2012): the square root of the L1-normalised
-    histogram, whose dot products are Hellinger kernels. SIFT knows no foreground: callers give masks, or take
-    the whole image. The global feature is the normalised mean descriptor.
+    One upright SIFT descriptor (Lowe 2004) per patch centre of the image at 224 pixels, then RootSIFT
+    (Arandjelovic and Zisserman 2012): the square root of the L1-normalised histogram, whose dot products are
+    Hellinger kernels. A keypoint `keypoint_size` pixels wide has 4 x 4 cells of 1.5 times that side, so the
+    default of 24 describes a patch by most of the object around it.
+    SIFT knows no foreground: callers give masks, or take the whole image. The global feature is the mean
+    descriptor, normalised.
     """
 
     name = "rootsift"

@@ -1,0 +1,397 @@
+"""Checkpoints in all their wrappings, downloads over loopback with every mishap, images good and bad."""
+
+import hashlib
+import http.server
+import threading
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import nn
+
+from zsp_lite import backbones
+from zsp_lite.backbones import Backbone, Release, available_backbones, load_backbone, prepare_images
+from zsp_lite.download import fetch
+from zsp_lite.errors import InputError
+from zsp_lite.vit import VisionTransformer
+
+
+def small_vit(seed: int = 0, **sizes) -> VisionTransformer:
+    torch.manual_seed(seed)
+    standard = {"image_size": 32, "patch_size": 8, "embed_dim": 64, "depth": 3, "num_heads": 4}
+    vit = VisionTransformer(**(standard | sizes))
+    for parameter in vit.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    return vit
+
+
+@pytest.fixture(scope="module")
+def vit() -> VisionTransformer:
+    return small_vit()
+
+
+@pytest.fixture()
+def pictures() -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [rng.integers(0, 256, shape, dtype=np.uint8) for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))]
+
+
+def assert_same_features(first, second):
+    for a, b in zip(first, second, strict=True):
+        torch.testing.assert_close(a.keys, b.keys)
+        torch.testing.assert_close(a.saliency, b.saliency)
+
+
+# what a backbone computes
+
+
+def test_features_are_the_models_keys_saliency_and_cls(vit, pictures):
+    features = Backbone(vit, "small", key_block=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(pictures)
+    assert len(features) == 3
+    pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    with torch.no_grad():
+        tokens = vit.extract((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), 1)
+    first = features[0]
+    torch.testing.assert_close(first.keys, tokens.keys[0].view(4, 4, 64))
+    torch.testing.assert_close(first.global_feature, tokens.cls[0])
+    raw = tokens.attention[0, [0, 3]].mean(0).view(4, 4)
+    torch.testing.assert_close(first.saliency, (raw - raw.min()) / (raw.max() - raw.min()))
+    assert all(f.saliency.min() == 0 and f.saliency.max() == 1 for f in features)
+
+
+def test_features_depend_neither_on_batch_size_nor_on_the_images_type(vit, pictures):
+    expected = Backbone(vit, "small", device="cpu", batch_size=1)(pictures)
+    model = Backbone(vit, "small", device="cpu", batch_size=8)
+    assert_same_features(model(pictures), expected)
+    assert_same_features(model([p / 255 for p in pictures]), expected)
+    assert_same_features(model([torch.from_numpy(p) for p in pictures]), expected)
+    frozen = pictures[0].copy()
+    frozen.flags.writeable = False
+    assert_same_features(model([frozen, pictures[1][::-1][::-1]]), expected[:2])
+    assert model([]) == []
+
+
+def test_features_are_ordinary_tensors_of_their_own(vit, pictures):
+    keys = Backbone(vit, "small", device="cpu")(pictures)[0].keys
+    assert keys.untyped_storage().nbytes() == keys.numel() * 4
+    layer = nn.Linear(64, 2)
+    layer(keys).sum().backward()  # a tensor born in inference mode would refuse
+    assert layer.weight.grad is not None
+
+
+def test_bfloat16_gives_nearly_the_same_features_in_float32(vit, pictures):
+    full = Backbone(vit, "small", device="cpu")(pictures)
+    half = Backbone(vit, "small", device="cpu", precision="bfloat16")(pictures)
+    for a, b in zip(full, half):
+        assert b.keys.dtype == b.saliency.dtype == b.global_feature.dtype == torch.float32
+        assert F.cosine_similarity(a.keys, b.keys, dim=-1).min() > 0.98
+
+
+def test_uniform_attention_is_no_foreground():
+    vit = small_vit()
+    vit.blocks[-1].attn.qkv.weight.data.zero_()
+    vit.blocks[-1].attn.qkv.bias.data.zero_()
+    features = Backbone(vit, "small", device="cpu")([np.zeros((32, 32, 3), np.uint8)])
+    assert bool((features[0].saliency == 0).all())
+
+
+def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
+    vits = VisionTransformer(32, 8, 384, 12, 6)
+    assert Backbone(vits, "s", device="cpu").saliency_heads == (0, 2, 4, 5)
+    assert Backbone(vits, "s", device="cpu").key_block == 9
+    assert Backbone(small_vit(), "x", device="cpu").saliency_heads == (0, 1, 2, 3)
+    assert Backbone(small_vit(), "x", device="cpu").key_block == 2
+
+
+def test_resizing_averages_over_what_it_shrinks():
+    # A fine checkerboard shrinks to grey; without antialiasing it would stay black and white.
+    board = (np.indices((128, 128)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
+    shrunk = prepare_images([board], 32)
+    assert shrunk.shape == (1, 3, 32, 32)
+    torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((8, 8), np.uint8),
+        np.zeros((8, 8, 4), np.uint8),
+        np.zeros((0, 8, 3), np.uint8),
+        np.zeros((8, 8, 3), np.int64),
+        np.full((8, 8, 3), 1.5),
+        np.full((8, 8, 3), np.nan),
+        np.full((8, 8, 3), -0.1, np.float32),
+        "photo.jpg",
+        None,
+    ],
+)
+def test_bad_images_are_refused_by_number(vit, image):
+    with pytest.raises(InputError, match="^image 1: [^\n]+$"):
+        Backbone(vit, "small", device="cpu")([np.zeros((8, 8, 3), np.uint8), image])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"key_block": 3}, {"saliency_heads": (4,)}, {"saliency_heads": ()}, {"precision": "int8"}, {"batch_size": 0}]
+    + [{"device": "nowhere"}],
+)
+def test_options_out_of_range_are_refused(vit, options):
+    with pytest.raises(InputError):
+        Backbone(vit, "small", **({"device": "cpu"} | options))
+
+
+# checkpoints
+
+
+@pytest.mark.parametrize("wrapping", ["plain", "teacher", "state_dict", "prefixed"])
+def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path, wrapping):
+    weights = vit.state_dict()
+    content = {
+        "plain": weights,
+        "teacher": {"student": {}, "epoch": 3, "teacher": {f"module.backbone.{k}": v for k, v in weights.items()}},
+        "state_dict": {"state_dict": {f"module.{k}": v for k, v in weights.items()}},
+        "prefixed": {f"backbone.{k}": v for k, v in weights.items()} | {"head.mlp.weight": torch.zeros(2, 2)},
+    }[wrapping]
+    torch.save(content, tmp_path / "mine.pth")
+    loaded = load_backbone(tmp_path / "mine.pth", "cpu", num_heads=4)
+    assert (loaded.name, loaded.patch_size, loaded.image_size, loaded.embed_dim) == ("mine", 8, 32, 64)
+    assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+
+
+def test_heads_have_64_channels_unless_told(tmp_path):
+    torch.save(small_vit(embed_dim=128, num_heads=2).state_dict(), tmp_path / "a.pth")
+    assert load_backbone(tmp_path / "a.pth", "cpu").model.num_heads == 2
+    torch.save(small_vit(embed_dim=48, num_heads=6).state_dict(), tmp_path / "b.pth")
+    with pytest.raises(InputError, match="num_heads"):
+        load_backbone(tmp_path / "b.pth", "cpu")
+
+
+def test_safetensors_bring_their_settings_and_arguments_override_them(vit, pictures, tmp_path):
+    half = {key: x.half() for key, x in vit.state_dict().items()}
+    metadata = {"num_heads": "4", "key_block": "1", "saliency_heads": "0,2"}
+    save_file(half, tmp_path / "tiny.safetensors", metadata=metadata)
+    loaded = load_backbone(str(tmp_path / "tiny.safetensors"), "cpu")
+    assert (loaded.model.num_heads, loaded.key_block, loaded.saliency_heads) == (4, 1, (0, 2))
+    expected = Backbone(vit, "small", key_block=1, device="cpu")(pictures)
+    for a, b in zip(loaded(pictures), expected):
+        assert a.keys.dtype == torch.float32
+        assert F.cosine_similarity(a.keys, b.keys, dim=-1).min() > 0.999
+    other = load_backbone(tmp_path / "tiny.safetensors", "cpu", key_block=0, saliency_heads=[3])
+    assert (other.key_block, other.saliency_heads) == (0, (3,))
+
+
+def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
+    monkeypatch.setattr(backbones, "TINY", tmp_path / "zsp-tiny.safetensors")
+    with pytest.raises(InputError, match="zsp-lite train"):
+        load_backbone()
+    save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "4"})
+    assert load_backbone().name == "zsp-tiny"
+    assert available_backbones()["zsp-tiny"] == tmp_path / "zsp-tiny.safetensors"
+
+
+class Harmful:
+    def __reduce__(self):
+        return exec, ("raise SystemExit('code from a checkpoint ran')",)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "text"])
+def test_damaged_files_are_refused_in_one_line(vit, tmp_path, suffix, damage):
+    path = tmp_path / f"model{suffix}"
+    if suffix == ".pth":
+        torch.save(vit.state_dict(), path)
+    else:
+        save_file(vit.state_dict(), path)
+    whole = path.read_bytes()
+    path.write_bytes({"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"<html>404</html>"}[damage])
+    with pytest.raises(InputError, match=f"^checkpoint [^\n]*model{suffix}: damaged[^\n]*$"):
+        load_backbone(path, "cpu", num_heads=4)
+
+
+def test_no_code_from_a_checkpoint_runs(tmp_path):
+    torch.save({"cls_token": Harmful()}, tmp_path / "harmful.pth")
+    with pytest.raises(InputError, match="damaged"):
+        load_backbone(tmp_path / "harmful.pth")
+
+
+def without(weights, key):
+    return {k: v for k, v in weights.items() if k != key}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda w: without(w, "pos_embed"), "DINO layout"),
+        (lambda w: without(w, "blocks.1.norm1.bias"), "blocks.1.norm1.bias: expected .64,., got none"),
+        (lambda w: w | {"extra": torch.zeros(1)}, "extra: expected none"),
+        (lambda w: w | {"norm.weight": torch.zeros(3)}, "norm.weight"),
+        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight holds"),
+        (lambda w: {"fc.weight": torch.zeros(2, 2)}, "DINO layout"),
+        (lambda w: [1, 2], "state dict"),
+        (lambda w: {"epoch": 3}, "state dict"),
+    ],
+)
+def test_other_models_weights_are_refused_naming_what_differs(vit, tmp_path, change, message):
+    torch.save(change(dict(vit.state_dict())), tmp_path / "other.pth")
+    with pytest.raises(InputError, match=message):
+        load_backbone(tmp_path / "other.pth", "cpu", num_heads=4)
+
+
+def test_metadata_that_is_not_a_number_is_refused(vit, tmp_path):
+    save_file(vit.state_dict(), tmp_path / "x.safetensors", metadata={"num_heads": "four"})
+    with pytest.raises(InputError, match="num_heads"):
+        load_backbone(tmp_path / "x.safetensors")
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match="'resnet'.*zsp-tiny, dino_vits8"):
+        load_backbone("resnet")
+
+
+# downloads
+
+
+class Server:
+    """An HTTP server on loopback that counts requests and can misbehave."""
+
+    def __init__(self, files: dict[str, bytes]):
+        self.files, self.ranges, self.break_after, self.knows_ranges = files, [], None, True
+        outer = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self):
+                outer.ranges.append(self.headers.get("Range"))
+                content = outer.files.get(self.path)
+                if content is None:
+                    return self.send_error(404)
+                start = 0
+                if outer.knows_ranges and outer.ranges[-1]:
+                    start = int(outer.ranges[-1].removeprefix("bytes=").removesuffix("-"))
+                    if start >= len(content):
+                        self.send_response(416)
+                        self.send_header("Content-Range", f"bytes */{len(content)}")
+                        self.send_header("Content-Length", "0")
+                        return self.end_headers()
+                    self.send_response(206)
+                    self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
+                else:
+                    self.send_response(200)
+                self.send_header("Content-Length", str(len(content) - start))
+                self.end_headers()
+                end = len(content) if outer.break_after is None else start + outer.break_after
+                self.wfile.write(content[start:end])
+                self.close_connection = True
+
+            def log_message(self, *_):
+                return
+
+        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.http.server_port}"
+        threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
+
+
+@pytest.fixture()
+def server(monkeypatch):
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    content = np.random.default_rng(0).bytes(10_000)
+    server = Server({"/file": content})
+    server.content, server.md5 = content, hashlib.md5(content).hexdigest()[:6]
+    yield server
+    server.http.shutdown()
+    server.http.server_close()
+
+
+def test_a_file_is_fetched_checked_and_not_fetched_twice(server, tmp_path):
+    path = tmp_path / "folder" / "file"
+    for _ in range(2):
+        assert fetch(f"{server.url}/file", path, 10_000, server.md5) == path
+    assert path.read_bytes() == server.content
+    assert server.ranges == [None]
+    assert [p.name for p in path.parent.iterdir()] == ["file"]
+
+
+def test_a_transfer_that_breaks_off_is_resumed_where_it_stopped(server, tmp_path):
+    server.break_after = 4_000
+    fetch(f"{server.url}/file", tmp_path / "file", 10_000, server.md5)
+    assert server.ranges == [None, "bytes=4000-", "bytes=8000-"]
+    assert (tmp_path / "file").read_bytes() == server.content
+
+
+def test_a_transfer_that_keeps_breaking_off_is_kept_for_the_next_call(server, tmp_path):
+    server.break_after = 1_000
+    with pytest.raises(InputError, match="3000 bytes; call again to resume"):
+        fetch(f"{server.url}/file", tmp_path / "file", 10_000, server.md5)
+    assert not (tmp_path / "file").exists() and (tmp_path / "file.part").stat().st_size == 3_000
+    server.break_after = None
+    fetch(f"{server.url}/file", tmp_path / "file", 10_000, server.md5)
+    assert server.ranges[-1] == "bytes=3000-"
+    assert (tmp_path / "file").read_bytes() == server.content
+
+
+def test_a_server_without_ranges_sends_everything_again(server, tmp_path):
+    (tmp_path / "file.part").write_bytes(server.content[:2_000])
+    server.knows_ranges = False
+    fetch(f"{server.url}/file", tmp_path / "file", None, server.md5)
+    assert (tmp_path / "file").read_bytes() == server.content
+
+
+@pytest.mark.parametrize("size", [10_000, None])
+def test_a_part_that_is_complete_already_takes_its_name(server, tmp_path, size):
+    (tmp_path / "file.part").write_bytes(server.content)
+    fetch(f"{server.url}/file", tmp_path / "file", size, server.md5)
+    assert (tmp_path / "file").read_bytes() == server.content
+
+
+@pytest.mark.parametrize("size", [10_000, None])
+def test_a_part_longer_than_the_file_is_started_anew(server, tmp_path, size):
+    (tmp_path / "file.part").write_bytes(b"x" * 12_000)
+    fetch(f"{server.url}/file", tmp_path / "file", size, server.md5)
+    assert (tmp_path / "file").read_bytes() == server.content
+
+
+@pytest.mark.parametrize("size, md5", [(10_001, ""), (10_000, "000000"), (None, "000000")])
+def test_a_file_of_another_size_or_hash_is_refused_and_removed(server, tmp_path, size, md5):
+    with pytest.raises(InputError, match="expected"):
+        fetch(f"{server.url}/file", tmp_path / "file", size, md5)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_dino_models_come_from_the_server_into_the_cache(server, vit, pictures, tmp_path, monkeypatch):
+    torch.save(vit.state_dict(), tmp_path / "made.pth")
+    content = (tmp_path / "made.pth").read_bytes()
+    server.files["/dino/some/vit.pth"] = content
+    monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    release = Release("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+    monkeypatch.setitem(backbones.RELEASES, "dino_vits8", release)
+    assert available_backbones()["dino_vits8"] is None
+    loaded = load_backbone("dino_vits8", "cpu", num_heads=4)
+    assert loaded.name == "dino_vits8"
+    assert available_backbones()["dino_vits8"] == tmp_path / "cache" / "vit.pth"
+    assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+
+
+@pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])
+def test_without_the_server_one_line_says_what_to_do(server, tmp_path, monkeypatch, address):
+    monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
+    with pytest.raises(InputError) as caught:
+        load_backbone("dino_vits8")
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in (backbones.RELEASES["dino_vits8"].url, str(tmp_path / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
+        assert part in message
+
+
+def test_released_addresses_and_hashes_are_those_that_were_published():
+    release = backbones.RELEASES["dino_vits8"]
+    folder = "https://dl.fbaipublicfiles.com/dino/dino_deitsmall8_pretrain/"
+    assert release.url == folder + "dino_deitsmall8_pretrain.pth"
+    assert (release.md5_prefix, release.size) == ("230cd5", 86_728_949)
+    assert {name: r.md5_prefix for name, r in backbones.RELEASES.items()} == {
+        "dino_vits8": "230cd5", "dino_vits16": "cf0f22", "dino_vitb8": "556550", "dino_vitb16": "552daf"
+    }  # fmt: skip

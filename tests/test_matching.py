@@ -1,0 +1,266 @@
+"""Similarity against materialised descriptors, cyclical distances against loops, and what `match` promises."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.cluster import KMeans
+
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap, log_bin
+from zsp_lite.matching import (
+    _cluster,
+    _gram,
+    cyclical_distances,
+    match,
+    nearest_neighbours,
+    similarities,
+    similarity,
+)
+
+sides = st.integers(1, 8)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def descriptors(keys: torch.Tensor) -> torch.Tensor:
+    return F.normalize(log_bin(keys[None])[0].flatten(0, 1), dim=1)
+
+
+def feature_map(seed: int, grid=(9, 9), channels: int = 16, saliency=None) -> FeatureMap:
+    generator = torch.Generator().manual_seed(seed)
+    keys = torch.randn(*grid, channels, generator=generator)
+    saliency = torch.rand(grid, generator=generator) if saliency is None else saliency
+    return FeatureMap(keys, saliency, keys.mean((0, 1)))
+
+
+def cycles_by_loops(sim: np.ndarray, grid1, grid2, fg1, fg2) -> np.ndarray:
+    result = np.full(grid1, -np.inf)
+    for u in range(sim.shape[0]):
+        v = int(np.argmax(sim[u]))
+        back = int(np.argmax(sim[:, v]))
+        places = [divmod(u, grid1[1]), divmod(back, grid1[1])]
+        if fg1[places[0]] and fg1[places[1]] and fg2[divmod(v, grid2[1])]:
+            result[places[0]] = -np.hypot(*np.subtract(*places))
+    return result
+
+
+# similarity
+
+
+@settings(max_examples=40, deadline=None)
+@given(sides, sides, sides, sides, seeds)
+def test_similarity_is_the_cosine_of_materialised_descriptors(h1, w1, h2, w2, seed):
+    generator = torch.Generator().manual_seed(seed)
+    ref = torch.randn(h1, w1, 5, generator=generator) + 0.5
+    target = torch.randn(h2, w2, 5, generator=generator)
+    expected = descriptors(ref.double()) @ descriptors(target.double()).T
+    torch.testing.assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
+
+
+def test_similarity_holds_at_the_size_of_the_paper_and_with_one_dominant_patch():
+    ref, target = feature_map(0, (28, 28), 384).keys, feature_map(1, (28, 28), 384).keys
+    ref[13, 4] *= 1000
+    expected = descriptors(ref.double()) @ descriptors(target.double()).T
+    torch.testing.assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
+
+
+def test_an_image_is_most_similar_to_itself_patch_by_patch():
+    features = feature_map(0)
+    sim = similarity(features, features)
+    torch.testing.assert_close(sim.diagonal(), torch.ones(81))
+    assert torch.equal(nearest_neighbours(sim)[0], torch.arange(81))
+
+
+def test_similarity_takes_maps_tensors_and_arrays_and_is_symmetric():
+    ref, target = feature_map(0, (4, 6)), feature_map(1, (5, 3))
+    sim = similarity(ref, target)
+    assert sim.shape == (24, 15)
+    torch.testing.assert_close(similarity(ref.keys.numpy().astype(np.float64), target.keys), sim)
+    torch.testing.assert_close(similarity(target, ref).T, sim)
+    for many, target in zip(similarities(ref, [target, ref]), (target, ref)):
+        assert torch.equal(many, similarity(ref, target))
+
+
+def test_descriptors_without_length_are_similar_to_nothing():
+    assert bool((similarity(torch.zeros(4, 4, 3), torch.ones(4, 4, 3)) == 0).all())
+
+
+@pytest.mark.parametrize("ref, target", [((3, 3, 4), (3, 3, 5)), ((9, 4), (3, 3, 4)), ((0, 3, 4), (3, 3, 4))])
+def test_similarity_refuses_shapes_that_do_not_fit(ref, target):
+    with pytest.raises(InputError, match="similarity"):
+        similarity(torch.zeros(ref), torch.zeros(target))
+
+
+# cyclical distances
+
+
+@settings(max_examples=40, deadline=None)
+@given(sides, sides, sides, sides, seeds)
+def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
+    rng = np.random.default_rng(seed)
+    sim = rng.normal(size=(h1 * w1, h2 * w2))
+    fg1, fg2 = rng.random((h1, w1)) < 0.7, rng.random((h2, w2)) < 0.7
+    expected = cycles_by_loops(sim, (h1, w1), (h2, w2), fg1, fg2)
+    np.testing.assert_allclose(cyclical_distances(sim, (h1, w1), (h2, w2), fg1, fg2).numpy(), expected, rtol=1e-6)
+
+
+def test_an_image_cycles_through_itself_in_place():
+    sim = similarity(feature_map(0), feature_map(0))
+    assert bool((cyclical_distances(sim, (9, 9), (9, 9)) == 0).all())
+
+
+def test_each_station_of_a_cycle_must_lie_on_the_foreground():
+    # u = 0 goes to v = 1 and returns to u' = 2, two patches to the right.
+    sim = np.array([[0.0, 0.8, 0.0], [0.5, 0.0, 0.0], [0.0, 0.9, 0.0]])
+    row = (1, 3)
+    assert cyclical_distances(sim, row, row)[0, 0] == -2
+    for fg1, fg2 in (([0, 1, 1], [1, 1, 1]), ([1, 1, 1], [1, 0, 1]), ([1, 1, 0], [1, 1, 1])):
+        masks = np.array([fg1], dtype=bool), np.array([fg2], dtype=bool)
+        assert cyclical_distances(sim, row, row, *masks)[0, 0] == -np.inf
+
+
+def test_the_published_form_masks_returns_to_the_first_row_and_column_only():
+    sim = similarity(feature_map(0, (4, 5)), feature_map(0, (4, 5)))
+    masked = cyclical_distances(sim, (4, 5), (4, 5), published=True)
+    assert bool((masked[0] == -torch.inf).all()) and bool((masked[:, 0] == -torch.inf).all())
+    assert bool((masked[1:, 1:] == 0).all())
+    # The return need not be on the foreground: patch 4 goes to 5, which returns to 5, and that is off.
+    sim = np.eye(9)
+    sim[4, 5], off = 2, np.ones((3, 3), dtype=bool)
+    sim[5, 5], off[1, 2] = 3, False
+    grid = (3, 3)
+    assert cyclical_distances(sim, grid, grid, off)[1, 1] == -np.inf
+    assert cyclical_distances(sim, grid, grid, off, published=True)[1, 1] == -1
+
+
+@pytest.mark.parametrize(
+    "arguments", [((2, 2), (2, 3)), ((2, 3), (2, 3), np.ones((3, 2), bool)), ((2, 3), (2, 3), None, np.ones(6, bool))]
+)
+def test_cyclical_distances_refuse_shapes_that_do_not_fit(arguments):
+    with pytest.raises(InputError, match="cyclical_distances"):
+        cyclical_distances(np.zeros((6, 6)), *arguments)
+
+
+# match
+
+
+def test_matches_are_cycles_with_their_similarity_and_distance():
+    ref, target = feature_map(0), feature_map(1, (7, 10))
+    sim = similarity(ref, target).numpy()
+    cycles = cycles_by_loops(sim, ref.grid, target.grid, ref.foreground().numpy(), target.foreground().numpy())
+    matches = match(ref, target, k=8)
+    assert len(matches) == 8
+    for (row, column), there, cosine, distance in zip(
+        matches.reference, matches.target, matches.similarity, matches.distance
+    ):
+        u = row * 9 + column
+        v = int(np.argmax(sim[u]))
+        assert tuple(there) == divmod(v, 10)
+        assert cosine == sim[u, v]
+        assert distance == pytest.approx(-cycles[row, column])
+    assert (np.diff(matches.distance) >= 0).all()
+
+
+def test_without_kmeans_the_k_best_cycles_are_taken_ties_by_similarity():
+    ref, target = feature_map(2), feature_map(3)
+    everything = match(ref, target, k=81, kmeans=False)
+    keys = list(zip(everything.distance, -everything.similarity))
+    assert keys == sorted(keys)
+    np.testing.assert_array_equal(match(ref, target, k=7, kmeans=False).reference, everything.reference[:7])
+
+
+def test_kmeans_keeps_the_most_salient_patch_of_each_group_of_like_patches():
+    # Three regions, far apart in feature space, and two candidates in the middle of each.
+    noise = torch.randn(27, 6, 3, generator=torch.Generator().manual_seed(0))
+    keys = torch.eye(3)[torch.arange(27) // 9][:, None] + 0.02 * noise
+    saliency = torch.full((27, 6), 0.1)
+    for row, least, most in ((4, 1, 4), (13, 3, 0), (22, 2, 5)):
+        saliency[row, least], saliency[row, most] = 0.5, 0.9
+    features = FeatureMap(keys, saliency, torch.zeros(3))
+    six = saliency > 0.2
+    matches = match(features, features, k=3, ref_foreground=six, target_foreground=six)
+    assert sorted(matches.reference.tolist()) == [[4, 4], [13, 0], [22, 5]]
+    np.testing.assert_array_equal(matches.target, matches.reference)
+    np.testing.assert_array_equal(matches.distance, 0)
+
+
+def test_clustering_by_inner_products_keeps_all_distances():
+    features = feature_map(4)
+    index = np.arange(0, 81, 2)
+    points = descriptors(features.keys)[index].double().numpy()
+    np.testing.assert_allclose(_gram(features, index), points @ points.T, atol=1e-6)
+    labels = _cluster(_gram(features, index), 12, np.random.default_rng(5))
+    state = int(np.random.default_rng(5).integers(2**31))
+    direct = KMeans(12, n_init=1, random_state=state).fit(points).labels_
+    pairs = labels[:, None] == labels[None]
+    np.testing.assert_array_equal(pairs, direct[:, None] == direct[None])
+
+
+def test_the_same_seed_gives_the_same_matches():
+    ref, target = feature_map(5), feature_map(6)
+    first, second = (match(ref, target, k=10, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.reference, second.reference)
+    np.testing.assert_array_equal(first.target, second.target)
+
+
+def test_a_similarity_computed_before_changes_nothing():
+    ref, target = feature_map(5), feature_map(6)
+    given_sim = match(ref, target, k=10, sim=similarity(ref, target))
+    np.testing.assert_array_equal(given_sim.reference, match(ref, target, k=10).reference)
+
+
+def test_matches_lie_on_the_foreground_that_is_given():
+    ref, target = feature_map(7), feature_map(8)
+    on_ref, on_target = torch.zeros(9, 9, dtype=torch.bool), np.zeros((9, 9), dtype=bool)
+    on_ref[2:7, 2:7], on_target[1:8, 1:8] = True, True
+    matches = match(ref, target, ref_foreground=on_ref, target_foreground=on_target)
+    assert 0 < len(matches) < 50
+    assert bool(on_ref[tuple(matches.reference.T)].all()) and on_target[tuple(matches.target.T)].all()
+
+
+@pytest.mark.parametrize("kmeans", [True, False])
+@pytest.mark.parametrize("cycle_from", ["reference", "target"])
+def test_without_foreground_there_are_no_matches(kmeans, cycle_from):
+    empty = feature_map(9, saliency=torch.zeros(9, 9))
+    matches = match(empty, feature_map(10), kmeans=kmeans, cycle_from=cycle_from)
+    assert len(matches) == 0
+    assert matches.reference.shape == matches.target.shape == (0, 2)
+    assert matches.similarity.shape == matches.distance.shape == (0,)
+
+
+def test_equal_descriptors_everywhere_neither_warn_nor_fail(recwarn):
+    uniform = FeatureMap(torch.ones(6, 6, 4), torch.ones(6, 6), torch.ones(4))
+    assert 1 <= len(match(uniform, uniform, k=5)) <= 5
+    assert not recwarn.list
+
+
+def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
+    ref, target = feature_map(11), feature_map(12, (8, 10))
+    matches = match(ref, target, k=81, kmeans=False, cycle_from="target")
+    sim = similarity(ref, target)
+    cycles = cyclical_distances(sim.T, target.grid, ref.grid, target.foreground(), ref.foreground(), published=True)
+    assert len(matches) == int(cycles.isfinite().sum()) > 0
+    np.testing.assert_allclose(-matches.distance, cycles.numpy()[tuple(matches.target.T)])
+    forth = sim.argmax(0).numpy()
+    np.testing.assert_array_equal(matches.reference @ (9, 1), forth[matches.target @ (10, 1)])
+
+
+def test_from_the_target_salience_is_the_targets():
+    features = feature_map(13)
+    low, high = torch.full((9, 9), 0.5), torch.full((9, 9), 0.5)
+    high[4, 4] = 1.0
+    ref = FeatureMap(features.keys, low, features.global_feature)
+    target = FeatureMap(features.keys, high, features.global_feature)
+    inner = torch.zeros(9, 9, dtype=torch.bool)
+    inner[3:6, 3:6] = True
+    arguments = dict(k=5, ref_foreground=inner, target_foreground=inner)
+    chosen = match(ref, target, cycle_from="target", **arguments).target.tolist()
+    assert [4, 4] in chosen
+
+
+@pytest.mark.parametrize("options", [{"k": 0}, {"cycle_from": "both"}])
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(InputError, match="match"):
+        match(feature_map(0), feature_map(1), **options)

@@ -1,0 +1,47 @@
+"""Dense RootSIFT goes through the pipeline like any backbone."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from zsp_lite.baselines.rootsift import RootSift
+from zsp_lite.errors import InputError
+from zsp_lite.matching import match
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    noise = np.random.default_rng(0).integers(0, 256, (28, 28, 3), dtype=np.uint8)
+    return cv2.resize(noise, (224, 224), interpolation=cv2.INTER_CUBIC)
+
+
+def test_one_descriptor_of_unit_length_per_patch_all_salient(picture):
+    features = RootSift()([picture, np.full((100, 150, 3), 0.5)])
+    assert [f.keys.shape for f in features] == [(28, 28, 128)] * 2
+    assert bool((features[0].saliency == 1).all()) and features[0].global_feature.shape == (128,)
+    torch.testing.assert_close(features[0].keys.square().sum(-1), torch.ones(28, 28))
+    assert bool(features[1].keys.isfinite().all())
+
+
+def test_the_patch_of_a_key_is_where_the_grid_says(picture):
+    # One keypoint at the centre of the patch in row 9, column 17, described on its own.
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    _, histogram = cv2.SIFT_create().compute(grey, [cv2.KeyPoint(17 * 8 + 3.5, 9 * 8 + 3.5, 24.0, 0.0)])
+    root = np.sqrt(histogram[0] / histogram[0].sum())
+    np.testing.assert_allclose(RootSift()([picture])[0].keys[9, 17], root, atol=1e-6)
+
+
+def test_a_shifted_picture_matches_at_the_shift(picture):
+    shifted = np.roll(picture, (16, 24), axis=(0, 1))  # two patches down, three to the right
+    ref, target = RootSift(keypoint_size=4.0)([picture, shifted])  # small, to stay clear of the seams
+    inner = torch.zeros(28, 28, dtype=torch.bool)
+    inner[6:20, 6:20] = True
+    matches = match(ref, target, k=30, ref_foreground=inner)
+    moved = (matches.target - matches.reference == (2, 3)).all(axis=1)
+    assert moved.mean() > 0.9
+
+
+def test_bad_images_are_refused():
+    with pytest.raises(InputError, match="image 1"):
+        RootSift()([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.uint8)])
