@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 IMAGE_SIZE = 224
 # Thin parts (a chair's legs) never fill half a patch.
 _MASK_PATCH = 0.25
+_FEW = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,9 +254,9 @@ def view_alignment(reference: View, target: View) -> Sim3:
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
     points, known = view.patch_points
     foreground = np.asarray(view.foreground.cpu())
-    # Best first: measured points of the object; then any measured point; a view with neither was refused before.
+    # Measured points of the object; where they are too few to have a spread, of the whole crop.
     for chosen in (foreground & known, known):
-        if chosen.any():
+        if chosen.sum() >= _FEW:
             return points[chosen]
     return points.reshape(-1, 3)
 
