@@ -60,9 +60,11 @@ def geometry_loss(
 
 
 def attention_loss(
-    cls_logits: Float[Tensor, "crops heads n+1"], coverage: Float[Tensor, "crops n"]
+    cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
 ) -> tuple[Tensor, float]:
     """Ask the CLS attention, averaged over heads, to spread evenly over the object and leave the rest.
+
+    cls_logits holds 1 + n columns, the CLS token first.
 
     Divergence between the normalised mask and the attention over patches, and a cross-entropy that separates the two
     sides at 0.12 of the object's mean attention. This is supervision by rendered masks. Returns the loss and the mean

@@ -19,13 +19,12 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss
 from zsp_lite.training.renders import SHARD, RenderSet, load_render_set, render_set
 from zsp_lite.vit import TrainingTokens, VisionTransformer
-
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
@@ -188,7 +187,7 @@ def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
 
 
 def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
-          checkpoint_every: int = 250, log_every: int = 50) -> Path:  # fmt: skip
+          progress=lambda iterable, total: iterable, checkpoint_every: int = 250, log_every: int = 50) -> Path:  # fmt: skip
     """Train from scratch, or resume from `folder`/checkpoint.pt, and export `folder`/zsp-tiny.safetensors.
 
     folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights; `renders`
@@ -203,7 +202,8 @@ def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log
     if config_file.exists() and json.loads(config_file.read_text()) != settings:
         raise InputError(f"{config_file}: holds a run of another configuration; expected a new folder for this one")
     config_file.write_text(json.dumps(settings, indent=1) + "\n")
-    shards = render_set(renders or folder / "renders", config.objects, config.seed)
+    shard = min(SHARD, max(1, config.objects // 8))
+    shards = render_set(renders or folder / "renders", config.objects, config.seed, shard, progress=progress)
     training, held_out = load_render_set(shards[:-1]), load_render_set(shards[-1:])
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -285,7 +285,7 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     """
     backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
     backbone.load_state_dict(model.backbone.state_dict())
-    rgb = torch.from_numpy(renders.rgb[: min(24, SHARD), ::3].reshape(-1, *renders.rgb.shape[2:])).permute(0, 3, 1, 2)
+    rgb = torch.from_numpy(renders.rgb[:24, ::3].reshape(-1, *renders.rgb.shape[2:])).permute(0, 3, 1, 2)
     images = (F.interpolate(rgb.float() / 255, (224, 224), mode="bilinear") - MEAN) / STD
     dim = config.embed_dim
     x, _ = backbone.embed(images)
