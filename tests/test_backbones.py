@@ -48,7 +48,8 @@ def assert_same_features(first, second):
 
 
 def test_features_are_the_models_keys_saliency_and_cls(vit, pictures):
-    features = Backbone(vit, "small", key_block=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(pictures)
+    model = Backbone(vit, "small", key_block=1, saliency_heads=(0, 3), device="cpu", batch_size=2)
+    features = model(pictures)
     assert len(features) == 3
     pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
@@ -135,8 +136,14 @@ def test_bad_images_are_refused_by_number(vit, image):
 
 @pytest.mark.parametrize(
     "options",
-    [{"key_block": 3}, {"saliency_heads": (4,)}, {"saliency_heads": ()}, {"precision": "int8"}, {"batch_size": 0}]
-    + [{"device": "nowhere"}],
+    [
+        {"key_block": 3},
+        {"saliency_heads": (4,)},
+        {"saliency_heads": ()},
+        {"precision": "int8"},
+        {"batch_size": 0},
+        {"device": "nowhere"},
+    ],
 )
 def test_options_out_of_range_are_refused(vit, options):
     with pytest.raises(InputError):
@@ -149,9 +156,10 @@ def test_options_out_of_range_are_refused(vit, options):
 @pytest.mark.parametrize("wrapping", ["plain", "teacher", "state_dict", "prefixed"])
 def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path, wrapping):
     weights = vit.state_dict()
+    teacher = {f"module.backbone.{k}": v for k, v in weights.items()}
     content = {
         "plain": weights,
-        "teacher": {"student": {}, "epoch": 3, "teacher": {f"module.backbone.{k}": v for k, v in weights.items()}},
+        "teacher": {"student": {}, "epoch": 3, "teacher": teacher},
         "state_dict": {"state_dict": {f"module.{k}": v for k, v in weights.items()}},
         "prefixed": {f"backbone.{k}": v for k, v in weights.items()} | {"head.mlp.weight": torch.zeros(2, 2)},
     }[wrapping]
@@ -206,7 +214,8 @@ def test_damaged_files_are_refused_in_one_line(vit, tmp_path, suffix, damage):
     else:
         save_file(vit.state_dict(), path)
     whole = path.read_bytes()
-    path.write_bytes({"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"<html>404</html>"}[damage])
+    damaged = {"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"<html>404</html>"}
+    path.write_bytes(damaged[damage])
     with pytest.raises(InputError, match=f"^checkpoint [^\n]*model{suffix}: damaged[^\n]*$"):
         load_backbone(path, "cpu", num_heads=4)
 
@@ -383,7 +392,8 @@ def test_without_the_server_one_line_says_what_to_do(server, tmp_path, monkeypat
         load_backbone("dino_vits8")
     message = str(caught.value)
     assert "\n" not in message
-    for part in (backbones.RELEASES["dino_vits8"].url, str(tmp_path / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
+    place = tmp_path / "dino_deitsmall8_pretrain.pth"
+    for part in (backbones.RELEASES["dino_vits8"].url, str(place), "zsp-tiny"):
         assert part in message
 
 

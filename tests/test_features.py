@@ -27,7 +27,8 @@ def log_bin_by_loops(x: np.ndarray) -> np.ndarray:
                     for dx in (-step, 0, step):
                         if step == 3 and dy == dx == 0:
                             continue
-                        bins.append(source[min(max(row + dy, 0), height - 1), min(max(column + dx, 0), width - 1)])
+                        there = min(max(row + dy, 0), height - 1), min(max(column + dx, 0), width - 1)
+                        bins.append(source[there])
             result.append(np.concatenate(bins))
     return np.stack(result).reshape(height, width, -1)
 

@@ -1,4 +1,4 @@
-"""Similarity against materialised descriptors, cyclical distances against loops, and what `match` promises."""
+"""Similarity against materialised descriptors, cyclical distances against loops, and `match`'s promises."""
 
 import numpy as np
 import pytest
@@ -103,7 +103,8 @@ def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
     sim = rng.normal(size=(h1 * w1, h2 * w2))
     fg1, fg2 = rng.random((h1, w1)) < 0.7, rng.random((h2, w2)) < 0.7
     expected = cycles_by_loops(sim, (h1, w1), (h2, w2), fg1, fg2)
-    np.testing.assert_allclose(cyclical_distances(sim, (h1, w1), (h2, w2), fg1, fg2).numpy(), expected, rtol=1e-6)
+    cyclical = cyclical_distances(sim, (h1, w1), (h2, w2), fg1, fg2)
+    np.testing.assert_allclose(cyclical.numpy(), expected, rtol=1e-6)
 
 
 def test_an_image_cycles_through_itself_in_place():
@@ -136,7 +137,12 @@ def test_the_published_form_masks_returns_to_the_first_row_and_column_only():
 
 
 @pytest.mark.parametrize(
-    "arguments", [((2, 2), (2, 3)), ((2, 3), (2, 3), np.ones((3, 2), bool)), ((2, 3), (2, 3), None, np.ones(6, bool))]
+    "arguments",
+    [
+        ((2, 2), (2, 3)),
+        ((2, 3), (2, 3), np.ones((3, 2), bool)),
+        ((2, 3), (2, 3), None, np.ones(6, bool)),
+    ],
 )
 def test_cyclical_distances_refuse_shapes_that_do_not_fit(arguments):
     with pytest.raises(InputError, match="cyclical_distances"):
@@ -149,7 +155,8 @@ def test_cyclical_distances_refuse_shapes_that_do_not_fit(arguments):
 def test_matches_are_cycles_with_their_similarity_and_distance():
     ref, target = feature_map(0), feature_map(1, (7, 10))
     sim = similarity(ref, target).numpy()
-    cycles = cycles_by_loops(sim, ref.grid, target.grid, ref.foreground().numpy(), target.foreground().numpy())
+    on_ref, on_target = ref.foreground().numpy(), target.foreground().numpy()
+    cycles = cycles_by_loops(sim, ref.grid, target.grid, on_ref, on_target)
     matches = match(ref, target, k=8)
     assert len(matches) == 8
     for (row, column), there, cosine, distance in zip(
@@ -240,7 +247,8 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
     ref, target = feature_map(11), feature_map(12, (8, 10))
     matches = match(ref, target, k=81, kmeans=False, cycle_from="target")
     sim = similarity(ref, target)
-    cycles = cyclical_distances(sim.T, target.grid, ref.grid, target.foreground(), ref.foreground(), published=True)
+    on_target, on_ref = target.foreground(), ref.foreground()
+    cycles = cyclical_distances(sim.T, target.grid, ref.grid, on_target, on_ref, published=True)
     assert len(matches) == int(cycles.isfinite().sum()) > 0
     np.testing.assert_allclose(-matches.distance, cycles.numpy()[tuple(matches.target.T)])
     forth = sim.argmax(0).numpy()

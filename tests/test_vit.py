@@ -26,9 +26,10 @@ def images() -> torch.Tensor:
 
 
 def oracle(vit: VisionTransformer, images: torch.Tensor):
-    """(output tokens, keys of every block, attention of every block), by convolution and MultiheadAttention."""
+    """Output tokens, keys of every block, attention of every block, by Conv2d and MultiheadAttention."""
     weights = vit.state_dict()
-    patches = F.conv2d(images, weights["patch_embed.proj.weight"], weights["patch_embed.proj.bias"], stride=PATCH)
+    kernel, bias = weights["patch_embed.proj.weight"], weights["patch_embed.proj.bias"]
+    patches = F.conv2d(images, kernel, bias, stride=PATCH)
     x = torch.cat([weights["cls_token"].expand(len(images), 1, DIM), patches.flatten(2).transpose(1, 2)], 1)
     x = x + weights["pos_embed"]
     keys, attentions = [], []
@@ -78,9 +79,11 @@ def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, 
         tokens, output = model.extract(images, key_block), model(images)
     torch.testing.assert_close(training.tokens, output, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(training.keys, tokens.keys, atol=2e-5, rtol=1e-4)
-    torch.testing.assert_close(training.cls_logits.softmax(-1)[:, :, 1:], tokens.attention, atol=1e-5, rtol=1e-4)
+    attention = training.cls_logits.softmax(-1)[:, :, 1:]
+    torch.testing.assert_close(attention, tokens.attention, atol=1e-5, rtol=1e-4)
     weight, bias = (x.chunk(3)[1] for x in model.blocks[key_block].attn.qkv.parameters())
-    torch.testing.assert_close(F.linear(training.key_input, weight, bias), training.keys, atol=2e-5, rtol=1e-4)
+    keys = F.linear(training.key_input, weight, bias)
+    torch.testing.assert_close(keys, training.keys, atol=2e-5, rtol=1e-4)
     loss = training.tokens.square().sum() + training.keys.sum() + training.cls_logits.square().sum()
     gradients = torch.autograd.grad(loss, list(model.parameters()))
     assert all(bool(gradient.isfinite().all()) and bool(gradient.any()) for gradient in gradients)
@@ -88,7 +91,8 @@ def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, 
 
 def test_in_the_last_block_no_patch_passes_the_mlp(model, images):
     widths = []
-    handle = model.blocks[-1].mlp.register_forward_hook(lambda _, inputs, __: widths.append(inputs[0].shape[1]))
+    last = model.blocks[-1].mlp
+    handle = last.register_forward_hook(lambda _, inputs, __: widths.append(inputs[0].shape[1]))
     with torch.no_grad():
         model.extract(images, 1)
     handle.remove()
