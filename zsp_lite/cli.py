@@ -12,7 +12,7 @@ from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
     "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and soft masks as "
-    "CO3D has them. No photograph, and no object or category that the backbone was trained on."
+    "CO3D has them; no photograph."
 )
 USER_NOTE = "a folder in CO3D's layout, as given."
 

@@ -51,10 +51,10 @@ def page(results: Sequence[DemoResult], data: str, data_note: str, backbone: str
 <title>zsp-lite: zero-shot pose, end to end</title><style>{_CSS}</style>
 <script>{get_plotlyjs()}</script></head><body>
 <header><h1>Zero-shot category-level pose, end to end</h1>
-<p>Two objects of one category, never seen before and without a label: how must the first be turned, moved and scaled to
-lie on the second? Below, every stage of the method on one pair of each category in <code>{html.escape(data)}</code>.</p>
+<p>Two objects of one category, neither with a label: how must the first be turned, moved and scaled to lie on the second?
+Below, every stage of the method on one pair of each category in <code>{html.escape(data)}</code>.</p>
 <p><strong>Data:</strong> {html.escape(data_note)} <strong>Backbone:</strong> <code>{html.escape(backbone)}</code>.
-The pairs are the first evaluation pair of each category, fixed before anything was run, so some of them fail.</p></header>
+The pairs are the first evaluation pair of each category, fixed before anything was run: what fails is shown too.</p></header>
 <div class="scroll"><table><thead><tr><th scope="col">category</th><th scope="col">chosen view</th>
 <th scope="col">inliers</th><th scope="col">rotation error</th><th scope="col">time</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
