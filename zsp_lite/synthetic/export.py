@@ -27,7 +27,7 @@ LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 @dataclass(frozen=True)
 class Preset:
-    """A data set as plain data; `image_size` is the shorter image side in pixels, `pairs` are per category."""
+    """A data set as plain data: `image_size` is the shorter image side in pixels, `pairs` is per category."""
 
     categories: tuple[str, ...]
     sequences: int
@@ -81,9 +81,9 @@ def export_categories(
     """Write `sequences` sequences of `frames` frames of each category to the folder `out`, with pose labels.
 
     The shorter image side has `image_size` pixels. A sequence depends on the seed, its category and its index
-    alone, so any part of an export can be made again; sequences that are complete already are left as they are.
-    The first sequence of a category is its labels' reference. Raises InputError on unknown categories or
-    layouts, and on a folder that was made with other settings.
+    alone, so any part of an export can be made again; sequences that are complete already are left alone. The
+    first sequence of a category is its labels' reference. Raises InputError on unknown categories or layouts,
+    and on a folder that was made with other settings.
     """
     generators = TRAINING | EVALUATION
     for category in categories:
@@ -108,7 +108,7 @@ def export_categories(
             # The pose goes first: a sequence counts as complete by the annotations, which come last.
             poses[name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale}
             write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-            write_co3d(out, category, [data], quality=90, intrinsics_format=LAYOUTS[layout])
+            write_co3d(out, category, [data], quality=88, intrinsics_format=LAYOUTS[layout])
         reference = sequence_name(seed, category, 0)
         trans = np.array(poses[name]["trans"]) @ np.linalg.inv(poses[reference]["trans"])
         write_label(out, category, PoseLabel(np.eye(4) if name == reference else trans, name, reference))

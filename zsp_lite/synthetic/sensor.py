@@ -18,7 +18,7 @@ from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 
 _DEPTH_NOISE = 0.005  # of the depth, at the object
 # Unknown share of the object's and of the floor's pixels, drawn per sequence; the wall is too far away.
-_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.15, 0.35)
+_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float
 
 
 def stereo_depth(
-    view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.25
+    view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.2
 ) -> Float[np.ndarray, "h w"]:
     """Depth (float32, 0 = unknown) as stereo would give it, with the wanted shares of unknown pixels.
 
@@ -88,7 +88,7 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], seed: int | np.random.Generator) ->
         1 - inside, cv2.DIST_L2, 5
     )
     distance -= np.where(mask, 0.5, -0.5)
-    wander = 0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape))
+    wander = np.clip(0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape)), -1.5, 1.5)
     return (1 / (1 + np.exp(-np.clip((distance + wander) / 0.7, -20, 20)))).astype(np.float32)
 
 
@@ -127,7 +127,7 @@ def observe(
         depths.append(stereo_depth(view, rng, *shares))
         masks.append(soft_mask(view.mask, rng))
     cloud = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
-    factor = 1 / cloud.points.std(0).mean()
+    factor = round(float(1 / cloud.points.std(0).mean()), 9)
     exact = rescaled(sequence, factor)
     frames = [
         Frame(view.rgb, depth * np.float32(factor), mask, view.camera, f"{name}/{number}")

@@ -1,6 +1,7 @@
 """A hand-held camera walks around an object: the renderings of one sequence, in a world of its own."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -61,7 +62,7 @@ def handheld_sweep(
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
-    elevation = np.radians(rng.uniform(19, 30) + rng.uniform(3, 9) * wave(1, rng.choice([1, 2])))
+    elevation = np.radians(rng.uniform(19, 30) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2]))))
     elevation = np.clip(elevation + np.radians(rng.normal(0, 1, frames)), np.radians(10), np.radians(35))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
@@ -72,11 +73,11 @@ def handheld_sweep(
     plane = [(v := vertices @ R.T + t)[:, :2] / v[:, 2:] for R, t in poses]
     low, high = np.array([p.min(0) for p in plane]), np.array([p.max(0) for p in plane])
     sides = np.array(size[::-1], float)
-    principal_point = sides / 2 + rng.normal(0, 0.004, 2) * sides
+    principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
     room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
     allowed = (room / np.maximum(-low, high).max(0)).min()
-    focal = np.full(2, min(wanted, allowed))
+    focal = np.full(2, round(min(wanted, allowed), 6))
     return [Camera(R, t, focal, principal_point, size) for R, t in poses]
 
 
@@ -95,14 +96,16 @@ def render_sequence(
     cameras = handheld_sweep(scene.vertices, rng, frames, image_shape(image_size, rng))
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
+    # The last digits of sines and products depend on the processor: rounded, files are equal on any of them.
+    tidy = partial(np.round, decimals=9)
     views = []
     for camera in cameras:
         exposed = replace(look, gain=look.gain * np.exp(rng.normal(0, 0.02)))
         view = scene.render(camera, exposed, rng)
-        pose = camera.matrix @ to_object
+        pose = tidy(camera.matrix @ to_object) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
-    return RenderedSequence(tuple(views), tuple(seconds.tolist()), first, 1.0)
+    return RenderedSequence(tuple(views), tuple(seconds.tolist()), tidy(first), 1.0)
 
 
 def rescaled(sequence: RenderedSequence, factor: float) -> RenderedSequence:

@@ -1,0 +1,353 @@
+"""The procedural world: what is exported reads like CO3D, and its labels, cameras and depth agree with the geometry."""
+
+import inspect
+import types
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from zsp_lite.alignment import umeyama
+from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.frames import crop_to_object
+from zsp_lite.labels import read_labels, relative_pose
+from zsp_lite.pairs import read_upstream_pairs, upstream_pairs_path
+from zsp_lite.synthetic import evaluation_categories, export, training_categories
+from zsp_lite.synthetic.assembly import make_shape, surface_spread
+from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.synthetic.export import (
+    PRESETS,
+    Preset,
+    export_categories,
+    make_sequence,
+    sequence_name,
+    write_pairs,
+)
+from zsp_lite.synthetic.sensor import soft_mask
+from zsp_lite.synthetic.sequences import handheld_sweep, rescaled
+from zsp_lite.synthetic.training_categories import TRAINING
+
+PAPER_CATEGORIES = set(
+    "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse remote teddybear "
+    "toaster toilet toybus toyplane toytrain toytruck".split()
+)
+SEED, FRAMES, SIZE = 5, 6, 72
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("synthetic")
+    export_categories(["chair", "toytruck"], out, 2, FRAMES, SEED, SIZE)
+    return out
+
+
+@pytest.fixture(scope="module")
+def chairs():
+    """Two chairs as CO3D would hold them, each with its exact twin."""
+    return [make_sequence("chair", index, FRAMES, SEED, SIZE) for index in range(2)]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+# Categories
+
+
+def code_of(module: types.ModuleType) -> dict[str, types.CodeType]:
+    """Code of every function that belongs to the module's side: its own, and those of its siblings it imports."""
+    side = module.__name__.split(".")[-1].split("_")[0]  # "evaluation" or "training"
+    found, queue = {}, [module]
+    while queue:
+        here = queue.pop()
+        for function in vars(here).values():
+            if inspect.isfunction(function) and function.__module__.split(".")[-1].startswith(side):
+                function = inspect.unwrap(function)
+                if f"{function.__module__}.{function.__name__}" not in found:
+                    found[f"{function.__module__}.{function.__name__}"] = function.__code__
+                    queue.append(inspect.getmodule(function))
+    return found
+
+
+def test_evaluation_names_are_the_papers():
+    assert set(EVALUATION) <= PAPER_CATEGORIES
+    assert len(EVALUATION) >= 10 and len(TRAINING) >= 12
+
+
+def test_no_training_category_is_evaluated():
+    assert not set(EVALUATION) & set(TRAINING)
+    generators = {inspect.unwrap(generator) for generator in EVALUATION.values()}
+    assert not generators & {inspect.unwrap(generator) for generator in TRAINING.values()}
+
+
+def test_the_two_sides_share_no_code():
+    evaluation, training = code_of(evaluation_categories), code_of(training_categories)
+    assert len(evaluation) > len(EVALUATION) and len(training) >= len(TRAINING)
+    assert all(any(name.endswith(f".{category}") for name in evaluation) for category in EVALUATION)
+    assert not {code.co_code for code in evaluation.values()} & {code.co_code for code in training.values()}
+
+
+@pytest.mark.parametrize("category", sorted(EVALUATION))
+def test_objects_of_a_category_are_unit_sized_and_vary(category):
+    shapes = [make_shape(EVALUATION[category], seed) for seed in range(4)]
+    for shape in shapes:
+        assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
+        assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
+        assert 0 <= shape.material.min() and shape.material.max() < 8
+    extents = np.array([np.ptp(shape.vertices, axis=0) for shape in shapes])
+    assert (extents.std(0) / extents.mean(0)).max() > 0.02
+
+
+@pytest.mark.parametrize("category", sorted(EVALUATION))
+def test_front_and_back_of_an_object_differ(category):
+    """Turned by half a turn about z, no object coincides with itself, or its pose would have two answers."""
+    shape = make_shape(EVALUATION[category], 3)
+    turned = shape.vertices * [-1, -1, 1]
+    nearest = np.linalg.norm(shape.vertices[:, None] - turned[None, ::3], axis=-1).min(0)
+    assert nearest.max() > 0.2
+
+
+# Sequences
+
+
+def test_the_object_is_never_cut_and_fills_the_picture():
+    size = (120, 160)
+    extents = []
+    for seed in range(8):
+        vertices = make_shape(EVALUATION["bicycle"], seed).vertices
+        for camera in handheld_sweep(vertices, seed, 12, size):
+            pixels, depth = camera.project(vertices)
+            assert depth.min() > 1
+            assert (pixels > 0).all() and (pixels < size[::-1]).all()
+            extents.append(np.ptp(pixels, axis=0).max() / min(size))
+    assert 0.5 < np.median(extents) < 0.8
+
+
+def test_the_sweep_goes_once_around_between_10_and_35_degrees():
+    vertices = make_shape(EVALUATION["car"], 0).vertices
+    cameras = handheld_sweep(vertices, 1, 40, (100, 100))
+    x, y, z = np.transpose([camera.centre - (vertices.max(0) + vertices.min(0)) / 2 for camera in cameras])
+    turned = np.degrees(np.unwrap(np.arctan2(y, x)))
+    assert 330 < np.ptp(turned) < 390
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    assert 8 < elevation.min() and elevation.max() < 37
+    assert np.ptp([camera.focal[0] for camera in cameras]) == 0
+
+
+def test_canonical_coordinates_project_onto_their_own_pixels_and_depth(chairs):
+    for _, exact in chairs:
+        for view in exact.views:
+            row, col = np.nonzero(view.mask)
+            pixels, depth = view.camera.project(exact.to_world(view.canonical[row, col]))
+            assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
+            np.testing.assert_allclose(depth, view.depth[row, col], rtol=1e-4)
+
+
+def test_the_world_is_the_first_cameras_frame(chairs):
+    for data, _ in chairs:
+        np.testing.assert_allclose(data.frames[0].camera.matrix, np.eye(4), atol=1e-12)
+
+
+def test_a_change_of_unit_scales_lengths_and_moves_no_pixel(chairs):
+    exact = chairs[0][1]
+    larger = rescaled(exact, 3.0)
+    point = np.array([0.3, -0.2, 0.1])
+    np.testing.assert_allclose(larger.to_world(point), 3 * exact.to_world(point))
+    for view, other in zip(exact.views, larger.views, strict=True):
+        pixels, _ = view.camera.project(exact.to_world(point))
+        np.testing.assert_allclose(other.camera.project(larger.to_world(point))[0], pixels)
+
+
+# Sensor
+
+
+def test_a_third_to_a_half_of_the_depth_is_unknown_in_patches():
+    unknown, on_object, lonely = [], [], []
+    for index, category in enumerate(sorted(EVALUATION)):
+        data, exact = make_sequence(category, index, 2, SEED, SIZE)
+        for frame, view in zip(data.frames, exact.views, strict=True):
+            hole = frame.depth == 0
+            unknown.append(hole.mean())
+            on_object.append(hole[view.mask].mean())
+            lonely.append((hole[:, 1:-1] & ~hole[:, :-2] & ~hole[:, 2:]).sum() / hole.sum())
+    assert 0.3 < np.mean(on_object) < 0.5
+    assert 0.35 < np.mean(unknown) < 0.6
+    assert np.mean(lonely) < 0.1
+
+
+def test_known_depth_is_right_to_about_half_a_percent(chairs):
+    for data, exact in chairs:
+        error = []
+        for frame, view in zip(data.frames, exact.views, strict=True):
+            known = (frame.depth > 0) & view.mask
+            error.append(frame.depth[known] / view.depth[known] - 1)
+        assert 0.003 < np.concatenate(error).std() < 0.008
+
+
+def test_masks_are_soft_and_right_to_two_pixels(chairs):
+    truth = np.zeros((80, 80), bool)
+    truth[20:60, 20:60] = True
+    mask = soft_mask(truth, 0)
+    assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
+    assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
+    for data, exact in chairs:
+        for frame, view in zip(data.frames, exact.views, strict=True):
+            inside = view.mask.astype(np.uint8)
+            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
+                1 - inside, cv2.DIST_L2, 5
+            )
+            wrong = (frame.mask > 0.5) != view.mask
+            assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
+
+
+def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
+    for data, exact in chairs:
+        assert data.points.std(0).mean() == pytest.approx(1)
+        np.testing.assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
+        R, t = exact.object_pose[:3, :3], exact.object_pose[:3, 3]
+        canonical = (data.points - t) @ R / exact.scale
+        seen = np.concatenate([view.canonical[view.mask] for view in exact.views])
+        assert (canonical > seen.min(0) - 0.3).all() and (canonical < seen.max(0) + 0.3).all()
+
+
+# Export
+
+
+def test_the_reader_reads_what_is_exported(folder, chairs):
+    dataset = Co3D(folder)
+    assert dataset.categories() == ["chair", "toytruck"]
+    for category in dataset.categories():
+        assert len(dataset.select(category)) == 2
+        for sequence in dataset.sequences(category):
+            assert len(dataset.frames(category, sequence.sequence_name)) == FRAMES
+            points, colours = dataset.point_cloud(category, sequence.sequence_name)
+            assert len(points) == len(colours) == sequence.point_cloud.n_points
+    data = chairs[0][0]
+    for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
+        frame = dataset.load(annotation)
+        np.testing.assert_allclose(frame.camera.matrix, wanted.camera.matrix, atol=1e-9)
+        np.testing.assert_allclose(frame.camera.K, wanted.camera.K, rtol=1e-9)
+        np.testing.assert_allclose(frame.depth, wanted.depth, rtol=1e-3)
+        np.testing.assert_allclose(frame.mask, wanted.mask, atol=0.51 / 255)
+        assert np.abs(frame.rgb.astype(int) - wanted.rgb).mean() < 12  # JPEG
+        assert crop_to_object(frame).rgb.size < frame.rgb.size
+
+
+def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
+    """Ground truth from labels and cameras against a fit to the objects' own coordinates."""
+    labels = read_labels(folder, "chair")
+    (data_a, exact_a), (data_b, exact_b) = chairs
+    view_a, view_b = exact_a.views[2], exact_b.views[4]
+    truth = relative_pose(labels[data_a.name], view_a.camera, labels[data_b.name], view_b.camera)
+
+    def canonical_to_camera(view, depth):
+        row, col = np.nonzero(view.mask)
+        seen = view.camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), depth[row, col])
+        return umeyama(view.canonical[row, col].astype(float), seen)
+
+    a, b = canonical_to_camera(view_a, view_a.depth), canonical_to_camera(view_b, view_b.depth)
+    np.testing.assert_allclose(truth[:3, :3], np.asarray(b.R) @ np.asarray(a.R).T, atol=1e-3)
+    # The object's origin, the same point of both, goes where it belongs.
+    np.testing.assert_allclose(truth[:3, :3] @ np.asarray(a.t) + truth[:3, 3], np.asarray(b.t), atol=1e-2)
+    assert np.array_equal(labels[data_a.name].trans, np.eye(4))
+
+
+def test_evaluation_pairs_in_the_upstream_form_read_back(folder):
+    preset = Preset(("chair", "toytruck"), 2, FRAMES, SIZE, pairs=4, targets=(1, 3))
+    write_pairs(preset, folder, SEED)
+    for category in preset.categories:
+        for n_targets in preset.targets:
+            pairs = read_upstream_pairs(upstream_pairs_path(folder, category, 4, n_targets), Co3D(folder))
+            assert len(pairs) == 4 and {len(pair.target_frames) for pair in pairs} == {n_targets}
+
+
+def test_a_sequence_depends_on_its_own_name_alone(folder, tmp_path):
+    """One category by itself, begun with one sequence and then completed, gives the very bytes of the whole."""
+    export_categories(["toytruck"], tmp_path, 1, FRAMES, SEED, SIZE)
+    export_categories(["toytruck"], tmp_path, 2, FRAMES, SEED, SIZE)
+    whole = {
+        name: data for name, data in files(folder).items() if "toytruck" in name and "determ_eval" not in name
+    }
+    part = {name: data for name, data in files(tmp_path).items() if "toytruck" in name}
+    assert part == whole and len(part) > 50
+
+
+def test_complete_sequences_are_not_rendered_again(folder, monkeypatch):
+    before = files(folder)
+    monkeypatch.setattr(export, "make_sequence", lambda *_: pytest.fail("rendered again"))
+    export_categories(["chair", "toytruck"], folder, 2, FRAMES, SEED, SIZE)
+    assert files(folder) == before
+
+
+def test_an_interrupted_export_is_taken_up(tmp_path, monkeypatch):
+    def breaks_at_the_second(category, index, *rest):
+        if index == 1:
+            raise KeyboardInterrupt
+        return make_sequence(category, index, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "make_sequence", breaks_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
+    export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
+    export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+
+
+def test_the_v2_layout_holds_the_same_cameras(tmp_path, chairs):
+    export_categories(["chair"], tmp_path, 1, FRAMES, SEED, SIZE, layout="v2")
+    dataset = Co3D(tmp_path)
+    annotations = dataset.frames("chair", chairs[0][0].name)
+    assert annotations[0].viewpoint.intrinsics_format == "ndc_isotropic"
+    for annotation, frame in zip(annotations, chairs[0][0].frames, strict=True):
+        np.testing.assert_allclose(dataset.load(annotation).camera.K, frame.camera.K)
+
+
+def test_training_categories_can_be_exported_too(tmp_path):
+    export_categories(["teapot"], tmp_path, 1, 2, 0, 48)
+    assert Co3D(tmp_path).categories() == ["teapot"]
+
+
+def test_sequence_names_are_digits_in_the_order_of_the_indices():
+    names = [sequence_name(0, "car", index) for index in range(30)]
+    assert names == sorted(names) and len(set(names)) == 30
+    assert all(part.isdigit() for name in names for part in name.split("_"))
+    assert names[0] != sequence_name(1, "car", 0)
+
+
+def test_presets_are_of_evaluation_categories():
+    for preset in PRESETS.values():
+        assert set(preset.categories) <= set(EVALUATION)
+        assert all(getattr(preset, field.name) for field in fields(preset))
+    assert len(PRESETS["samples"].categories) == 4 and len(PRESETS["eval"].categories) >= 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((["sofa"], 1, 1, 0), "sofa"),
+        ((["chair"], 0, 1, 0), "expected at least 1"),
+        ((["chair"], 1, 1, 0, 64, "v3"), "v3"),
+    ],
+)
+def test_bad_requests_are_refused(tmp_path, arguments, named):
+    categories, *rest = arguments
+    with pytest.raises(InputError, match=named):
+        export_categories(categories, tmp_path, *rest)
+
+
+def test_a_folder_made_with_other_settings_is_refused(folder):
+    with pytest.raises(InputError, match="was made with"):
+        export_categories(["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
+
+
+def test_an_unknown_preset_is_refused(tmp_path):
+    with pytest.raises(InputError, match="imagenet"):
+        export.export_preset("imagenet", tmp_path, 0)
