@@ -13,7 +13,13 @@ SIZE = (480, 640)
 
 
 def view(**changes):
-    values = {"R": np.eye(3), "t": [0, 0, 2], "focal": [500, 500], "principal_point": [320, 240], "size": SIZE}
+    values = {
+        "R": np.eye(3),
+        "t": [0, 0, 2],
+        "focal": [500, 500],
+        "principal_point": [320, 240],
+        "size": SIZE,
+    }
     return Camera(**(values | changes))
 
 

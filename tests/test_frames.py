@@ -27,7 +27,12 @@ SIZE = (24, 32)
 
 
 def frame(**changes):
-    values = {"rgb": np.zeros((*SIZE, 3), np.uint8), "depth": None, "mask": None, "camera": random_camera(0, SIZE)}
+    values = {
+        "rgb": np.zeros((*SIZE, 3), np.uint8),
+        "depth": None,
+        "mask": None,
+        "camera": random_camera(0, SIZE),
+    }
     return Frame(**(values | changes))
 
 
@@ -74,7 +79,13 @@ def test_cropping_keeps_every_pixels_world_point():
     whole = sequence_data("one").frames[0]
     cropped = crop_to_object(whole)
     top, left, height, width = object_box(whole.mask)
-    assert cropped.camera.size == cropped.rgb.shape[:2] == cropped.depth.shape == cropped.mask.shape == (height, width)
+    assert (
+        cropped.camera.size
+        == cropped.rgb.shape[:2]
+        == cropped.depth.shape
+        == cropped.mask.shape
+        == (height, width)
+    )
     np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
     pixel = np.array([3.5, 2.5])
     np.testing.assert_allclose(
@@ -155,7 +166,9 @@ def test_missing_and_corrupt_files_are_refused_by_name(tmp_path, read):
 
 
 def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path):
-    write_image(tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+    write_image(
+        tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    )
     data = (tmp_path / "image.jpg").read_bytes()
     (tmp_path / "image.jpg").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="expected a complete JPEG"):

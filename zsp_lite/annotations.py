@@ -10,7 +10,7 @@ import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import msgspec
 
@@ -21,7 +21,6 @@ from zsp_lite.files import read_bytes
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
 
 Triple = tuple[float, float, float]
-T = TypeVar("T")
 
 
 class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
@@ -133,7 +132,7 @@ def read_frame_index(path: Path) -> FrameIndex:
     return FrameIndex(path, entries, keys, of_sequence)
 
 
-def decode(data: bytes | msgspec.Raw, kind: type[T], where: str | Path) -> T:
+def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
     """Validated JSON as `kind`. Raises InputError that says where and which field does not fit."""
     try:
         return msgspec.json.decode(data, type=kind)

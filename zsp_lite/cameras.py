@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
-from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError
 
@@ -54,10 +53,10 @@ class Camera:
     @classmethod
     def from_pytorch3d(
         cls,
-        R: ArrayLike,
-        T: ArrayLike,
-        focal_length: ArrayLike,
-        principal_point: ArrayLike,
+        R: Real[np.ndarray, "3 3"] | Sequence,
+        T: Real[np.ndarray, "3"] | Sequence,
+        focal_length: Real[np.ndarray, "2"] | Sequence,
+        principal_point: Real[np.ndarray, "2"] | Sequence,
         size: Sequence[int],
         intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
     ) -> "Camera":
@@ -131,7 +130,7 @@ class Camera:
         return pixels, depth
 
     def unproject_camera(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
         """Camera-frame points seen at `pixels` (x, y) at `depth` along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
@@ -139,7 +138,7 @@ class Camera:
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
 
     def unproject(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
         """World points seen at `pixels` (x, y) at `depth`: the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
@@ -171,7 +170,7 @@ def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.
     )
 
 
-def _finite(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
+def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -1,0 +1,361 @@
+import gzip
+import hashlib
+import json
+import os
+
+import numpy as np
+import pytest
+from co3d_folders import edit_json, sequence_data
+
+from zsp_lite.benchmark.annotations import annotation_benchmark
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.errors import InputError
+from zsp_lite.frames import write_depth, write_image, write_mask
+from zsp_lite.ply import read_ply, write_ply
+
+V1, V2 = "ndc_norm_image_bounds", "ndc_isotropic"
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_co3d(tmp_path, "chair", [sequence_data("b_2"), sequence_data("a_1", quality=0.5)])
+    return tmp_path
+
+
+def frames_file(root):
+    return root / "chair" / "frame_annotations.jgz"
+
+
+def fingerprint(root):
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in root.rglob("*")
+        if path.is_file()
+    }
+
+
+def change_first_frame(root, **changes):
+    edit_json(frames_file(root), lambda frames: frames[0].update(changes))
+
+
+def first(root):
+    """The entry that `change_first_frame` changes."""
+    return Co3D(root).frame("chair", "b_2", 0)
+
+
+@pytest.mark.parametrize("intrinsics_format", [V1, V2])
+def test_what_is_written_is_read(tmp_path, intrinsics_format):
+    written = sequence_data("b_2", depth_scale_adjustment=1.7)
+    write_co3d(tmp_path, "chair", [written], intrinsics_format=intrinsics_format)
+    dataset = Co3D(tmp_path)
+    assert dataset.categories() == ["chair"]
+    annotations = dataset.frames("chair", "b_2")
+    assert [annotation.frame_number for annotation in annotations] == [0, 1, 2, 3]
+    assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
+    for annotation, expected in zip(annotations, written.frames, strict=True):
+        frame = dataset.load(annotation)
+        for name in ("R", "t", "focal", "principal_point"):
+            np.testing.assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
+        np.testing.assert_array_equal(frame.mask, expected.mask)
+        np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
+        assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8  # JPEG, colours at half resolution
+    points, colours = dataset.point_cloud("chair", "b_2")
+    np.testing.assert_allclose(points, written.points, rtol=1e-6)
+    np.testing.assert_array_equal(colours, written.colours)
+
+
+def test_the_layout_is_co3ds(root):
+    names = {path.name for path in (root / "chair").iterdir()}
+    assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
+    inside = {str(path.relative_to(root / "chair/a_1")) for path in (root / "chair/a_1").rglob("*.*")}
+    assert {
+        "images/frame000001.jpg",
+        "masks/frame000001.png",
+        "depths/frame000001.jpg.geometric.png",
+        "depth_masks/frame000001.png",
+        "pointcloud.ply",
+    } <= inside
+    entry = json.loads(gzip.decompress(frames_file(root).read_bytes()))[0]
+    assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
+    assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}  # v1 has no format
+    assert "meta" not in entry
+
+
+def test_the_format_of_intrinsics_is_told_frame_by_frame(tmp_path):
+    old, new = sequence_data("old", frames=1), sequence_data("new", frames=1)
+    write_co3d(tmp_path, "chair", [old], intrinsics_format=V1)
+    write_co3d(tmp_path, "chair", [new], intrinsics_format=V2)
+    dataset = Co3D(tmp_path)
+    for data in (old, new):
+        camera = dataset.load(dataset.frames("chair", data.name)[0]).camera
+        np.testing.assert_allclose(camera.focal, data.frames[0].camera.focal)
+    assert dataset.frames("chair", "new")[0].viewpoint.intrinsics_format == V2
+    assert "meta" in json.loads(gzip.decompress(frames_file(tmp_path).read_bytes()))[1]
+
+
+def test_the_same_sequences_give_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        write_co3d(tmp_path / name, "chair", [sequence_data("b_2"), sequence_data("a_1")])
+    assert fingerprint(tmp_path / "one") == fingerprint(tmp_path / "two")
+
+
+def test_writing_one_after_the_other_equals_writing_together(tmp_path):
+    sequences = [sequence_data("b_2"), sequence_data("a_1")]
+    write_co3d(tmp_path / "together", "chair", sequences)
+    for sequence in sequences:
+        write_co3d(tmp_path / "apart", "chair", [sequence])
+    assert fingerprint(tmp_path / "together") == fingerprint(tmp_path / "apart")
+
+
+def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):
+    write_co3d(root, "chair", [sequence_data("b_2", frames=2, quality=0.9)])
+    dataset = Co3D(root)
+    assert [key.sequence_name for key in dataset.frame_list("chair")] == ["a_1"] * 4 + ["b_2"] * 2
+    scores = {s.sequence_name: s.point_cloud.quality_score for s in dataset.sequences("chair")}
+    assert scores == {"a_1": 0.5, "b_2": 0.9}
+
+
+def test_an_interrupted_run_leaves_the_finished_sequences(tmp_path):
+    def sequences():
+        yield sequence_data("a_1")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_co3d(tmp_path, "chair", sequences())
+    dataset = Co3D(tmp_path)
+    assert [sequence.sequence_name for sequence in dataset.sequences("chair")] == ["a_1"]
+    assert len(dataset.frames("chair", "a_1")) == 4
+
+
+def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
+    edit_json(frames_file(root), lambda frames: frames[::-1])
+    dataset = Co3D(root)
+    keys = [(key.sequence_name, key.frame_number) for key in dataset.frame_list("chair")]
+    assert keys == [(name, number) for name in ("a_1", "b_2") for number in (3, 2, 1, 0)]
+    assert [frame.frame_number for frame in dataset.frames("chair", "a_1")] == [0, 1, 2, 3]
+    assert dataset.frame("chair", "a_1", 2).image.path == "chair/a_1/images/frame000003.jpg"
+
+
+def test_members_that_the_reader_does_not_know_are_ignored(root):
+    change_first_frame(root, novelty={"deep": [1, 2]}, meta={"frame_type": "x"})
+    edit_json(root / "chair" / "sequence_annotations.jgz", lambda items: items[0].update(novelty=1))
+    assert first(root).meta == {"frame_type": "x"}
+    assert len(Co3D(root).sequences("chair")) == 2
+
+
+def test_what_may_be_null_may_be_null(root):
+    change_first_frame(root, depth=None, mask=None)
+    frame = Co3D(root).load(first(root))
+    assert frame.depth is None and frame.mask is None
+    change_first_frame(root, viewpoint=None)
+    with pytest.raises(InputError, match="frame b_2/0 has no viewpoint"):
+        Co3D(root).load(first(root))
+
+    def strip(items):
+        items[0].update(video=None, point_cloud=None, viewpoint_quality_score=None)
+
+    edit_json(root / "chair" / "sequence_annotations.jgz", strip)
+    dataset = Co3D(root)
+    assert [sequence.sequence_name for sequence in dataset.select("chair")] == ["a_1"]
+    with pytest.raises(InputError, match="chair/b_2 has no point cloud"):
+        dataset.point_cloud("chair", "b_2")
+
+
+@pytest.mark.parametrize("field", ["sequence_name", "frame_number", "image"])
+def test_a_missing_field_is_named_with_its_file(root, field):
+    edit_json(
+        frames_file(root), lambda frames: [{k: v for k, v in frame.items() if k != field} for frame in frames]
+    )
+    with pytest.raises(InputError, match=rf"frame_annotations\.jgz.*missing required field `{field}`"):
+        Co3D(root).frames("chair", "b_2")
+
+
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [("image", "size"), ("depth", "scale_adjustment"), ("mask", "path"), ("viewpoint", "T")],
+)
+def test_a_missing_field_inside_a_member_is_named_too(root, part, field):
+    edit_json(
+        frames_file(root),
+        lambda frames: frames[0].update({part: {k: v for k, v in frames[0][part].items() if k != field}}),
+    )
+    message = rf"frame 0 of b_2.*missing required field `{field}` - at `\$\.{part}`"
+    with pytest.raises(InputError, match=message):
+        Co3D(root).frames("chair", "b_2")
+
+
+def test_a_camera_that_is_not_finite_fails_alone_and_by_name(root):
+    edit_json(frames_file(root), lambda frames: frames[0]["viewpoint"].update(T=[0, float("nan"), 1]))
+    dataset = Co3D(root)
+    assert len(dataset.frames("chair", "a_1")) == 4
+    with pytest.raises(InputError, match=r"frame 0 of b_2.*got `null` - at `\$\.viewpoint\.T"):
+        dataset.frames("chair", "b_2")
+
+
+def test_a_matrix_that_is_no_rotation_is_refused_with_its_frame(root):
+    edit_json(
+        frames_file(root), lambda frames: frames[0]["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])
+    )
+    with pytest.raises(InputError, match="frame b_2/0: camera R"):
+        Co3D(root).load(first(root))
+
+
+@pytest.mark.parametrize("data", [b"", b"no gzip", gzip.compress(b"[{]"), gzip.compress(b"[1, 2]"), "cut"])
+def test_broken_annotation_files_are_refused_by_name(root, data):
+    path = frames_file(root)
+    path.write_bytes(path.read_bytes()[:-40] if data == "cut" else data)
+    with pytest.raises(InputError, match=r"annotations .*frame_annotations\.jgz"):
+        Co3D(root).frame_list("chair")
+
+
+def test_unknown_folders_categories_sequences_and_frames_are_named(root):
+    dataset = Co3D(root)
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        Co3D(root / "nowhere")
+    with pytest.raises(InputError, match="category 'sofa' is not in .*, which has chair"):
+        dataset.frame_list("sofa")
+    with pytest.raises(InputError, match="plain folder name"):
+        dataset.frame_list("../chair")
+    with pytest.raises(InputError, match="sequence 'c_3'"):
+        dataset.frames("chair", "c_3")
+    with pytest.raises(InputError, match="no sequence 'c_3'"):
+        dataset.point_cloud("chair", "c_3")
+    with pytest.raises(InputError, match="chair/a_1 has no frame number 9"):
+        dataset.frame("chair", "a_1", 9)
+
+
+@pytest.mark.parametrize("path", ["../secret.jpg", "chair/../../secret.jpg", "ABSOLUTE", "link/secret.jpg"])
+def test_paths_that_leave_the_folder_are_refused(root, path):
+    inside = root / "inside"
+    inside.mkdir()
+    (root / "chair").rename(inside / "chair")
+    write_image(root / "secret.jpg", np.zeros((24, 32, 3), np.uint8))
+    os.symlink(root, inside / "link")
+    path = str(root / "secret.jpg") if path == "ABSOLUTE" else path
+    for part in ("image", "depth", "mask"):
+        edit_json(frames_file(inside), lambda frames, part=part: frames[0][part].update(path=path))
+        with pytest.raises(InputError, match="leaves the data folder"):
+            Co3D(inside).load(first(inside))
+    items = inside / "chair" / "sequence_annotations.jgz"
+    edit_json(items, lambda items: items[0]["point_cloud"].update(path=path))
+    with pytest.raises(InputError, match="leaves the data folder"):
+        Co3D(inside).point_cloud("chair", "b_2")
+
+
+def test_links_that_stay_inside_the_folder_are_fine(root):
+    os.symlink(root / "chair", root / "alias")
+    change_first_frame(root, image={"path": "alias/b_2/images/frame000001.jpg", "size": [24, 32]})
+    assert Co3D(root).load(first(root)).rgb.shape == (24, 32, 3)
+
+
+def test_the_depth_mask_makes_depth_unknown(root):
+    annotation = first(root)
+    before = Co3D(root).load(annotation).depth
+    allowed = np.zeros((24, 32), np.float32)
+    allowed[:, :16] = 1
+    write_mask(root / annotation.depth.mask_path, allowed)
+    after = Co3D(root).load(annotation).depth
+    np.testing.assert_array_equal(after, np.where(allowed > 0, before, 0))
+    change_first_frame(
+        root, depth={"path": annotation.depth.path, "scale_adjustment": 2.0, "mask_path": None}
+    )
+    np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
+
+
+@pytest.mark.parametrize("part", ["image", "depth", "mask"])
+def test_files_of_another_size_or_none_are_refused(root, part):
+    annotation = first(root)
+    path = root / getattr(annotation, part).path
+    path.unlink()
+    with pytest.raises(InputError, match=f"{part} .*{path.name} cannot be read"):
+        Co3D(root).load(annotation)
+    small = np.ones((5, 6, 3), np.uint8)
+    {"image": write_image, "depth": write_depth, "mask": write_mask}[part](
+        path, small if part == "image" else small[..., 0]
+    )
+    with pytest.raises(InputError, match=r"is \(5, 6\) pixels, expected the annotated \(H, W\) = \(24, 32\)"):
+        Co3D(root).load(annotation)
+
+
+def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
+    scores = {
+        "good": (2.0, 0.9),
+        "best": (1.3, 1.5),
+        "fair": (2.0, 0.31),
+        "blurred": (1.25, 2),
+        "sparse": (3, 0.3),
+    }
+    write_co3d(tmp_path, "chair", [sequence_data(name, frames=1) for name in scores])
+
+    def score(items):
+        for item in items:
+            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[
+                item["sequence_name"]
+            ]
+
+    edit_json(tmp_path / "chair" / "sequence_annotations.jgz", score)
+    dataset = Co3D(tmp_path)
+    assert [sequence.sequence_name for sequence in dataset.select("chair")] == ["best", "good", "fair"]
+    assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == ["best"]
+    assert len(dataset.select("chair", viewpoint_quality=0, point_cloud_quality=0)) == 5
+
+
+def test_set_lists_are_found_in_both_places(root):
+    assert Co3D(root).set_lists("chair") == {}
+    entry = ["a_1", 0, "chair/a_1/images/frame000001.jpg"]
+    (root / "chair/set_lists.json").write_text(json.dumps({"train_known": [entry]}))
+    (root / "chair/set_lists").mkdir()
+    (root / "chair/set_lists/set_lists_fewview_dev.json").write_text(json.dumps({"val": []}))
+    lists = Co3D(root).set_lists("chair")
+    assert lists == {"set_lists": {"train_known": [tuple(entry)]}, "set_lists_fewview_dev": {"val": []}}
+
+
+def test_sequences_that_do_not_fit_together_are_refused(tmp_path):
+    data = sequence_data("a_1")
+    with pytest.raises(InputError, match="plain folder name"):
+        write_co3d(tmp_path, "../chair", [data])
+    object.__setattr__(data, "timestamps", [0.0])
+    with pytest.raises(InputError, match="4 frames and 1 timestamps"):
+        write_co3d(tmp_path, "chair", [data])
+
+
+def test_point_clouds_are_read_in_every_encoding(tmp_path):
+    points = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    header = "ply\nformat {} 1.0\ncomment made up\nelement vertex 5\n"
+    header += "".join(f"property float {name}\n" for name in "xyz") + "element face 0\nend_header\n"
+    for encoding, body in {
+        "binary_little_endian": points.astype("<f4").tobytes(),
+        "binary_big_endian": points.astype(">f4").tobytes(),
+        "ascii": "\n".join(" ".join(map(repr, row.tolist())) for row in points).encode(),
+    }.items():
+        (tmp_path / "cloud.ply").write_bytes(header.format(encoding).encode() + body)
+        read, colours = read_ply(tmp_path / "cloud.ply")
+        np.testing.assert_array_equal(read, points)
+        assert colours is None
+
+
+def test_broken_point_clouds_are_refused_by_name(tmp_path):
+    path = tmp_path / "cloud.ply"
+    write_ply(path, np.zeros((5, 3)), np.zeros((5, 3), np.uint8))
+    whole = path.read_bytes()
+    for data in (
+        b"",
+        b"text",
+        whole[:-1],
+        whole.replace(b"float x", b"float w"),
+        whole.replace(b"vertex 5", b"vertex x"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"point cloud .*cloud\.ply"):
+            read_ply(path)
+    write_ply(path, np.full((5, 3), np.nan), np.zeros((5, 3), np.uint8))
+    with pytest.raises(InputError, match="not finite"):
+        read_ply(path)
+
+
+def test_opening_a_category_costs_little_more_than_its_json():
+    figures = annotation_benchmark(frames=8600)
+    assert figures["frames"] == 8600
+    assert 1.0 < figures["json_mb"] / 8600 * 1000 < 1.3  # real entries have about 1.2 kB
+    # A tenth of the bounds for 86,000 frames (3 s, 400 MB), with room for a busy machine.
+    assert figures["seconds"] < 1 and figures["extra_memory_mb"] < 60

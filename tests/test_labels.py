@@ -1,0 +1,106 @@
+import json
+
+import numpy as np
+import pytest
+from co3d_folders import random_camera, seeds
+from hypothesis import given
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.errors import InputError
+from zsp_lite.labels import PoseLabel, read_labels, relative_pose, write_label
+
+
+def random_label(seed, name="a", reference="zero"):
+    trans = np.eye(4)
+    trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
+    trans[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return PoseLabel(trans, name, reference)
+
+
+def transform(matrix, points):
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@given(seeds)
+def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(seed):
+    label_a, label_b = random_label(seed), random_label(seed + 1, "b")
+    camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
+    canonical = np.random.default_rng(seed).normal(size=(6, 3))  # points of the reference sequence's cloud
+    seen_a = camera_a.to_camera(transform(label_a.trans, canonical))
+    seen_b = camera_b.to_camera(transform(label_b.trans, canonical))
+    pose = relative_pose(label_a, camera_a, label_b, camera_b)
+    np.testing.assert_allclose(transform(pose, seen_a), seen_b, atol=1e-9)
+    np.testing.assert_allclose(
+        pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
+    )
+
+
+@given(seeds)
+def test_the_relative_pose_of_a_view_to_itself_is_the_identity(seed):
+    label, camera = random_label(seed), random_camera(seed)
+    np.testing.assert_allclose(relative_pose(label, camera, label, camera), np.eye(4), atol=1e-9)
+
+
+def test_the_relative_pose_agrees_with_the_papers_row_vector_composition():
+    labels, cameras = [random_label(1), random_label(2, "b")], [random_camera(1), random_camera(2)]
+    (row_a, row_b), (cam_a, cam_b) = (
+        [label.trans.T for label in labels],
+        [camera.matrix.T for camera in cameras],
+    )
+    paper = np.linalg.inv(cam_a) @ np.linalg.inv(row_a) @ row_b @ cam_b
+    np.testing.assert_allclose(
+        relative_pose(labels[0], cameras[0], labels[1], cameras[1]).T, paper, atol=1e-12
+    )
+
+
+def test_labels_of_different_references_have_no_relative_pose():
+    with pytest.raises(InputError, match="expected one reference sequence"):
+        relative_pose(random_label(0), random_camera(0), random_label(1, "b", "other"), random_camera(1))
+
+
+@pytest.mark.parametrize("folder", ["class_labels", "data/class_labels"])
+def test_labels_survive_their_files_in_either_place(tmp_path, folder):
+    (tmp_path / folder / "chair").mkdir(parents=True)
+    written = {name: random_label(number, name) for number, name in enumerate("ba")}
+    for label in written.values():
+        assert write_label(tmp_path, "chair", label).parent == tmp_path / folder / "chair"
+    read = read_labels(tmp_path, "chair")
+    assert list(read) == ["a", "b"]
+    for name, label in read.items():
+        np.testing.assert_array_equal(label.trans, written[name].trans)
+        assert (label.seq, label.reference_seq) == (name, "zero")
+
+
+def test_a_file_has_the_upstream_form(tmp_path):
+    path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
+    assert path == tmp_path / "class_labels" / "chair" / "a.json"
+    assert json.loads(path.read_text()) == {"trans": np.eye(4).tolist(), "seq": "a", "reference_seq": "a"}
+
+
+def test_a_category_without_labels_has_none(tmp_path):
+    assert read_labels(tmp_path, "chair") == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "rigid motion of unit scale"),
+        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "rigid motion of unit scale"),
+        ({"trans": [[1.0, 0], [0, 1]]}, "trans"),
+        ({"seq": "b"}, "of sequence 'b', expected 'a'"),
+        ({"seq": None}, "seq"),
+    ],
+)
+def test_a_label_that_cannot_be_is_refused_with_its_file(tmp_path, change, message):
+    path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=message) as caught:
+        read_labels(tmp_path, "chair")
+    assert str(path) in str(caught.value)
+
+
+def test_a_label_without_a_field_names_it(tmp_path):
+    path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
+    path.write_text('{"seq": "a", "reference_seq": "a"}')
+    with pytest.raises(InputError, match="missing required field `trans`"):
+        read_labels(tmp_path, "chair")

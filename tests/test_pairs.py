@@ -1,0 +1,180 @@
+import os
+
+import numpy as np
+import pytest
+import torch
+from co3d_folders import edit_json, sequence_data
+
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.errors import InputError
+from zsp_lite.labels import PoseLabel, write_label
+from zsp_lite.pairs import Pair, read_upstream_pairs, sample_pairs, upstream_pairs_path, write_upstream_pairs
+
+NAMES = ["s3", "s1", "s2"]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    for category in ("chair", "lamp"):
+        write_co3d(root, category, [sequence_data(name, frames=12) for name in [*NAMES, "unlabelled"]])
+        for name in NAMES:
+            write_label(root, category, PoseLabel(np.eye(4), name, "s1"))
+    # Frame numbers are not positions: the list is shuffled, and numbers start at 100.
+    path = root / "chair" / "frame_annotations.jgz"
+
+    def shuffle(frames):
+        for frame in frames:
+            frame["frame_number"] += 100
+        return [frames[position] for position in np.random.default_rng(0).permutation(len(frames))]
+
+    edit_json(path, shuffle)
+    return Co3D(root)
+
+
+def save(path, items):
+    torch.save(items, path)
+    return path
+
+
+def item(dataset, **changes):
+    frames = dataset.frame_list("chair")
+    where = {name: [i for i, key in enumerate(frames) if key.sequence_name == name] for name in NAMES}
+    return {
+        "class": "chair",
+        "reference_seq_name": "s1",
+        "reference_frame_id": where["s1"][0],
+        "target_seq_name": "s2",
+        "all_target_id": where["s2"][:3],
+    } | changes
+
+
+def test_references_go_round_the_sorted_labelled_sequences(dataset):
+    pairs = sample_pairs(dataset, "chair", 9, 5, seed=0)
+    assert [pair.reference_sequence for pair in pairs] == ["s1", "s2", "s3"] * 3
+    for pair in pairs:
+        assert pair.target_sequence in NAMES and pair.target_sequence != pair.reference_sequence
+        assert pair.reference_frame in range(100, 112)
+
+
+def test_every_other_sequence_and_frame_gets_its_turn(dataset):
+    pairs = sample_pairs(dataset, "chair", 300, 1, seed=0)
+    assert {(pair.reference_sequence, pair.target_sequence) for pair in pairs} == {
+        (a, b) for a in NAMES for b in NAMES if a != b
+    }
+    assert {pair.reference_frame for pair in pairs} == set(range(100, 112))
+    assert {pair.target_frames for pair in pairs} == {(number,) for number in range(100, 112)}
+
+
+@pytest.mark.parametrize("n_targets", [1, 3, 4, 5, 12])
+def test_target_frames_are_evenly_spaced_round_the_sequence(dataset, n_targets):
+    for pair in sample_pairs(dataset, "chair", 20, n_targets, seed=3):
+        assert len(set(pair.target_frames)) == n_targets
+        steps = np.diff([*pair.target_frames, pair.target_frames[0] + 12]) % 12
+        assert set(steps % 12) <= {12 // n_targets % 12, -(-12 // n_targets) % 12}
+
+
+def test_sampling_depends_on_seed_and_category_alone(dataset):
+    pairs = sample_pairs(dataset, "chair", 20, 5, seed=1)
+    assert pairs == sample_pairs(Co3D(dataset.root), "chair", 20, 5, seed=1)
+    assert pairs[:7] == sample_pairs(dataset, "chair", 7, 5, seed=1)
+    assert pairs != sample_pairs(dataset, "chair", 20, 5, seed=2)
+    choices = {
+        category: [pair.target_sequence for pair in sample_pairs(dataset, category, 50, 5, seed=1)]
+        for category in ("chair", "lamp")
+    }
+    assert choices["chair"] != choices["lamp"]
+
+
+def test_a_generator_is_drawn_from_as_it_is(dataset):
+    one, two = (sample_pairs(dataset, "lamp", 5, 2, np.random.default_rng(4)) for _ in range(2))
+    assert one == two
+
+
+def test_sampling_says_what_is_wanting(dataset, tmp_path):
+    with pytest.raises(InputError, match="has 12 frames, expected at least 13"):
+        sample_pairs(dataset, "chair", 1, 13)
+    with pytest.raises(InputError, match="expected at least 1 and 1"):
+        sample_pairs(dataset, "chair", 0, 5)
+    write_co3d(tmp_path, "chair", [sequence_data("s1")])
+    with pytest.raises(InputError, match="has 0 labelled sequences"):
+        sample_pairs(Co3D(tmp_path), "chair", 1, 1)
+
+
+def test_a_pairs_seed_is_a_function_of_its_key(dataset):
+    pair = Pair("chair", "a", 1, "b", (2, 3))
+    assert pair.key == "chair/a:1/b:2,3"
+    assert pair.seed == 1587145652271358322  # the same on every machine and in every run
+    pairs = sample_pairs(dataset, "chair", 50, 5)
+    assert len({pair.key for pair in pairs}) == len(set(pairs)) == len({pair.seed for pair in pairs})
+
+
+def test_pairs_survive_the_upstream_form(dataset, tmp_path):
+    pairs = sample_pairs(dataset, "chair", 10, 5)
+    path = upstream_pairs_path(tmp_path, "chair", 10, 5)
+    assert path == tmp_path / "determ_eval" / "10samples_5tgt" / "chair.pt"
+    write_upstream_pairs(path, pairs, dataset)
+    assert read_upstream_pairs(path, dataset) == pairs
+    before = path.read_bytes()
+    write_upstream_pairs(path, pairs, dataset)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("form", [list, torch.tensor])
+def test_upstream_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
+    frames = dataset.frame_list("chair")
+    given = item(dataset)
+    path = save(tmp_path / "chair.pt", [given | {"all_target_id": form(given["all_target_id"])}])
+    (pair,) = read_upstream_pairs(path, dataset)
+    assert pair.reference_frame == frames[given["reference_frame_id"]].frame_number
+    assert pair.target_frames == tuple(frames[position].frame_number for position in given["all_target_id"])
+
+
+class Dangerous:
+    def __reduce__(self):
+        return os.system, ("echo executed > executed",)
+
+
+def test_a_file_that_would_run_code_is_refused_and_not_run(dataset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"chair\.pt are not a torch file of plain data"):
+        read_upstream_pairs(save(tmp_path / "chair.pt", [Dangerous()]), dataset)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_what_is_no_pair_list_is_refused(dataset, tmp_path):
+    path = tmp_path / "chair.pt"
+    with pytest.raises(InputError, match=r"chair\.pt cannot be read"):
+        read_upstream_pairs(path, dataset)
+    whole = save(path, [item(dataset)]).read_bytes()
+    for data in (b"", b"garbage", whole[: len(whole) // 2]):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match="not a torch file"):
+            read_upstream_pairs(path, dataset)
+    with pytest.raises(InputError, match="hold a dict, expected a list"):
+        read_upstream_pairs(save(path, {}), dataset)
+    with pytest.raises(InputError, match="pair 0: missing class"):
+        read_upstream_pairs(save(path, [{}]), dataset)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reference_frame_id": 48}, "frame id is 48, expected 0 to 47"),
+        ({"reference_frame_id": -1}, "frame id is -1"),
+        ({"reference_frame_id": "3"}, "frame id is '3'"),
+        ({"all_target_id": []}, "all_target_id"),
+        ({"all_target_id": 3}, "all_target_id"),
+        ({"target_seq_name": "s3"}, "expected s3"),
+        ({"class": "sofa"}, "category 'sofa'"),
+    ],
+)
+def test_ids_that_do_not_fit_the_data_are_refused(dataset, tmp_path, changes, message):
+    path = save(tmp_path / "chair.pt", [item(dataset, **changes)])
+    with pytest.raises(InputError, match=message):
+        read_upstream_pairs(path, dataset)
+
+
+def test_a_pair_of_unknown_frames_cannot_be_written(dataset, tmp_path):
+    with pytest.raises(InputError, match="no frame"):
+        write_upstream_pairs(tmp_path / "chair.pt", [Pair("chair", "s1", 0, "s2", (100,))], dataset)
