@@ -1,6 +1,8 @@
 """The benchmark on a small CO3D folder whose features are perfect, so that every figure is known."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +10,9 @@ import pytest
 from synthetic_views import CoordinateBackbone, look_at, render
 
 import zsp_lite
-from zsp_lite.alignment import Sim3
+from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.backbones import Backbone
+from zsp_lite.benchmark.profile import Row, made_up_frames, peak_memory, ransac_by_loop, ransac_rows, similarity_rows
 from zsp_lite.benchmark.run import METHODS, category_pairs, evaluate, random_backbone, read_records
 from zsp_lite.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.errors import InputError
@@ -202,9 +205,41 @@ def test_a_random_backbone_has_the_shape_of_the_other_and_its_own_weights():
 
 
 def test_the_package_exports_its_vocabulary_without_importing_torch():
-    import subprocess
-    import sys
-
     code = "import sys, zsp_lite; assert 'torch' not in sys.modules; print(zsp_lite.__version__)"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert all(hasattr(zsp_lite, name) for name in zsp_lite.__all__)
+
+
+def test_the_loop_that_ransac_is_timed_against_finds_as_good_a_pose():
+    rng = np.random.default_rng(1)
+    source = rng.normal(size=(50, 3))
+    target = source + 0.02 * rng.normal(size=(50, 3))
+    target[:30] = rng.normal(size=(30, 3))
+    loop, batch = ransac_by_loop(source, target), ransac(source, target)[1]
+    assert loop[30:].all() and batch[30:].all()
+    assert abs(loop.sum() - batch.sum()) <= 1
+
+
+def test_profile_rows_carry_their_limits():
+    fast, loop, ratio = ransac_rows(repeats=1)
+    assert loop.value / fast.value == pytest.approx(ratio.value)
+    # A limit on the ratio is for an idle machine; here only that the batch is the faster one by far.
+    assert ratio.value > 4
+    assert not Row("x", 2, "s", 1).kept and Row("x", 2, "s", 1, at_most=False).kept and Row("x", 2, "s").kept
+    assert "MISSED" in str(Row("x", 2, "s", 1)) and "MISSED" not in str(Row("x", 1, "s", 1))
+
+
+def test_a_similarity_by_algebra_is_timed_against_the_loop():
+    rows = similarity_rows(repeats=1, tokens=1)
+    assert rows[-1].value > 30 and "of 784 tokens" in rows[1].note
+
+
+def test_made_up_frames_have_an_object_and_holes_in_its_depth():
+    frames = made_up_frames(2, (120, 160))
+    assert (frames[0].rgb != frames[1].rgb).any()
+    holes = (frames[0].depth == 0) & (frames[0].mask > 0)
+    assert 0.1 < holes.sum() / (frames[0].mask > 0).sum() < 0.6
+
+
+def test_peak_memory_is_that_of_this_process():
+    assert 2**26 < peak_memory() < 2**36

@@ -78,11 +78,35 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
     equal or collinear (the rotation about their line is then undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
-    (scale,), (rotation,), (translation,), (conditioning,) = _umeyama(source[None], target[None], with_scale)
+    (scale,), (rotation,), (translation,), (conditioning,) = umeyama_batch(source[None], target[None], with_scale)
     if not conditioning > _COLLINEAR:
         raise InputError(f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
                          "expected at least 3 that span a plane")
     return Sim3(float(scale), rotation, translation)
+
+
+def umeyama_batch(
+    source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
+) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
+    """`umeyama` on a batch of point sets, unchecked: scales, rotations, translations, and conditionings.
+
+    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear points.
+    """
+    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
+    left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
+    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
+    flip = np.sign(np.linalg.det(left @ right))
+    left[:, :, 2] *= flip[:, None]
+    rotation = left @ right
+    if with_scale:
+        spread = np.square(centred_source).sum(axis=(1, 2))
+        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(spread > 0, spread, 1)
+    else:
+        scale = np.ones(len(singular))
+    translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
+    conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
+    return scale, rotation, translation, conditioning
 
 
 def ransac(
@@ -111,7 +135,7 @@ def ransac(
                          "positive threshold, at least 1 trial and at least 3 points per sample")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
-    scale, rotation, translation, conditioning = _umeyama(source[samples], target[samples])
+    scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
         raise InputError(f"ransac: no usable sample in {trials} trials over {len(source)} points: all collinear, or "
@@ -126,31 +150,10 @@ def ransac(
     chosen = inlier[best]
 
     if counts[best] >= 3:
-        fit_scale, fit_rotation, fit_translation, conditioning = _umeyama(source[None, chosen], target[None, chosen])
+        fit_scale, fit_rotation, fit_translation, conditioning = umeyama_batch(source[None, chosen], target[None, chosen])
         if conditioning[0] > _COLLINEAR_SAMPLE:
             return Sim3(float(fit_scale[0]), fit_rotation[0], fit_translation[0]), chosen
     return Sim3(float(scale[best]), rotation[best], translation[best]), chosen
-
-
-def _umeyama(
-    source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
-) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
-    """Umeyama on a batch of point sets: scale, rotation, translation, and the conditioning (see _COLLINEAR)."""
-    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
-    centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
-    left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
-    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
-    flip = np.sign(np.linalg.det(left @ right))
-    left[:, :, 2] *= flip[:, None]
-    rotation = left @ right
-    if with_scale:
-        spread = np.square(centred_source).sum(axis=(1, 2))
-        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(spread > 0, spread, 1)
-    else:
-        scale = np.ones(len(singular))
-    translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
-    conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
-    return scale, rotation, translation, conditioning
 
 
 def _residuals(
