@@ -1,4 +1,4 @@
-"""The procedural world: what is exported reads like CO3D, and its labels, cameras and depth agree with the geometry."""
+"""The procedural world: exports read like CO3D; labels, cameras and depth agree with the geometry."""
 
 import inspect
 import types
@@ -31,8 +31,8 @@ from zsp_lite.synthetic.sequences import handheld_sweep, rescaled
 from zsp_lite.synthetic.training_categories import TRAINING
 
 PAPER_CATEGORIES = set(
-    "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse remote teddybear "
-    "toaster toilet toybus toyplane toytrain toytruck".split()
+    "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse remote "
+    "teddybear toaster toilet toybus toyplane toytrain toytruck".split()
 )
 SEED, FRAMES, SIZE = 5, 6, 72
 
@@ -62,7 +62,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def code_of(module: types.ModuleType) -> dict[str, types.CodeType]:
-    """Code of every function that belongs to the module's side: its own, and those of its siblings it imports."""
+    """Code of every function of the module's side: its own, and those of its siblings that it imports."""
     side = module.__name__.split(".")[-1].split("_")[0]  # "evaluation" or "training"
     found, queue = {}, [module]
     while queue:
@@ -269,7 +269,7 @@ def test_evaluation_pairs_in_the_upstream_form_read_back(folder):
 
 
 def test_a_sequence_depends_on_its_own_name_alone(folder, tmp_path):
-    """One category by itself, begun with one sequence and then completed, gives the very bytes of the whole."""
+    """One category by itself, begun with one sequence, then completed, gives the very bytes of the whole."""
     export_categories(["toytruck"], tmp_path, 1, FRAMES, SEED, SIZE)
     export_categories(["toytruck"], tmp_path, 2, FRAMES, SEED, SIZE)
     whole = {
