@@ -4,6 +4,7 @@ No backbone is trained on any of them; `training_categories` shares neither a na
 """
 
 from zsp_lite.synthetic.evaluation_appliances import hairdryer, laptop, mouse, toaster
+from zsp_lite.synthetic.evaluation_desk import book, handbag, keyboard, remote
 from zsp_lite.synthetic.evaluation_furniture import backpack, chair, hydrant, toilet
 from zsp_lite.synthetic.evaluation_road import bicycle, car, motorcycle
 from zsp_lite.synthetic.evaluation_toys import teddybear, toybus, toyplane, toytrain, toytruck
@@ -11,7 +12,7 @@ from zsp_lite.synthetic.evaluation_toys import teddybear, toybus, toyplane, toyt
 EVALUATION = {
     generator.__name__: generator
     for generator in (
-        backpack, bicycle, car, chair, hairdryer, hydrant, laptop, motorcycle,
-        mouse, teddybear, toaster, toilet, toybus, toyplane, toytrain, toytruck,
+        backpack, bicycle, book, car, chair, hairdryer, handbag, hydrant, keyboard, laptop,
+        motorcycle, mouse, remote, teddybear, toaster, toilet, toybus, toyplane, toytrain, toytruck,
     )
 }  # fmt: skip
