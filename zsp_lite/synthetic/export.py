@@ -37,9 +37,14 @@ class Preset:
     targets: tuple[int, ...]
 
 
+# Half of the paper's twenty names, fixed before any result: the five of its Table 1 and five others.
+_EVAL = (
+    "bicycle", "car", "chair", "hairdryer", "hydrant", "motorcycle", "teddybear", "toaster", "toyplane", "toytruck"
+)  # fmt: skip
+
 PRESETS = {
     "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
-    "eval": Preset(tuple(sorted(EVALUATION)), 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
+    "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
 }
 
 
