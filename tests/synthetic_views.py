@@ -1,7 +1,7 @@
 """Views of a bumpy ellipsoid, ray-cast in closed form, and a backbone that knows the object's coordinates.
 
-The colours of the pictures are the object's own coordinates, so features made of them are perfect and any error left
-is the pipeline's.
+The colours of the pictures are the object's own coordinates, so features made of them are perfect and any
+error left is the pipeline's.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,8 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     right = np.cross(forward, (0.1, 0.2, 1.0))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), np.array([size[1], size[0]]) / 2, size)
+    middle = np.array([size[1], size[0]]) / 2
+    return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
 
 
 def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:

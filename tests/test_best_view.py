@@ -4,16 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-from zsp_lite.best_view import VIEW_SELECTORS, Comparison, correspondence_score, cyclical_iou, global_score, mask_iou
+from zsp_lite.best_view import (
+    VIEW_SELECTORS,
+    Comparison,
+    correspondence_score,
+    cyclical_iou,
+    global_score,
+    mask_iou,
+)
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
 
 
 def matches(similarities) -> Matches:
     k = len(similarities)
-    return Matches(
-        np.zeros((k, 2), int), np.zeros((k, 2), int), np.asarray(similarities, np.float32), np.zeros(k, np.float32)
-    )
+    nowhere = np.zeros((k, 2), int)
+    return Matches(nowhere, nowhere, np.asarray(similarities, np.float32), np.zeros(k, np.float32))
 
 
 def test_the_correspondence_score_sums_the_distances_of_eq_3():
@@ -34,7 +40,8 @@ def test_similarities_a_hair_above_one_are_at_distance_zero():
 
 def feature_map(global_feature, saliency=None) -> FeatureMap:
     saliency = torch.ones(2, 2) if saliency is None else torch.as_tensor(saliency)
-    return FeatureMap(torch.ones(*saliency.shape, 3), saliency, torch.as_tensor(global_feature, dtype=torch.float32))
+    keys = torch.ones(*saliency.shape, 3)
+    return FeatureMap(keys, saliency, torch.as_tensor(global_feature, dtype=torch.float32))
 
 
 def test_the_global_score_is_the_cosine_whatever_the_lengths():
@@ -49,8 +56,9 @@ def test_mask_iou_counts_shared_patches():
 
 
 def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
-    # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes to reference
-    # patch 0, and so comes back to target patch 0: from patch 3 that is 3 patches off, from 1.5 nothing else counts.
+    # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes to
+    # reference patch 0, and so comes back to target patch 0: from patch 3 that is 3 patches off, from 1.5
+    # nothing else counts.
     similarity = torch.zeros(6, 6)
     similarity[[0, 1, 2], [0, 1, 2]] = torch.tensor([3.0, 2.0, 2.0])
     similarity[0, 3:] = 1.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsp_lite.errors import InputError
@@ -29,6 +29,7 @@ def about(axis, degrees: float) -> np.ndarray:
 axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: np.linalg.norm(axis) > 0.1)
 
 
+@settings(deadline=None)
 @given(axes, axes, st.floats(0, 180))
 def test_the_error_is_the_angle_between_the_rotations(axis, other, degrees):
     base = about(other, 77)
@@ -48,6 +49,7 @@ def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
     assert rotation_error(np.eye(3), np.diag([1.0, -1, -1])) == 180
 
 
+@settings(deadline=None)
 @given(axes, axes, st.floats(0, 180))
 def test_the_error_is_symmetric_and_unchanged_by_a_common_rotation(axis, other, degrees):
     a, b, common = np.eye(3), about(axis, degrees), about(other, 123)

@@ -58,7 +58,8 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
 
 def test_the_best_view_looks_from_nearly_the_same_side(estimate, reference, targets):
     errors = [
-        rotation_error(np.eye(3), true_pose(reference.camera, AT_HOME, t.camera, ELSEWHERE).R) for t in targets
+        rotation_error(np.eye(3), true_pose(reference.camera, AT_HOME, target.camera, ELSEWHERE).R)
+        for target in targets
     ]
     assert estimate.view == np.argmax(estimate.view_scores)
     assert estimate.view in np.argsort(errors)[:2]
@@ -85,7 +86,8 @@ def test_every_stage_is_timed(estimate):
 
 def test_a_second_run_gives_the_same_numbers(method, estimate, reference, targets):
     again = method.estimate(reference, targets)
-    assert (again.sim3.matrix == estimate.sim3.matrix).all() and (again.view_scores == estimate.view_scores).all()
+    assert (again.sim3.matrix == estimate.sim3.matrix).all()
+    assert (again.view_scores == estimate.view_scores).all()
 
 
 def test_turning_the_target_world_leaves_the_pose_between_cameras(method, estimate, reference, targets):
@@ -94,7 +96,8 @@ def test_turning_the_target_world_leaves_the_pose_between_cameras(method, estima
     other = method.estimate(reference, moved)
     np.testing.assert_allclose(other.sim3.matrix, estimate.sim3.matrix, atol=1e-12)
     cameras = [frame.camera for frame in targets]
-    for before, after in zip(estimate.propagate(cameras), other.propagate([turned(c, turn) for c in cameras])):
+    moved_cameras = [turned(camera, turn) for camera in cameras]
+    for before, after in zip(estimate.propagate(cameras), other.propagate(moved_cameras)):
         np.testing.assert_allclose(after.matrix, before.matrix, atol=1e-9)
 
 
@@ -139,7 +142,10 @@ def test_with_perfect_features_no_setting_breaks_the_method(method, reference, t
 
 def test_depth_with_holes_still_gives_the_pose(method, reference, targets):
     rng = np.random.default_rng(0)
-    holes = lambda frame: replace(frame, depth=frame.depth * (rng.random(frame.depth.shape) > 0.4))  # noqa: E731
+
+    def holes(frame):
+        return replace(frame, depth=frame.depth * (rng.random(frame.depth.shape) > 0.4))
+
     estimate = method.estimate(holes(reference), [holes(frame) for frame in targets])
     truth = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
     assert rotation_error(estimate.sim3.R, truth.R) < 6
@@ -187,7 +193,8 @@ def test_too_few_matches_fall_back_to_the_best_view_and_say_so(backbone, referen
 
 
 def test_collinear_points_fall_back_and_say_so(method, reference):
-    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a line.
+    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a
+    # line.
     flat = replace(reference, depth=np.full_like(reference.depth, 4.0))
     views = look(method.backbone, [object_crop(flat)] * 2)
     for view in views:
@@ -199,7 +206,8 @@ def test_collinear_points_fall_back_and_say_so(method, reference):
 
 def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
     empty = replace(reference, mask=np.zeros_like(reference.mask))
-    no_depth, no_known = replace(reference, depth=None), replace(reference, depth=np.zeros_like(reference.depth))
+    no_depth = replace(reference, depth=None)
+    no_known = replace(reference, depth=np.zeros_like(reference.depth))
     for frame, word in ((empty, "mask"), (no_depth, "depth"), (no_known, "depth")):
         with pytest.raises(InputError, match=word) as error:
             method.estimate(frame, targets)

@@ -1,4 +1,5 @@
-"""Rigid alignment with scale: Umeyama's least squares inside RANSAC (paper eq. 4, supplement "Rigid body transform").
+"""Rigid alignment with scale: Umeyama's least squares inside RANSAC (paper eq. 4, supplement "Rigid body
+transform").
 
 All trials of RANSAC go through one batched SVD, which is what makes a thousand of them cost milliseconds.
 """
@@ -11,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError
 
-# Below this ratio of the second to the first singular value of the covariance, the rotation about the points' common
-# line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is wide.
+# Below this ratio of the second to the first singular value of the covariance, the rotation about the points'
+# common line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is
+# wide.
 _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
 
@@ -72,30 +74,34 @@ class Sim3:
 def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Sim3:
     """The similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4; Umeyama 1991).
 
-    source, target: (N, 3) corresponding points, N >= 3, numpy or torch.  with_scale: False fixes the scale at 1.
-    R is always a rotation, also where a reflection would fit better.
-    Raises InputError for wrong or unequal shapes, fewer than 3 points, non-finite values, and points that are all
-    equal or collinear (the rotation about their line is then undetermined).
+    source, target: (N, 3) corresponding points, N >= 3, numpy or torch.  with_scale: False fixes the scale at
+    1. R is always a rotation, also where a reflection would fit better.
+    Raises InputError for wrong or unequal shapes, fewer than 3 points, non-finite values, and points that are
+    all equal or collinear (the rotation about their line is then undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
-    (scale,), (rotation,), (translation,), (conditioning,) = umeyama_batch(source[None], target[None], with_scale)
-    if not conditioning > _COLLINEAR:
+    scale, rotation, translation, conditioning = umeyama_batch(source[None], target[None], with_scale)
+    if not conditioning[0] > _COLLINEAR:
         raise InputError(f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
                          "expected at least 3 that span a plane")
-    return Sim3(float(scale), rotation, translation)
+    return Sim3(scale[0], rotation[0], translation[0])
 
 
 def umeyama_batch(
     source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
-) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
+) -> tuple[
+    Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]
+]:
     """`umeyama` on a batch of point sets, unchecked: scales, rotations, translations, and conditionings.
 
-    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear points.
+    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear
+    points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
     left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
-    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
+    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a
+    # mirror.
     flip = np.sign(np.linalg.det(left @ right))
     left[:, :, 2] *= flip[:, None]
     rotation = left @ right
@@ -121,25 +127,25 @@ def ransac(
     """Umeyama in RANSAC: the most inliers among `trials` samples, then a fit on those inliers.
 
     source, target: (N, 3) corresponding points, N >= sample_size, numpy or torch.
-    threshold: largest distance |target - (scale * R @ source + t)| of an inlier, in target units; the paper's 0.2 is
-    for clouds of unit standard deviation.  sample_size: points per trial, drawn without replacement; the paper takes
-    4 because 3 can be degenerate.  scale_range: hypotheses with another scale are discarded.
-    Returns the similarity and the (N,) bool inliers of the best trial (ties: the smaller sum of their residuals),
-    which are what the fit used; where those cannot carry a fit of their own, the best trial's similarity.
-    Deterministic for a seed.
-    Raises InputError for bad shapes, too few points, non-finite values, and where every sample is collinear or
-    has a scale out of range.
+    threshold: largest distance |target - (scale * R @ source + t)| of an inlier, in target units; the paper's
+    0.2 is for clouds of unit standard deviation.  sample_size: points per trial, drawn without replacement;
+    the paper takes 4 because 3 can be degenerate.  scale_range: hypotheses with another scale are discarded.
+    Returns the similarity and the (N,) bool inliers of the best trial (ties: the smaller sum of their
+    residuals), which are what the fit used; where those cannot carry a fit of their own, the best trial's
+    similarity. Deterministic for a seed.
+    Raises InputError for bad shapes, too few points, non-finite values, and where every sample is collinear
+    or has a scale out of range.
     """
     if not (threshold > 0 and trials >= 1 and sample_size >= 3):
-        raise InputError(f"ransac: threshold={threshold}, trials={trials}, sample_size={sample_size}; expected a "
-                         "positive threshold, at least 1 trial and at least 3 points per sample")
+        raise InputError(f"ransac: threshold={threshold}, trials={trials}, sample_size={sample_size}; "
+                         "expected a positive threshold, at least 1 trial and at least 3 points per sample")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        raise InputError(f"ransac: no usable sample in {trials} trials over {len(source)} points: all collinear, or "
-                         f"scale outside {scale_range}")
+        raise InputError(f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
+                         f"collinear, or scale outside {scale_range}")
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
 
     residual = _residuals(scale, rotation, translation, source, target)
@@ -150,10 +156,10 @@ def ransac(
     chosen = inlier[best]
 
     if counts[best] >= 3:
-        fit_scale, fit_rotation, fit_translation, conditioning = umeyama_batch(source[None, chosen], target[None, chosen])
+        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen])
         if conditioning[0] > _COLLINEAR_SAMPLE:
-            return Sim3(float(fit_scale[0]), fit_rotation[0], fit_translation[0]), chosen
-    return Sim3(float(scale[best]), rotation[best], translation[best]), chosen
+            return Sim3(*(part[0] for part in fit)), chosen
+    return Sim3(scale[best], rotation[best], translation[best]), chosen
 
 
 def _residuals(
@@ -165,8 +171,8 @@ def _residuals(
 ) -> Float[np.ndarray, "trials n"]:
     """|target - (scale * R @ source + t)| for every trial and point.
 
-    The square, multiplied out, is one matrix product of what is known of the trials with what is known of the points:
-    a third of the time of moving every point. Taken about the clouds' means, so that little cancels.
+    The square, multiplied out, is one matrix product of what is known of the trials with what is known of the
+    points: a third of the time of moving every point. Taken about the clouds' means, so that little cancels.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     x, y = source - source_mean, target - target_mean
@@ -178,7 +184,8 @@ def _residuals(
         2 * (t[:, None, :] @ linear)[:, 0], -2 * t, -2 * linear.reshape(-1, 9),
     ])  # fmt: skip
     of_points = np.hstack([
-        np.ones((len(x), 1)), np.square(y).sum(axis=1, keepdims=True), np.square(x).sum(axis=1, keepdims=True),
+        np.ones((len(x), 1)),
+        np.square(y).sum(axis=1, keepdims=True), np.square(x).sum(axis=1, keepdims=True),
         x, y, (y[:, :, None] * x[:, None, :]).reshape(-1, 9),
     ])  # fmt: skip
     return np.sqrt(np.maximum(of_trials @ of_points.T, 0))
@@ -201,7 +208,8 @@ def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> I
 def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np.ndarray, np.ndarray]:
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
+        raise InputError(f"source and target have shapes {source.shape} and {target.shape}, "
+                         "expected equal (N, 3)")
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):

@@ -1,7 +1,8 @@
-"""Which target view to align with: the paper's correspondence score and its three alternatives (sec. 3.2, table 3).
+"""Which target view to align with: the paper's correspondence score and its three alternatives (sec. 4.2,
+table 3).
 
-Each score is a plain function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a `Comparison`.
-The view with the highest score is chosen.
+Each score is a plain function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a
+`Comparison`. The view with the highest score is chosen.
 """
 
 from collections.abc import Callable
@@ -37,8 +38,8 @@ class Comparison:
 def correspondence_score(matches: Matches, k: int) -> float:
     """Eq. 3, "CorrespondSim": the sum over the K matches of -d, d the L2 distance of normalised descriptors.
 
-    With fewer than k matches, each missing one counts as orthogonal, d = sqrt(2): otherwise a view with hardly any
-    foreground in common would win by having little to sum.
+    With fewer than k matches, each missing one counts as orthogonal, d = sqrt(2): otherwise a view with
+    hardly any foreground in common would win by having little to sum.
     """
     cosine = torch.as_tensor(matches.similarity)
     distances = (2 - 2 * cosine).clamp_min(0).sqrt()
@@ -52,7 +53,8 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
 
 
 def mask_iou(first: Mask, second: Mask) -> float:
-    """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two foregrounds."""
+    """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two
+    foregrounds."""
     first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
@@ -63,11 +65,12 @@ def cyclical_iou(
     target_foreground: Bool[torch.Tensor, "target_rows target_cols"],
     threshold: float = 1.5,
 ) -> float:
-    """"CyclicalDistIoU": IoU of the target's foreground and its patches that cycle through the reference back to
-    within `threshold` patches of themselves.
+    """"CyclicalDistIoU": IoU of the target's foreground and its patches that cycle through the reference back
+    to within `threshold` patches of themselves.
 
-    The paper does not give its threshold; 1.5 patches takes a return to the patch itself or to one of its eight
-    neighbours. (The published code compares a rescaled map with the saliency without thresholding either.)
+    The paper does not give its threshold; 1.5 patches takes a return to the patch itself or to one of its
+    eight neighbours. (The published code compares a rescaled map with the saliency without thresholding
+    either.)
     """
     distances = cyclical_distances(
         similarity.T,

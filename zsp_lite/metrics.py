@@ -1,4 +1,5 @@
-"""Errors of an estimated pose, and what to say about many of them (paper sec. 4.1, supplement "evaluation metrics")."""
+"""Errors of an estimated pose, and what to say about many of them (paper sec. 5.1, supplement "evaluation
+metrics")."""
 
 from collections.abc import Callable
 from math import comb
@@ -12,9 +13,9 @@ from zsp_lite.errors import InputError
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Geodesic angle between rotations, in degrees, in [0, 180].
 
-    first, second: (..., 3, 3), broadcast against each other; numpy or torch.  Returns (...), a float for one pair.
-    atan2 of the relative rotation's sine (its antisymmetric part) and cosine (its trace): unlike an arccos of the
-    trace, exact near 0 and near 180.
+    first, second: (..., 3, 3), broadcast against each other; numpy or torch.  Returns (...), a float for one
+    pair. atan2 of the relative rotation's sine (its antisymmetric part) and cosine (its trace): unlike an
+    arccos of the trace, exact near 0 and near 180.
     Raises InputError for other shapes and non-finite values.
     """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
@@ -33,7 +34,8 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
 
 
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
-    """Euclidean distance between translations (..., 3), in their unit.  Raises InputError for other shapes."""
+    """Euclidean distance between translations (..., 3), in their unit.  Raises InputError for other
+    shapes."""
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if first.shape[-1:] != (3,) or second.shape[-1:] != (3,):
         raise InputError(f"translation_error: shapes {first.shape} and {second.shape}, expected (..., 3)")
@@ -41,7 +43,8 @@ def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float
 
 
 def accuracy(errors: ArrayLike, threshold: float) -> np.ndarray | float:
-    """Percentage of errors (..., n) strictly below the threshold, over the last axis: Acc30 is threshold=30."""
+    """Percentage of errors (..., n) strictly below the threshold, over the last axis: Acc30 is
+    threshold=30."""
     return 100 * np.mean(_errors(errors) < threshold, axis=-1)
 
 
@@ -71,14 +74,17 @@ def bootstrap_ci(
 def summarise(errors: ArrayLike, seed: int | np.random.Generator = 0) -> dict:
     """The paper's figures for rotation errors (n,) in degrees, with 95 % bootstrap intervals.
 
-    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), and for each of the three NAME_ci: [low, high]}.
+    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), and for each of the three NAME_ci: [low,
+    high]}.
     Raises InputError where there is nothing to summarise.
     """
     errors = _errors(errors)
     rng = np.random.default_rng(seed)
     figures = {"median": median, "acc30": lambda e: accuracy(e, 30), "acc15": lambda e: accuracy(e, 15)}
     summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    return summary | {f"{name}_ci": list(bootstrap_ci(errors, figure, seed=rng)) for name, figure in figures.items()}
+    for name, figure in figures.items():
+        summary[f"{name}_ci"] = list(bootstrap_ci(errors, figure, seed=rng))
+    return summary
 
 
 def paired_test(
@@ -91,14 +97,14 @@ def paired_test(
     """Is the second method better than the first on the same pairs?  Two-sided tests.
 
     first, second: (n,) errors of the same pairs in the same order.
-    Returns {"accuracy_gain": second - first, percentage points, "accuracy_p": exact sign test over the pairs that
-    only one of them solves (McNemar), "error_drop": mean of first - second, in the errors' unit, "error_p": its
-    permutation test by flipping the sign of each difference}.
+    Returns {"accuracy_gain": second - first, percentage points, "accuracy_p": exact sign test over the pairs
+    that only one of them solves (McNemar), "error_drop": mean of first - second, in the errors' unit,
+    "error_p": its permutation test by flipping the sign of each difference}.
     Raises InputError where the two differ in length.
     """
     first, second = _errors(first), _errors(second)
     if first.shape != second.shape or first.ndim != 1:
-        raise InputError(f"paired_test: errors of shapes {first.shape} and {second.shape}, expected equal (n,)")
+        raise InputError(f"paired_test: shapes {first.shape} and {second.shape}, expected equal (n,)")
     only_first = int(np.sum((first < threshold) & ~(second < threshold)))
     only_second = int(np.sum((second < threshold) & ~(first < threshold)))
     discordant = only_first + only_second

@@ -1,4 +1,4 @@
-"""The method from frames to a pose, composed of the stages' plain functions (paper fig. 2 and sec. 3)."""
+"""The method from frames to a pose, composed of the stages' plain functions (paper fig. 2 and sec. 4)."""
 
 import time
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _FEW = 10
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame cropped to its object, with its features: what one image brings to every pair it takes part in."""
+    """A frame cropped to its object, with its features: what one image brings to every pair it is in."""
 
     frame: Frame
     features: FeatureMap
@@ -40,7 +40,8 @@ class View:
 
     @cached_property
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
+        """Camera-frame point of each patch, and whether a measured depth stands behind it (see
+        `depth.patch_points`).
 
         Worked out when first asked for: of N target views only the chosen one's are needed.
         Raises InputError where the frame has no known depth.
@@ -62,7 +63,7 @@ class PoseEstimate:
     matches: between the reference and that view.  inliers: (K,) which of them the fit used.
     points: their 3D points in the reference's and the target's camera frame, (K, 3) each.
     view_scores: (N,) of all target views, higher is better.  timings: seconds per stage.
-    target_camera: of the chosen view.  flags: one line for each reason not to trust the estimate, usually none.
+    target_camera: of the chosen view.  flags: one line per reason not to trust the estimate.
     reference_view, target_views: crops, features and foregrounds that went in.
     """
 
@@ -89,8 +90,8 @@ class PoseEstimate:
         return "; ".join(self.flags)
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
-        """Pose of the reference against other cameras of the target sequence (sec. 4.4): reference-camera points to
-        each camera's points, through the known world-to-camera transforms."""
+        """Pose of the reference against other cameras of the target sequence (sec. 5.6): reference-camera
+        points to each camera's points, through the known world-to-camera transforms."""
         best = self.target_camera
         poses = []
         for camera in cameras:
@@ -103,9 +104,10 @@ class PoseEstimate:
 class ZeroShotPose:
     """The method with its settings; the defaults are the paper's.
 
-    k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 3.1).
-    view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in scene
-    units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
+    k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 4.1).
+    view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in
+    scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground
+    above it.
     foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
     cycle_from: "reference" as in the paper, or "target" as in its published code.
     Raises InputError for a setting out of its range.
@@ -138,10 +140,11 @@ class ZeroShotPose:
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """The pose of the reference's object in the best of N target views of another object of its category.
 
-        A frame without a mask is taken whole. Where the matches of the best view cannot carry a fit (fewer than
-        sample_size, collinear, or of no plausible scale) the estimate is the best view itself: identity rotation,
-        translation and scale from the foregrounds' centroids and spreads, and a flag that says so.
-        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen target.
+        A frame without a mask is taken whole. Where the matches of the best view cannot carry a fit (fewer
+        than sample_size, collinear, or of no plausible scale) the estimate is the best view itself: identity
+        rotation, translation and scale from the foregrounds' centroids and spreads, and a flag that says so.
+        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen
+        target.
         """
         timings: dict[str, float] = {}
         with _timed(timings, "crop"):
@@ -183,8 +186,9 @@ class ZeroShotPose:
             flags: tuple[str, ...] = ()
             try:
                 sim3, inliers = ransac(
-                    *points, threshold=self.threshold, trials=self.trials, sample_size=self.sample_size, seed=self.seed
-                )
+                    *points, threshold=self.threshold, trials=self.trials, sample_size=self.sample_size,
+                    seed=self.seed,
+                )  # fmt: skip
             except InputError as error:
                 sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
                 flags = (f"pose is the best view's, not a fit: {error}",)
@@ -195,7 +199,7 @@ class ZeroShotPose:
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
-    """The frame's object crop, resized to (size, size) without keeping its aspect (supplement, "Object crops").
+    """The frame's object crop, resized to (size, size) not keeping its aspect (supplement, "Object crops").
 
     A frame without a mask is taken whole. Raises InputError for an empty mask.
     """
@@ -210,7 +214,7 @@ def look(
 ) -> list[View]:
     """Views of cropped frames, their features computed in one batch.  foreground: see `frame_view`."""
     features = backbone([frame.rgb for frame in frames])
-    return [frame_view(frame, found, foreground, saliency_threshold) for frame, found in zip(frames, features)]
+    return [frame_view(*pair, foreground, saliency_threshold) for pair in zip(frames, features)]
 
 
 def frame_view(
@@ -218,8 +222,8 @@ def frame_view(
 ) -> View:
     """A cropped frame with its features, and which patches are the object.
 
-    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a quarter of
-    the patch). Raises InputError for "mask" where the frame has none.
+    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a
+    quarter of the patch). Raises InputError for "mask" where the frame has none.
     """
     if foreground == "mask":
         return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device))
@@ -227,7 +231,8 @@ def frame_view(
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
-    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
+    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a
+    mask."""
     if frame.mask is None:
         raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
     covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
@@ -237,8 +242,9 @@ def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows 
 def match_points(
     reference: View, target: View, matches: Matches
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """The matches' 3D points, each in its own camera frame (sec. 3.3)."""
-    return reference.patch_points[0][tuple(matches.reference.T)], target.patch_points[0][tuple(matches.target.T)]
+    """The matches' 3D points, each in its own camera frame (sec. 4.3)."""
+    (source, _), (destination, _) = reference.patch_points, target.patch_points
+    return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
 
 
 def view_alignment(reference: View, target: View) -> Sim3:

@@ -1,7 +1,7 @@
 """What one estimate costs, stage by stage, and what the algebra saves against the plain loops.
 
-Runs with random weights in the shape of dino_vits8: time does not depend on what they are. The images are noise-textured
-ellipsoids with masks and holed depth, so that every stage has its usual amount of work.
+Runs with random weights in the shape of dino_vits8: time does not depend on what they are. The images are
+noise-textured ellipsoids with masks and holed depth, so that every stage has its usual amount of work.
 """
 
 import json
@@ -33,7 +33,8 @@ N_TARGETS = 5
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure. `limit` is what it has to keep: at most where `at_most`, else at least; None for none."""
+    """One measured figure. `limit` is what it has to keep: at most where `at_most`, else at least; None for
+    none."""
 
     name: str
     value: float
@@ -60,7 +61,7 @@ def profile(repeats: int = 5) -> Iterator[Row]:
     if repeats < 1:
         raise InputError(f"repeats is {repeats}, expected at least 1")
     if hasattr(os, "getloadavg"):
-        yield Row("load average before", os.getloadavg()[0], "processes", note="the limits are for an idle machine")
+        yield Row("load average before", os.getloadavg()[0], "processes", note="limits: for an idle machine")
     yield from stage_rows(repeats)
     yield from similarity_rows(repeats)
     yield from ransac_rows(repeats)
@@ -69,29 +70,34 @@ def profile(repeats: int = 5) -> Iterator[Row]:
 
 
 def stage_rows(repeats: int = 5) -> list[Row]:
-    """Median seconds of each stage of one estimate (N = 5, K = 50), and all but the forward as a share of it."""
+    """Median seconds of each stage of one estimate (N = 5, K = 50), and all but the forward as a share of
+    it."""
     method = ZeroShotPose(random_vits8())
     reference, *targets = made_up_frames(1 + N_TARGETS)
     method.estimate(reference, targets)  # the first run pays for allocations and lazy imports
     runs = [method.estimate(reference, targets).timings for _ in range(repeats)]
     stages = {stage: float(np.median([run[stage] for run in runs])) for stage in runs[0]}
-    rest = [sum(seconds for stage, seconds in run.items() if stage != "features") / run["features"] for run in runs]
+    rest = [sum(run.values()) / run["features"] - 1 for run in runs]
     threads = f"{torch.get_num_threads()} threads"
     names = {"features": "ViT forward, 6 images"}
-    rows = [Row(names.get(stage, stage), 1000 * seconds, "ms", note=threads) for stage, seconds in stages.items()]
+    rows = [Row(names.get(name, name), 1000 * value, "ms", note=threads) for name, value in stages.items()]
     share = 100 * float(np.median(rest))
-    return [*rows, Row("everything but the forward, share of it", share, "%", 25, note="dino_vits8, N = 5, K = 50")]
+    return [*rows, Row("everything but the forward, share of it", share, "%", 25, note="N = 5, K = 50")]
 
 
 def similarity_rows(repeats: int = 5, tokens: int = 8) -> list[Row]:
-    """The log-binned similarity of a reference with 5 targets, against a cosine per token of materialised descriptors.
+    """The log-binned similarity of a reference with 5 targets, against a cosine per token of materialised
+    descriptors.
 
-    The loop is timed on `tokens` of the 784 reference tokens and scaled up; making the descriptors is not counted.
+    The loop is timed on `tokens` of the 784 reference tokens and scaled up; making the descriptors is not
+    counted.
     """
-    keys = [torch.randn(28, 28, 384, generator=torch.Generator().manual_seed(i)) for i in range(1 + N_TARGETS)]
+    generator = torch.Generator().manual_seed(0)
+    keys = [torch.randn(28, 28, 384, generator=generator) for _ in range(1 + N_TARGETS)]
     first, second = (log_bin(one[None])[0].flatten(0, 1) for one in keys[:2])
     per_token, fast = _median_seconds(
-        [lambda: F.cosine_similarity(first[:1], second), lambda: similarities(keys[0], keys[1:])], max(repeats, tokens)
+        [lambda: F.cosine_similarity(first[:1], second), lambda: similarities(keys[0], keys[1:])],
+        max(repeats, tokens),
     )
     loop = per_token * len(first) * N_TARGETS
     note = f"loop timed on {max(repeats, tokens)} of {len(first)} tokens and scaled"
@@ -108,7 +114,9 @@ def ransac_rows(repeats: int = 5) -> list[Row]:
     source = rng.normal(size=(50, 3))
     target = source + 0.02 * rng.normal(size=(50, 3))
     target[:30] = rng.normal(size=(30, 3))
-    fast, loop = _median_seconds([lambda: ransac(source, target), lambda: ransac_by_loop(source, target)], 2 * repeats)
+    fast, loop = _median_seconds(
+        [lambda: ransac(source, target), lambda: ransac_by_loop(source, target)], 2 * repeats
+    )
     return [
         Row("RANSAC, 1,000 trials, 50 points", 1000 * fast, "ms"),
         Row("RANSAC by a loop over the trials", 1000 * loop, "ms"),
@@ -119,7 +127,8 @@ def ransac_rows(repeats: int = 5) -> list[Row]:
 def ransac_by_loop(
     source: np.ndarray, target: np.ndarray, threshold: float = 0.2, trials: int = 1000, seed: int = 0
 ) -> np.ndarray:
-    """RANSAC as one writes it down, with the same fit: sample, fit, count, keep the best.  Returns the inliers (N,)."""
+    """RANSAC as one writes it down, with the same fit: sample, fit, count, keep the best.  Returns the
+    inliers (N,)."""
     rng = np.random.default_rng(seed)
     best = np.zeros(len(source), dtype=bool)
     for _ in range(trials):
@@ -144,7 +153,7 @@ print(json.dumps(peak_memory()))
 def memory_row() -> Row:
     """Peak memory of a process that imports the library, builds dino_vits8 and makes one estimate (N = 5)."""
     done = subprocess.run([sys.executable, "-c", _MEMORY], capture_output=True, text=True, check=True)
-    return Row("peak memory of one estimate", json.loads(done.stdout) / 2**30, "GiB", 1.5e9 / 2**30, note="whole process")
+    return Row("peak memory of one estimate", json.loads(done.stdout) / 1e9, "GB", 1.5, note="whole process")
 
 
 def estimate_once() -> None:
@@ -184,7 +193,8 @@ def random_vits8() -> Backbone:
 
 
 def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) -> list[Frame]:
-    """Frames of a textured ellipsoid on a plain ground, with its mask, and depth with a third of its pixels unknown."""
+    """Frames of a textured ellipsoid on a plain ground, with its mask, and depth with a third of its pixels
+    unknown."""
     rng = np.random.default_rng(seed)
     height, width = size
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, float(width)), np.array([width, height]) / 2, size)
@@ -198,12 +208,14 @@ def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) ->
         rgb = np.where(inside[..., None], 255 * texture.clip(0, 1), 90).astype(np.uint8)
         holes = cv2.resize(rng.random((30, 40)), (width, height)) < 0.42
         known = np.where(inside & ~holes, depth, 0)
-        frames.append(Frame(rgb, known.astype(np.float32), inside.astype(np.float32), camera, f"made up {index}"))
+        mask = inside.astype(np.float32)
+        frames.append(Frame(rgb, known.astype(np.float32), mask, camera, f"made up {index}"))
     return frames
 
 
 def _median_seconds(works: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median wall time of each; they take turns, so that whatever else the machine does meets all of them alike."""
+    """Median wall time of each; they take turns, so that whatever else the machine does meets all of them
+    alike."""
     times = np.empty((repeats, len(works)))
     for work in works:
         work()

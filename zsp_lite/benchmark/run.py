@@ -1,7 +1,8 @@
-"""Rotation errors of one or more methods over many pairs of a CO3D-format folder with pose labels (paper sec. 4).
+"""Rotation errors of methods over many pairs of a CO3D-format folder with pose labels (paper sec. 5).
 
-Features are computed once per frame and shared by every pair and method. A finished pair is a line of OUT/pairs.jsonl
-at once, so that an interrupted run goes on where it stopped; OUT/summary.json is made of those lines alone.
+Features are computed once per frame and shared by every pair and method. A finished pair is a line of
+OUT/pairs.jsonl at once, so that an interrupted run goes on where it stopped; OUT/summary.json is made of
+those lines alone.
 """
 
 import hashlib
@@ -40,9 +41,10 @@ _FAILED = 180.0
 class Method:
     """A row of the table.
 
-    features: what describes the images: the backbone under test, one of its shape with random weights, or RootSIFT.
-    answer: the fitted pose, the best view taken as it is ("Ours-BV"), or the pose fitted in the target view that is
-    truly nearest in rotation.  settings: of `ZeroShotPose`, where they differ from the paper's.
+    features: what describes the images: the backbone under test, one of its shape with random weights, or
+    RootSIFT.
+    answer: the fitted pose, the best view taken as it is ("Ours-BV"), or the pose fitted in the target view
+    that is truly nearest in rotation.  settings: of `ZeroShotPose`, where they differ from the paper's.
     """
 
     features: Literal["backbone", "random", "rootsift"] = "backbone"
@@ -75,19 +77,21 @@ def evaluate(
 ) -> dict:
     """Run the benchmark and return what OUT/summary.json says.
 
-    methods: names in `METHODS`.  pairs: per category; the folder's own evaluation set where it holds that many, else
-    sampled with `seed` (see `category_pairs`).  categories: default all of the folder's.  progress(done, total): called
-    after each pair.
-    Per-pair seeds come from the pair's key, so results do not depend on order. Running again with the same arguments
-    continues, with other methods adds them.
-    Raises InputError for unknown methods or categories, missing labels or files, and an OUT that holds another run.
+    methods: names in `METHODS`.  pairs: per category; the folder's own evaluation set where it holds that
+    many, else sampled with `seed` (see `category_pairs`).  categories: default all of the folder's. 
+    progress(done, total): called after each pair.
+    Per-pair seeds come from the pair's key, so results do not depend on order. Running again with the same
+    arguments continues, with other methods adds them.
+    Raises InputError for unknown methods or categories, missing labels or files, and an OUT that holds
+    another run.
     """
     dataset = Co3D(root)
     categories = list(categories or dataset.categories())
     if unknown := sorted(set(methods) - METHODS.keys()) or not methods:
         raise InputError(f"methods {unknown or 'none'}: expected some of {', '.join(METHODS)}")
     if missing := sorted(set(categories) - set(dataset.categories())) or not categories:
-        raise InputError(f"{root}: no categories {missing or ''}, found {', '.join(dataset.categories()) or 'none'}")
+        found = ", ".join(dataset.categories()) or "none"
+        raise InputError(f"{root}: no categories {missing or ''}, found {found}")
     backbone = load_backbone(backbone) if isinstance(backbone, str) else backbone
     todo = {category: category_pairs(dataset, category, pairs, targets, seed) for category in categories}
     total = sum(len(found) for found in todo.values())
@@ -123,7 +127,8 @@ def evaluate(
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """The first n pairs of the folder's own evaluation set for n_targets, where it holds so many; else n sampled."""
+    """The first n pairs of the folder's own evaluation set for n_targets, where it holds so many; else n
+    sampled."""
     for path in sorted(Path(dataset.root).glob(f"determ_eval/*samples_{n_targets}tgt/{category}.pt")):
         shipped = read_upstream_pairs(path, dataset)
         if len(shipped) >= n:
@@ -134,8 +139,9 @@ def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: i
 def summarise_run(records: Sequence[dict], methods: Sequence[str], data: dict, backbone: str) -> dict:
     """The summary of finished pairs: figures per method and category, saliency, and median seconds per stage.
 
-    "median", "acc30" and "acc15" are over all pairs; "mean_category_median" is the paper's way of averaging medians.
-    "against_ours": paired tests of "ours" against each other method.  "saliency_iou": mean over the frames used.
+    "median", "acc30" and "acc15" are over all pairs; "mean_category_median" is the paper's way of averaging
+    medians. "against_ours": paired tests of "ours" against each other method.  "saliency_iou": mean over the
+    frames used.
     """
     errors = {name: np.array([record["methods"][name]["error"] for record in records]) for name in methods}
     category_of = np.array([record["category"] for record in records])
@@ -161,11 +167,13 @@ def summarise_run(records: Sequence[dict], methods: Sequence[str], data: dict, b
         saliency["mean"] = float(np.mean(list(saliency.values())))
     timed = [record["methods"][name]["timings"] for record in records for name in methods[:1]
              if "timings" in record["methods"][name]]  # fmt: skip
-    timings = {stage: float(median([timing[stage] for timing in timed])) for stage in (timed[0] if timed else ())}
+    stages = timed[0] if timed else ()
+    timings = {stage: float(median([timing[stage] for timing in timed])) for stage in stages}
     frame_seconds = [record["seconds_per_frame"] for record in records if record.get("seconds_per_frame")]
     if frame_seconds:
         timings["features_per_frame"] = float(median(frame_seconds))
-    summary = {"data": data, "backbone": backbone, "methods": rows, "saliency_iou": saliency, "timings": timings}
+    summary = {"data": data, "backbone": backbone, "methods": rows, "saliency_iou": saliency}
+    summary["timings"] = timings
     if "ours" in errors:
         summary["against_ours"] = {
             name: paired_test(found, errors["ours"]) for name, found in errors.items() if name != "ours"
@@ -197,17 +205,20 @@ def _merge(record: dict, line: dict) -> None:
 
 
 class _Views:
-    """The category's frames as views, each cropped and described once; kept while the category is worked on."""
+    """The category's frames as views, each cropped and described once; kept while the category is worked
+    on."""
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Extractor]):
         self.dataset, self.category, self.extractors = dataset, category, extractors
         self.frames: dict[tuple[str, int], Frame | InputError] = {}
         self.features: dict[tuple[str, str, int], FeatureMap] = {}
         self.views: dict[tuple, View] = {}
-        self.seconds_per_frame: float | None = None  # of the pair at hand; None where nothing was left to compute
+        # Of the pair at hand; None where nothing was left to compute.
+        self.seconds_per_frame: float | None = None
 
     def load(self, keys: Sequence[tuple[str, int]]) -> None:
-        """Read and crop frames. A file that cannot be read is an error; one without an object fails its pairs."""
+        """Read and crop frames. A file that cannot be read is an error; one without an object fails its
+        pairs."""
         for key in keys:
             if key not in self.frames:
                 frame = self.dataset.load(self.dataset.frame(self.category, *key))
@@ -246,10 +257,12 @@ class _Views:
         return found
 
 
-def _evaluate_pair(pair: Pair, methods: Sequence[str], views: _Views, labels: Mapping[str, PoseLabel]) -> dict:
+def _evaluate_pair(
+    pair: Pair, methods: Sequence[str], views: _Views, labels: Mapping[str, PoseLabel]
+) -> dict:
     for sequence in (pair.reference_sequence, pair.target_sequence):
         if sequence not in labels:
-            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one for each sequence of a pair")
+            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one for each of a pair")
     views.seconds_per_frame = None
     keys = [(pair.reference_sequence, pair.reference_frame)]
     keys += [(pair.target_sequence, number) for number in pair.target_frames]
@@ -265,7 +278,7 @@ def _evaluate_pair(pair: Pair, methods: Sequence[str], views: _Views, labels: Ma
         "key": pair.key,
         "category": pair.category,
         "methods": results,
-        "saliency_iou": _saliency_iou(keys, views) if any(METHODS[name].features == "backbone" for name in methods) else {},
+        "saliency_iou": _saliency_iou(keys, views),
         "seconds_per_frame": views.seconds_per_frame,
     }
 
@@ -282,10 +295,11 @@ def _evaluate_method(
     reference, *targets = views.look(method.features, keys, solver)
     truths = [
         relative_pose(
-            labels[pair.reference_sequence], reference.frame.camera, labels[pair.target_sequence], target.frame.camera
+            labels[pair.reference_sequence], reference.frame.camera,
+            labels[pair.target_sequence], target.frame.camera,
         )
         for target in targets
-    ]
+    ]  # fmt: skip
     first = 0
     if method.answer == "true view":
         first = int(rotation_error(np.eye(3), np.stack(truths)[:, :3, :3]).argmin())
@@ -333,12 +347,15 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
     model = like.model
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
+        fresh = VisionTransformer(
+            model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads
+        )
     return Backbone(fresh, f"random like {like.name}", like.key_block, like.saliency_heads, like.device)
 
 
 def _fingerprint(backbone: Extractor) -> str:
-    """The backbone's name and a hash of its weights: retrained weights of the same name are another backbone."""
+    """The backbone's name and a hash of its weights: retrained weights of the same name are another
+    backbone."""
     name = getattr(backbone, "name", type(backbone).__name__)
     if not isinstance(backbone, Backbone):
         return name
@@ -357,7 +374,8 @@ def _same_run(out: Path, settings: dict) -> None:
         except ValueError as error:
             raise InputError(f"{path}: not the settings of a run ({error}); choose another folder") from error
         if before != settings:
-            differing = ", ".join(key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key])
+            before = before if isinstance(before, dict) else {}
+            differing = ", ".join(key for key in settings if before.get(key) != settings[key])
             raise InputError(f"{out} holds a run with other settings ({differing}); choose another folder")
     elif (out / "pairs.jsonl").exists():
         raise InputError(f"{out} holds pairs.jsonl without run.json; choose another folder")
