@@ -48,7 +48,8 @@ pytest.raises = raises
 
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
-    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with labels.
+    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with
+    labels.
 
     Sequence "b" stands in a world that is turned, moved and unlike that of "a", the reference of the labels.
     """
@@ -66,9 +67,14 @@ def ellipsoids(tmp_path_factory):
     sequences = []
     for name, placement in placements.items():
         angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
-        frames = [render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}") for i, a in enumerate(angles)]
+        frames = [
+            render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}")
+            for i, a in enumerate(angles)
+        ]
         colours = np.full((50, 3), 128, np.uint8)
-        sequences.append(SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0))
+        sequences.append(
+            SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0)
+        )
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)

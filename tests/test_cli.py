@@ -105,7 +105,9 @@ def test_the_doctor_names_each_thing_and_says_what_is_missing(capsys, ellipsoids
 def test_the_weights_list_has_every_name(capsys):
     assert cli.main(["weights", "list"]) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
+    assert all(
+        name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16")
+    )
 
 
 def assert_one_line(capsys) -> str:

@@ -25,7 +25,13 @@ def test_a_package_is_held_against_its_range_and_its_pin(installed, pinned, stat
 
 
 def test_pins_are_read_for_this_platform_only():
-    text = "# comment\n\ntorch==2.13.0\nNumPy==2.0 ; python_version >= '3.11'\nopen3d==1.0 ; python_version < '3'\nloose>=1\n"
+    text = """
+# comment
+torch==2.13.0
+NumPy==2.0 ; python_version >= '3.11'
+open3d==1.0 ; python_version < '3'
+loose>=1
+"""
     assert doctor.read_pins(text) == {"torch": "2.13.0", "numpy": "2.0"}
 
 

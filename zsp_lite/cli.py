@@ -11,8 +11,8 @@ from pathlib import Path
 from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
-    "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and soft masks as "
-    "CO3D has them; no photograph."
+    "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and "
+    "soft masks as CO3D has them; no photograph."
 )
 USER_NOTE = "a folder in CO3D's layout, as given."
 
@@ -103,18 +103,22 @@ def _add_data(parser: Parser) -> None:
 def _add_backbone(parser: Parser) -> None:
     parser.add_argument(
         "--backbone", default="zsp-tiny", metavar="NAME",
-        help="zsp-tiny, dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, or a checkpoint file (default: zsp-tiny)",
+        help="zsp-tiny (default), dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, or a checkpoint file",
     )  # fmt: skip
 
 
 def _add_demo(commands) -> None:
     parser = _command(
-        commands, "demo", _demo, "one pair of each category, end to end: a table, and a report with every stage",
+        commands, "demo", _demo, "one pair of each category, end to end: a table and a report of every stage",
         ["demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"],
     )  # fmt: skip
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)")
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)"
+    )
     _add_backbone(parser)
-    parser.add_argument("--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="default: outputs/demo")
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="default: outputs/demo"
+    )
 
 
 def _demo(arguments: argparse.Namespace) -> None:
@@ -151,14 +155,18 @@ def _demo(arguments: argparse.Namespace) -> None:
 
 def _add_benchmark(commands) -> None:
     parser = _command(
-        commands, "benchmark", _benchmark, "rotation errors over many pairs: summary.json, pairs.jsonl and a table",
-        ["benchmark", "benchmark --data outputs/eval --pairs 30 --methods ours,ours-bv,rootsift --out outputs/benchmark"],
+        commands, "benchmark", _benchmark, "rotation errors over many pairs: a table, and files to go on with",
+        ["benchmark", "benchmark --data outputs/eval --pairs 30 --methods ours,rootsift --out outputs/compared"],
     )  # fmt: skip
     _add_data(parser)
     _add_backbone(parser)
     parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all of the folder's")
-    parser.add_argument("--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)")
-    parser.add_argument("--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)")
+    parser.add_argument(
+        "--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)"
+    )
+    parser.add_argument(
+        "--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)"
+    )
     parser.add_argument(
         "--methods", type=_names, default=["ours", "ours-bv", "rootsift"], metavar="A,B",
         help="rows of the table (default: ours,ours-bv,rootsift)",
@@ -192,8 +200,8 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     for name, figures in summary["methods"].items():
         low, high = figures["acc30_ci"]
         table.add_row(
-            name, str(figures["n"]), f"{figures['median']:.1f}", f"{figures['acc30']:.1f}", f"{low:.1f} to {high:.1f}",
-            f"{figures['acc15']:.1f}",
+            name, str(figures["n"]), f"{figures['median']:.1f}", f"{figures['acc30']:.1f}",
+            f"{low:.1f} to {high:.1f}", f"{figures['acc15']:.1f}",
         )  # fmt: skip
     console = Console()
     console.print(table)
@@ -202,16 +210,18 @@ def _benchmark(arguments: argparse.Namespace) -> None:
 
 def _add_synth(commands) -> None:
     parser = _command(
-        commands, "synth", _synth, "make procedural objects as a folder in CO3D's layout, bit for bit from a seed",
+        commands, "synth", _synth, "make procedural objects as a CO3D folder, bit for bit from a seed",
         [
             "synth --preset samples --out data_samples",
             "synth --preset eval --out outputs/eval",
-            "synth --category chair --category teddybear --sequences 4 --frames 24 --seed 7 --out outputs/mine",
+            "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
         ],
     )  # fmt: skip
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--preset", metavar="NAME", help="samples (what data_samples/ holds) or eval")
-    what.add_argument("--category", action="append", metavar="NAME", help="a category; may be given more than once")
+    what.add_argument(
+        "--category", action="append", metavar="NAME", help="a category; may be given more than once"
+    )
     parser.add_argument("--sequences", type=_count, default=4, metavar="N", help="per category (default: 4)")
     parser.add_argument("--frames", type=_count, default=24, metavar="N", help="per sequence (default: 24)")
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
@@ -234,7 +244,7 @@ def _synth(arguments: argparse.Namespace) -> None:
 def _add_weights(commands) -> None:
     parser = _command(
         commands, "weights", _weights, "backbones: which are at hand, fetch one, check a file",
-        ["weights list", "weights fetch dino_vits8", "weights verify dino_vits8", "weights verify path/to/checkpoint.pth"],
+        ["weights list", "weights fetch dino_vits8", "weights verify path/to/checkpoint.pth"],
     )  # fmt: skip
     parser.add_argument("action", choices=("list", "fetch", "verify"))
     parser.add_argument("name", nargs="?", help="a backbone's name (verify: or a checkpoint file)")
@@ -261,14 +271,20 @@ def _weights(arguments: argparse.Namespace) -> None:
 
 def _add_train(commands) -> None:
     parser = _command(
-        commands, "train", _train, "train the embedded backbone from random weights, or resume a run; hours on a CPU",
+        commands, "train", _train, "train the embedded backbone from random weights, or resume; hours on a CPU",
         ["train --out outputs/train", "train --out outputs/try --shorten 0.02 --objects 60"],
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("outputs/train"), metavar="DIR",
-                        help="config, log, checkpoint and weights; a run found there is resumed (default: outputs/train)")  # fmt: skip
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/train"), metavar="DIR",
+        help="config, log, checkpoint, weights; a run found there is resumed (default: outputs/train)",
+    )  # fmt: skip
     parser.add_argument("--renders", type=Path, metavar="DIR", help="training renders (default: OUT/renders)")
-    parser.add_argument("--objects", type=_count, metavar="N", help="training objects (default: the configuration's)")
-    parser.add_argument("--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F")
+    parser.add_argument(
+        "--objects", type=_count, metavar="N", help="training objects (default: the configuration's)"
+    )
+    parser.add_argument(
+        "--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F"
+    )
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
 
 
@@ -284,24 +300,30 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _add_profile(commands) -> None:
-    _command(
-        commands, "profile", _profile, "time and memory of every stage, against the plain loops they replace", ["profile"]
+    parser = _command(
+        commands, "profile", _profile, "time and memory of every stage, against the plain loops they replace",
+        ["profile", "profile --repeats 2"],
+    )  # fmt: skip
+    parser.add_argument(
+        "--repeats", type=_count, default=5, metavar="N", help="runs behind each median (default: 5)"
     )
 
 
 def _profile(arguments: argparse.Namespace) -> None:
     from zsp_lite.benchmark.profile import profile
 
-    for line in profile():
-        print(line)
+    for row in profile(arguments.repeats):
+        print(row, flush=True)
 
 
 def _add_doctor(commands) -> None:
     parser = _command(
-        commands, "doctor", _doctor, "what is installed and at hand, and the command that mends what is missing",
+        commands, "doctor", _doctor, "what is installed and at hand, and the command that mends what is not",
         ["doctor", "doctor --data path/to/co3d"],
     )  # fmt: skip
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a CO3D folder to look at besides the usual ones")
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="a CO3D folder to look at besides the usual ones"
+    )
 
 
 def _doctor(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,6 @@
-"""One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks reuse."""
+"""One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks
+reuse.
+"""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,8 +26,10 @@ _SEQUENCE_FRAMES = 6
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """One pair and its estimate. `error`: rotation error in degrees; `seconds`: for the whole estimate, from frames in
-    memory; `sequence`: whole frames spread over the target sequence, which the pose is propagated to."""
+    """One pair and its estimate. `error`: rotation error in degrees; `seconds`: for the whole estimate, from
+    frames in memory; `sequence`: whole frames spread over the target sequence, which the pose is propagated
+    to.
+    """
 
     pair: Pair
     estimate: PoseEstimate
@@ -37,8 +41,8 @@ class DemoResult:
 def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
     """The first evaluation pair of every category: fixed beforehand, not picked for its result.
 
-    Categories without evaluation pairs for `n_targets` get the first pair of a sample with seed 0. Raises InputError
-    where the folder holds no category.
+    Categories without evaluation pairs for `n_targets` get the first pair of a sample with seed 0. Raises
+    InputError where the folder holds no category.
     """
     categories = dataset.categories()
     if not categories:
@@ -51,7 +55,9 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
     return pairs
 
 
-def run_demo(dataset: Co3D, backbone: Callable[[Sequence[np.ndarray]], list[FeatureMap]]) -> Iterator[DemoResult]:
+def run_demo(
+    dataset: Co3D, backbone: Callable[[Sequence[np.ndarray]], list[FeatureMap]]
+) -> Iterator[DemoResult]:
     """The estimates for `demo_pairs`, one after the other, with the paper's settings."""
     method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
@@ -65,7 +71,8 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     """
     reference = dataset.load(dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame))
     targets = [
-        dataset.load(dataset.frame(pair.category, pair.target_sequence, number)) for number in pair.target_frames
+        dataset.load(dataset.frame(pair.category, pair.target_sequence, number))
+        for number in pair.target_frames
     ]
 
     start = time.perf_counter()
@@ -75,7 +82,9 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     labels = read_labels(dataset.root, pair.category)
     for sequence in (pair.reference_sequence, pair.target_sequence):
         if sequence not in labels:
-            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with")
+            raise InputError(
+                f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with"
+            )
     truth = relative_pose(
         labels[pair.reference_sequence], reference.camera,
         labels[pair.target_sequence], targets[estimate.view].camera,
@@ -83,14 +92,16 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     error = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     sequence = dataset.frames(pair.category, pair.target_sequence)
     spread = np.linspace(0, len(sequence), _SEQUENCE_FRAMES, endpoint=False).astype(int)
-    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(spread)))
+    return DemoResult(
+        pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(spread))
+    )
 
 
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Camera-frame points of the pixels of the object with a measured depth, at most `most` of them.
 
-    The object is where the mask is above 0.5; without a mask, the patches of the foreground. Raises InputError where
-    none of its pixels has a depth.
+    The object is where the mask is above 0.5; without a mask, the patches of the foreground. Raises
+    InputError where none of its pixels has a depth.
     """
     frame = view.frame
     if frame.depth is None:

@@ -1,4 +1,6 @@
-"""What is installed, what is at hand, where data is looked for, and the command that mends what is missing."""
+"""What is installed, what is at hand, where data is looked for, and the command that mends what is
+missing.
+"""
 
 import importlib.metadata
 import importlib.util
@@ -20,8 +22,9 @@ OK, NOTE, BAD = "ok", "note", "bad"
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at. `state` is "ok", "note" (works without) or "bad" (an essential is missing); `remedy` is the
-    command or step that mends it, empty where there is nothing to mend."""
+    """One thing looked at. `state` is "ok", "note" (works without) or "bad" (an essential is missing);
+    `remedy` is the command or step that mends it, empty where there is nothing to mend.
+    """
 
     name: str
     state: str
@@ -30,7 +33,9 @@ class Check:
 
 
 def examine(data: Path | None = None) -> list[Check]:
-    """All checks, in the order in which one would mend them. `data`: a CO3D folder to look at besides the usual ones."""
+    """All checks, in the order in which one would mend them. `data`: a CO3D folder to look at besides the
+    usual ones.
+    """
     return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_data(data), _jupyter()]
 
 
@@ -48,13 +53,17 @@ def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
 
 
 def sample_data() -> Path:
-    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is in."""
+    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is
+    in.
+    """
     here = Path("data_samples")
     return here if here.is_dir() else REPOSITORY / "data_samples"
 
 
 def compare(requirement: Requirement, installed: str | None, pinned: str | None) -> Check:
-    """The state of one package: its installed version against the range it must be in and the version tested with."""
+    """The state of one package: its installed version against the range it must be in and the version tested
+    with.
+    """
     name, mend = requirement.name, f"{_pip()} install '{requirement.name}{requirement.specifier}'"
     if installed is None:
         return Check(name, BAD, f"not installed, expected {requirement.specifier or 'any version'}", mend)
@@ -67,7 +76,9 @@ def compare(requirement: Requirement, installed: str | None, pinned: str | None)
 
 
 def read_pins(text: str) -> dict[str, str]:
-    """Package name (lower case) to version, from a requirements file of exact pins; other lines are passed over."""
+    """Package name (lower case) to version, from a requirements file of exact pins; other lines are passed
+    over.
+    """
     pins = {}
     for line in text.splitlines():
         try:
@@ -96,7 +107,12 @@ def _packages() -> Iterator[Check]:
     try:
         requirements = importlib.metadata.requires("zsp-lite") or []
     except importlib.metadata.PackageNotFoundError:
-        yield Check("zsp-lite", BAD, "runs from its folder, is not installed", f"{_pip()} install --no-deps -e {REPOSITORY}")
+        yield Check(
+            "zsp-lite",
+            BAD,
+            "runs from its folder, is not installed",
+            f"{_pip()} install --no-deps -e {REPOSITORY}",
+        )
         return
     yield Check("zsp-lite", OK, importlib.metadata.version("zsp-lite"))
     environment = REPOSITORY / "environment.txt"
@@ -115,9 +131,18 @@ def _torch() -> Iterator[Check]:
     try:
         import torch
     except (ImportError, OSError) as error:
-        yield Check("torch runs", BAD, f"cannot be imported: {_one_line(error)}", f"{_pip()} install --force-reinstall torch")
+        yield Check(
+            "torch runs",
+            BAD,
+            f"cannot be imported: {_one_line(error)}",
+            f"{_pip()} install --force-reinstall torch",
+        )
         return
-    cuda = f", CUDA on {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else ", no CUDA (not needed)"
+    cuda = (
+        f", CUDA on {torch.cuda.get_device_name(0)}"
+        if torch.cuda.is_available()
+        else ", no CUDA (not needed)"
+    )
     yield Check("torch runs", OK, f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs{cuda}")
 
 
@@ -137,13 +162,20 @@ def _backbones() -> Iterator[Check]:
     try:
         from zsp_lite.backbones import available_backbones
     except (ImportError, OSError) as error:
-        yield Check("backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
+        yield Check(
+            "backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first"
+        )
         return
     for name, path in available_backbones().items():
         if path is not None:
             yield Check(f"backbone {name}", OK, f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
         elif name == "zsp-tiny":
-            yield Check(f"backbone {name}", BAD, "its weights are not in the package", "reinstall zsp-lite, or zsp-lite train")
+            yield Check(
+                f"backbone {name}",
+                BAD,
+                "its weights are not in the package",
+                "reinstall zsp-lite, or zsp-lite train",
+            )
         else:
             yield Check(f"backbone {name}", NOTE, "not downloaded", f"zsp-lite weights fetch {name}")
 
@@ -156,7 +188,11 @@ def _data(data: Path | None) -> Iterator[Check]:
         return
     for name, folder in data_folders(data):
         sample = name == "data_samples"
-        remedy = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"
+        remedy = (
+            "zsp-lite synth --preset samples --out data_samples"
+            if sample
+            else f"point {name} at a CO3D folder"
+        )
         try:
             categories = Co3D(folder).categories()
         except InputError as error:
@@ -174,7 +210,9 @@ def _data(data: Path | None) -> Iterator[Check]:
 
 
 def _jupyter() -> Check:
-    missing = [name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None]
+    missing = [
+        name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None
+    ]
     if missing:
         remedy = f"{_pip()} install {' '.join(missing)}"
         return Check("Jupyter", NOTE, f"{', '.join(missing)} not installed (only for the notebooks)", remedy)

@@ -1,4 +1,6 @@
-"""The demo as one HTML page that needs nothing beside itself: pictures inline, plotly's script inline once."""
+"""The demo as one HTML page that needs nothing beside itself: pictures inline, plotly's script inline
+once.
+"""
 
 import base64
 import html
@@ -23,20 +25,35 @@ _CSS = """
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 1120px; padding: 1.5rem 1rem 4rem; background: #fff; color: var(--ink);
        font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.7rem; margin: 0 0 .3rem; } h2 { font-size: 1.35rem; margin: 0; } h3 { font-size: 1.02rem; margin: 0 0 .3rem; }
-p { margin: .3rem 0 .8rem; max-width: 75ch; } .soft { color: var(--soft); }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .9rem .35rem 0; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } a { color: var(--accent); }
+h1 { font-size: 1.7rem; margin: 0 0 .3rem; }
+h2 { font-size: 1.35rem; margin: 0; }
+h3 { font-size: 1.02rem; margin: 0 0 .3rem; }
+p { margin: .3rem 0 .8rem; max-width: 75ch; }
+.soft { color: var(--soft); }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
+th, td { padding: .35rem .9rem .35rem 0; text-align: right;
+         border-bottom: 1px solid var(--line); white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+a { color: var(--accent); }
 section { border-top: 3px solid var(--ink); padding-top: .9rem; margin-top: 2.4rem; }
-.stages { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 1.4rem; margin-top: 1rem; }
-.wide { grid-column: 1 / -1; } figure { margin: 0; min-width: 0; } figcaption { color: var(--soft); font-size: .92rem; margin-top: .3rem; }
-img { max-width: 100%; height: auto; display: block; } .wide img { min-width: 620px; } .flag { border-left: 4px solid #d55e00; padding-left: .7rem; }
+.stages { display: grid;
+          grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 1.4rem; margin-top: 1rem; }
+.wide { grid-column: 1 / -1; }
+figure { margin: 0; min-width: 0; }
+figcaption { color: var(--soft); font-size: .92rem; margin-top: .3rem; }
+img { max-width: 100%; height: auto; display: block; }
+.wide img { min-width: 620px; }
+.flag { border-left: 4px solid #d55e00; padding-left: .7rem; }
 """
 
 
-def write_report(path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str) -> Path:
-    """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in it."""
+def write_report(
+    path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str
+) -> Path:
+    """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in
+    it.
+    """
     path = Path(path)
     write_atomic(path, page(results, data, data_note, backbone).encode())
     return path
@@ -47,19 +64,22 @@ def page(results: Sequence[DemoResult], data: str, data_note: str, backbone: str
     rows = "\n".join(_row(index, result) for index, result in enumerate(results))
     sections = "\n".join(_section(index, result) for index, result in enumerate(results))
     return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <title>zsp-lite: zero-shot pose, end to end</title><style>{_CSS}</style>
 <script>{get_plotlyjs()}</script></head><body>
 <header><h1>Zero-shot category-level pose, end to end</h1>
-<p>Two objects of one category, neither with a label: how must the first be turned, moved and scaled to lie on the second?
-Below, every stage of the method on one pair of each category in <code>{html.escape(data)}</code>.</p>
-<p><strong>Data:</strong> {html.escape(data_note)} <strong>Backbone:</strong> <code>{html.escape(backbone)}</code>.
-The pairs are the first evaluation pair of each category, fixed before anything was run: what fails is shown too.</p></header>
+<p>Two objects of one category, neither with a label: how must the first be turned, moved and scaled to lie on the
+second? Below, every stage of the method on one pair of each category in <code>{html.escape(data)}</code>.</p>
+<p><strong>Data:</strong> {html.escape(data_note)}
+<strong>Backbone:</strong> <code>{html.escape(backbone)}</code>.
+The pairs are the first evaluation pair of each category, fixed before anything was run: what fails is shown
+too.</p></header>
 <div class="scroll"><table><thead><tr><th scope="col">category</th><th scope="col">chosen view</th>
 <th scope="col">inliers</th><th scope="col">rotation error</th><th scope="col">time</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
-<p class="soft">Rotation error: angle between the estimated and the labelled rotation; 180 degrees is the largest there is.
-Time: from the frames in memory to the pose.</p>
+<p class="soft">Rotation error: angle between the estimated and the labelled rotation; 180 degrees is the
+largest there is. Time: from the frames in memory to the pose.</p>
 {sections}
 </body></html>
 """
@@ -79,7 +99,11 @@ def table_row(result: DemoResult) -> tuple[str, str, str, str, str]:
 
 def _row(index: int, result: DemoResult) -> str:
     category, *cells = map(html.escape, table_row(result))
-    return f'<tr><td><a href="#pair-{index}">{category}</a></td>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    return (
+        f'<tr><td><a href="#pair-{index}">{category}</a></td>'
+        + "".join(f"<td>{cell}</td>" for cell in cells)
+        + "</tr>"
+    )
 
 
 def _section(index: int, result: DemoResult) -> str:
@@ -90,38 +114,49 @@ def _section(index: int, result: DemoResult) -> str:
     chosen = f"target view {estimate.view + 1}"
     stages = [
         _figure(
-            "Reference and target views", _views(result), True,
-            f"The reference {category} and the views of another {category}; {chosen} is marked as the best one.",
-            "All views are cropped to the object. The score is eq. 3, higher is better; the marked view has the highest.",
+            "Reference and target views",
+            _views(result),
+            True,
+            f"The reference {category} and the views of another {category}; {chosen} is marked.",
+            "All views are cropped to the object. The score is eq. 3; the marked view has the highest.",
         ),
         _figure(
-            "Saliency", _saliency(result), False,
+            "Saliency",
+            _saliency(result),
+            False,
             f"Saliency of the reference and of {chosen} as a colour overlay.",
             "Attention of the CLS token. Patches above 0.05 count as the object.",
         ),
         _figure(
-            "Cyclical distances", _cycles(result), False,
+            "Cyclical distances",
+            _cycles(result),
+            False,
             f"Cyclical distance map of the reference against {chosen}, and back.",
-            "Each patch goes to its nearest neighbour in the other image and back; bright is a return near to the start. "
-            "Clear patches leave the object on the way.",
+            "Each patch goes to its nearest neighbour in the other image and back; bright is a return near to the "
+            "start. Clear patches leave the object on the way.",
         ),
         _figure(
-            "Correspondences", _correspondences(result), False,
-            f"Lines between corresponding patches of the reference and {chosen}; inliers solid, outliers dashed.",
-            f"{len(estimate.matches)} matches; the {int(estimate.inliers.sum())} solid ones agree with the pose, the dashed "
-            "grey ones do not.",
+            "Correspondences",
+            _correspondences(result),
+            False,
+            f"Lines between matched patches of the reference and {chosen}; inliers solid, outliers dashed.",
+            f"{len(estimate.matches)} matches; the {int(estimate.inliers.sum())} solid ones agree with the pose, "
+            "the dashed grey ones do not.",
         ),
         _scene(result, f"pair-{index}-scene"),
         _figure(
-            "The pose over the target sequence", _propagated(result), True,
-            f"The aligned reference point cloud drawn over {len(result.sequence)} frames of the target sequence.",
-            "One estimate, carried to other frames through the known cameras. Colours run along the reference object: "
-            "the same colour stays on the same part.",
+            "The pose over the target sequence",
+            _propagated(result),
+            True,
+            f"The aligned reference cloud drawn over {len(result.sequence)} frames of the target sequence.",
+            "One estimate, carried to other frames through the known cameras. Colours run along the reference "
+            "object: the same colour stays on the same part.",
         ),
     ]
     return f"""<section id="pair-{index}"><h2>{html.escape(category)}: {result.error:.1f}° off</h2>
 <p class="soft">Reference {html.escape(pair.reference_sequence)}, frame {pair.reference_frame}; target
-{html.escape(pair.target_sequence)}, frames {", ".join(map(str, pair.target_frames))}. Scale {estimate.sim3.scale:.2f}.
+{html.escape(pair.target_sequence)}, frames {", ".join(map(str, pair.target_frames))}.
+Scale {estimate.sim3.scale:.2f}.
 Time per stage: {html.escape(timings)}.</p>{flag}
 <div class="stages">{"".join(stages)}</div></section>"""
 
@@ -129,7 +164,9 @@ Time per stage: {html.escape(timings)}.</p>{flag}
 def _views(result: DemoResult) -> Figure:
     estimate = result.estimate
     views = [estimate.reference_view, *estimate.target_views]
-    titles = ["reference"] + [f"target {i + 1}\nscore {score:.1f}" for i, score in enumerate(estimate.view_scores)]
+    titles = ["reference"] + [
+        f"target {i + 1}\nscore {score:.1f}" for i, score in enumerate(estimate.view_scores)
+    ]
     figure, axes = plots.show_images([view.frame.rgb for view in views], titles, size=1.9)
     plots.mark(axes[1 + estimate.view], "chosen")
     return figure
@@ -137,7 +174,9 @@ def _views(result: DemoResult) -> Figure:
 
 def _saliency(result: DemoResult) -> Figure:
     views = _best_views(result)
-    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
+    figure, axes = plots.show_images(
+        [view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7
+    )
     for axis, view in zip(axes, views):
         plots.overlay_map(axis, view.features.saliency.cpu().numpy(), limits=(0, 1), label="saliency")
     return figure
@@ -145,11 +184,17 @@ def _saliency(result: DemoResult) -> Figure:
 
 def _cycles(result: DemoResult) -> Figure:
     views = _best_views(result)
-    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
+    figure, axes = plots.show_images(
+        [view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7
+    )
     sim = similarity(views[0].features, views[1].features)
     for axis, start, end, table in ((axes[0], *views, sim), (axes[1], *views[::-1], sim.T)):
-        distances = cyclical_distances(table, start.features.grid, end.features.grid, start.foreground, end.foreground)
-        plots.overlay_map(axis, distances.cpu().numpy(), limits=(-10, 0), cmap="cividis", label="− distance (patches)")
+        distances = cyclical_distances(
+            table, start.features.grid, end.features.grid, start.foreground, end.foreground
+        )
+        plots.overlay_map(
+            axis, distances.cpu().numpy(), limits=(-10, 0), cmap="cividis", label="− distance (patches)"
+        )
     return figure
 
 
@@ -183,10 +228,16 @@ def _propagated(result: DemoResult) -> Figure:
 def _scene(result: DemoResult, name: str) -> str:
     first, second = _best_views(result)
     scene = aligned_clouds(result.estimate.sim3.apply(object_cloud(first)), object_cloud(second))
-    inline = scene.to_html(full_html=False, include_plotlyjs=False, div_id=name, config={"displaylogo": False, "responsive": True})
+    inline = scene.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        div_id=name,
+        config={"displaylogo": False, "responsive": True},
+    )
     return (
-        f"<figure><h3>Aligned point clouds</h3>{inline}<figcaption>The reference's points after the estimated pose, and "
-        "the target's own, in the target camera's frame. Drag to turn. Each cloud holds only what its camera saw.</figcaption></figure>"
+        f"<figure><h3>Aligned point clouds</h3>{inline}<figcaption>The reference's points after the "
+        "estimated pose, and the target's own, in the target camera's frame. Drag to turn. Each cloud holds "
+        "only what its camera saw.</figcaption></figure>"
     )
 
 
@@ -198,7 +249,8 @@ def _figure(title: str, figure: Figure, wide: bool, alt: str, caption: str) -> s
     source = _inline_image(figure)
     return (
         f'<figure{" class=wide" if wide else ""}><h3>{html.escape(title)}</h3><div class="scroll">'
-        f'<img alt="{html.escape(alt)}" src="{source}"></div><figcaption>{html.escape(caption)}</figcaption></figure>'
+        f'<img alt="{html.escape(alt)}" src="{source}"></div>'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
 

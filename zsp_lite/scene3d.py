@@ -7,7 +7,9 @@ from jaxtyping import Real
 from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, ORANGE
 
-MAX_POINTS = 4000  # of both clouds together: beyond that browsers and notebooks grow heavy and nothing more is seen
+MAX_POINTS = (
+    4000  # of both clouds together: beyond that browsers and notebooks grow heavy and nothing more is seen
+)
 
 
 def aligned_clouds(
@@ -17,11 +19,12 @@ def aligned_clouds(
     title: str | None = None,
     seed: int = 0,
 ) -> go.Figure:
-    """Two clouds in one frame: the reference after its Sim3, and the target, both in the target camera's frame.
+    """Two clouds in one frame: the reference after its Sim3, and the target, both in the target camera's
+    frame.
 
-    The view is the target camera's, moved a little aside: +x right, +y down, +z away. At most 4,000 points are drawn,
-    chosen with `seed`. Besides the colour the symbols differ. Raises InputError on an empty cloud or values that are
-    not finite.
+    The view is the target camera's, moved a little aside: +x right, +y down, +z away. At most 4,000 points
+    are drawn, chosen with `seed`. Besides the colour the symbols differ. Raises InputError on an empty cloud
+    or values that are not finite.
     """
     rng = np.random.default_rng(seed)
     traces, kept = [], []
@@ -44,7 +47,13 @@ def aligned_clouds(
         title=title,
         height=440,
         margin={"l": 0, "r": 0, "t": 40 if title else 0, "b": 0},
-        legend={"itemsizing": "constant", "orientation": "h", "x": 0, "y": 0, "bgcolor": "rgba(255,255,255,0.8)"},
+        legend={
+            "itemsizing": "constant",
+            "orientation": "h",
+            "x": 0,
+            "y": 0,
+            "bgcolor": "rgba(255,255,255,0.8)",
+        },
         scene={
             **{f"{axis}axis": {"title": {"text": label}, "range": span} for axis, label, span in _axes(kept)},
             "aspectmode": "cube",
@@ -55,10 +64,13 @@ def aligned_clouds(
 
 
 def _axes(clouds: list[np.ndarray]) -> list[tuple[str, str, list[float]]]:
-    """Name, label and one common span for each axis, from the middle 98 % of the points: strays must not shrink all."""
+    """Name, label and one common span for each axis, from the middle 98 % of the points: strays must not
+    shrink all.
+    """
     low, high = np.percentile(np.concatenate(clouds), [1, 99], axis=0)
     centre, half = (low + high) / 2, 0.6 * float((high - low).max())
     labels = ("x (right)", "y (down)", "z (away)")
     return [
-        (axis, label, [float(middle - half), float(middle + half)]) for axis, label, middle in zip("xyz", labels, centre)
+        (axis, label, [float(middle - half), float(middle + half)])
+        for axis, label, middle in zip("xyz", labels, centre)
     ]
