@@ -291,12 +291,18 @@ def _add_train(commands) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from dataclasses import replace
 
+    from tqdm import tqdm
+
     from zsp_lite.training.train import TrainingConfig, train
 
     config = TrainingConfig(seed=arguments.seed).shortened(arguments.shorten)
     if arguments.objects:
         config = replace(config, objects=arguments.objects)
-    print(f"Written: {train(config, arguments.out, arguments.renders)}")
+
+    def bar(shards, total):
+        return tqdm(shards, "rendering", total, unit="shard", disable=None)
+
+    print(f"Written: {train(config, arguments.out, arguments.renders, progress=bar)}")
 
 
 def _add_profile(commands) -> None:
