@@ -78,7 +78,7 @@ def evaluate(
     """Run the benchmark and return what OUT/summary.json says.
 
     methods: names in `METHODS`.  pairs: per category; the folder's own evaluation set where it holds that
-    many, else sampled with `seed` (see `category_pairs`).  categories: default all of the folder's. 
+    many, else sampled with `seed` (see `category_pairs`).  categories: default all of the folder's.
     progress(done, total): called after each pair.
     Per-pair seeds come from the pair's key, so results do not depend on order. Running again with the same
     arguments continues, with other methods adds them.

@@ -71,7 +71,9 @@ class Scene:
         self.floor = float(self.vertices[:, 2].min())
         self.centre = (self.vertices.max(0) + self.vertices.min(0)) / 2
 
-    def render(self, camera: Camera, look: Appearance, seed: int | np.random.Generator, shadows: bool = True) -> Rendering:
+    def render(
+        self, camera: Camera, look: Appearance, seed: int | np.random.Generator, shadows: bool = True
+    ) -> Rendering:
         """Render the object on its floor before its wall; `seed` draws the sensor noise."""
         rng = np.random.default_rng(seed)
         height, width = camera.size
@@ -99,7 +101,8 @@ class Scene:
         reach = np.where(down, (self.floor - eye[2]) / np.where(down, rays[off, 2], -1), np.inf)
         grounded = (reach < 25) & look.has_ground
         floor_point = eye + reach[grounded, None] * rays[off[grounded]]
-        room = backdrop(2.5 * rays[off] / np.linalg.norm(rays[off], axis=1, keepdims=True), look.wall_waves, look.wall_colours)
+        direction = rays[off] / np.linalg.norm(rays[off], axis=1, keepdims=True)
+        room = backdrop(2.5 * direction, look.wall_waves, look.wall_colours)
         room[grounded] = backdrop(floor_point, look.ground_waves, look.ground_colours)
         depth = np.where(mask, distance, 0).astype(np.float32)
         depth[off[grounded]] = reach[grounded]

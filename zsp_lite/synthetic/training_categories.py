@@ -7,7 +7,16 @@ import numpy as np
 
 from zsp_lite.synthetic.assembly import Assembly
 from zsp_lite.synthetic.primitives import (
-    TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus,
+    TAU,
+    Mesh,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+    torus,
 )  # fmt: skip
 
 PI = np.pi
@@ -68,7 +77,8 @@ def bird(a: Assembly) -> None:
     a.add(ellipsoid((0.035, 0.03, 0.035), head + [0.1, 0.14, 0.06]), 3, mirror=True)
     a.add(ellipsoid((size * 0.8, 0.07, size * 0.4), (-0.08, size * 0.52, z + 0.05)), 1, mirror=True)
     spread, back = a.u(0.1, 0.35), -size * 1.6
-    a.add(extrusion([[-size * 0.8, 0.15], [-size * 0.8, -0.15], [back, -spread], [back, spread]], 0.06, "xy", z + 0.1), 3)
+    tail = [[-size * 0.8, 0.15], [-size * 0.8, -0.15], [back, -spread], [back, spread]]
+    a.add(extrusion(tail, 0.06, "xy", z + 0.1), 3)
     a.add(rod((0, 0.15, z - 0.1), (0, 0.17, 0.02), 0.035), 2, mirror=True)
     a.add(box((0.25, 0.13, 0.04), (0.06, 0.17, 0.02)), 2, mirror=True)
 
@@ -176,9 +186,10 @@ def faucet(a: Assembly) -> None:
     h, r = a.u(0.6, 1.2), a.u(0.25, 0.45)
     a.add(cylinder(0.3, 0.25, 0.12), 0)
     a.add(rod((0, 0, 0), (0, 0, h), a.u(0.08, 0.14)), 0)
-    arched = a.chance(0.5)
-    spout = torus(r, 0.08, (0, 1, 0), (r, 0, h), -PI / 2, PI / 2) if arched else rod((0, 0, h), (2 * r, 0, h + 0.1), 0.09, 0.07)
-    a.add(spout, 0)
+    if a.chance(0.5):
+        a.add(torus(r, 0.08, (0, 1, 0), (r, 0, h), -PI / 2, PI / 2), 0)
+    else:
+        a.add(rod((0, 0, h), (2 * r, 0, h + 0.1), 0.09, 0.07), 0)
     a.add(rod((0, 0.05, h * 0.5), (0, a.u(0.25, 0.4), h * 0.5), 0.06), 1)
     a.add(rod((0, 0.3, h * 0.5), (0.05, 0.35, h * 0.5 + a.u(0.2, 0.4)), 0.05), 2)
     a.add(rod((2 * r, 0, h - 0.12), (2 * r, 0, h + 0.1), 0.1), 3)

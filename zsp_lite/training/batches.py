@@ -61,8 +61,10 @@ def _recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Te
     return ((x - MEAN) / STD).contiguous()
 
 
-def sample_batch(renders: RenderSet, rng: np.random.Generator, objects: int, views: int, side: int,
-                 scale: tuple[float, float], patch_size: int = 8, members: np.ndarray | None = None) -> Batch:  # fmt: skip
+def sample_batch(
+    renders: RenderSet, rng: np.random.Generator, objects: int, views: int, side: int, scale: tuple[float, float],
+    patch_size: int = 8, members: np.ndarray | None = None,
+) -> Batch:  # fmt: skip
     """Draw a batch of square crops of `side` pixels whose width is a fraction `scale` (low, high) of the render's.
 
     views is 6, all of them, or 2, a pair from one side of the object. `members` fixes the objects by index.

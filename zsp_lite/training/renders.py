@@ -93,7 +93,8 @@ def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, wo
     folder.mkdir(parents=True, exist_ok=True)
     starts = range(0, objects, shard)
     with ProcessPoolExecutor(workers) as pool:
-        return list(progress(pool.map(partial(_render_shard, count=shard, folder=folder, seed=seed), starts), len(starts)))
+        paths = pool.map(partial(_render_shard, count=shard, folder=folder, seed=seed), starts)
+        return list(progress(paths, len(starts)))
 
 
 def load_render_set(paths: list[Path]) -> RenderSet:

@@ -170,13 +170,17 @@ def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 128, objec
         batch = _to(sample_batch(renders, rng, len(members), 6, side, (0.85, 1.0), members=members), device)
         with torch.autocast(device.type, torch.bfloat16):
             out = model(batch.images)
-        hits.append(correspondence_loss(model.descriptors(out.keys), batch.surface, len(members), 0.15, 0.1, 256, generator)[1])
+        _, accuracy = correspondence_loss(
+            model.descriptors(out.keys), batch.surface, len(members), 0.15, 0.1, 256, generator
+        )
+        hits.append(accuracy)
         ious.append(attention_loss(out.cls_logits.float(), batch.coverage)[1])
     return dict(held_out_accuracy=float(np.mean(hits)), held_out_iou=float(np.mean(ious)))
 
 
 def _to(batch: Batch, device) -> Batch:
-    return replace(batch, **{name: getattr(batch, name).to(device) for name in ("images", "surface", "geometry", "coverage")})
+    tensors = ("images", "surface", "geometry", "coverage")
+    return replace(batch, **{name: getattr(batch, name).to(device) for name in tensors})
 
 
 def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
@@ -186,12 +190,15 @@ def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
     return config.learning_rate * min(1, (step + 1) / 150) * decay * (0.7 if side > 128 else 1.0)
 
 
-def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
-          progress=lambda iterable, total: iterable, checkpoint_every: int = 250, log_every: int = 50) -> Path:  # fmt: skip
+def train(
+    config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
+    progress=lambda iterable, total: iterable, checkpoint_every: int = 250, log_every: int = 50,
+) -> Path:  # fmt: skip
     """Train from scratch, or resume from `folder`/checkpoint.pt, and export `folder`/zsp-tiny.safetensors.
 
-    folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights; `renders`
-    is where the training set is kept or made (default `folder`/renders). The checkpoint holds model, average, optimiser
+    folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights;
+    `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
+    its shards. The checkpoint holds model, average, optimiser
     and step; batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
     Raises InputError when `folder` holds a run of another configuration.
     """
@@ -253,7 +260,8 @@ def train(config: TrainingConfig, folder: Path, renders: Path | None = None, log
             log_file.flush()
             log("  ".join(f"{name} {value}" for name, value in row.items()))
         if step % checkpoint_every == 0 or step == config.steps:
-            state = dict(model=model.state_dict(), average=average.state_dict(), optimiser=optimiser.state_dict(), step=step)
+            state = dict(model=model.state_dict(), average=average.state_dict(), step=step)
+            state["optimiser"] = optimiser.state_dict()
             torch.save(state, checkpoint_file.with_suffix(".part"))
             checkpoint_file.with_suffix(".part").replace(checkpoint_file)
     return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
@@ -279,9 +287,9 @@ def _update_average(average: Trainee, model: Trainee, decay: float) -> None:
 def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig, path: Path) -> Path:
     """Write the backbone as float16 safetensors that any DINO code loads, and return the path.
 
-    Two exact changes: the mean key of every block is folded into its key bias (softmax attention does not see a constant
-    added to all keys, and cosine similarity of the keys becomes meaningful), and the trainer's input scaling is folded
-    into the patch embedding, so that the model expects ImageNet statistics.
+    Two exact changes: the mean key of every block is folded into its key bias (softmax attention does not see a
+    constant added to all keys, and cosine similarity of the keys becomes meaningful), and the trainer's input scaling
+    is folded into the patch embedding, so that the model expects ImageNet statistics.
     """
     backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
     backbone.load_state_dict(model.backbone.state_dict())
@@ -297,7 +305,8 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     proj.bias += (proj.weight * (mean - MEAN) / STD).sum((1, 2, 3))
     proj.weight *= std / STD
-    metadata = dict(name="zsp-tiny", patch_size=8, image_size=224, num_heads=config.num_heads, key_block=config.key_block)
+    metadata = dict(name="zsp-tiny", patch_size=8, image_size=224)
+    metadata |= dict(num_heads=config.num_heads, key_block=config.key_block)
     weights = {name: value.half().contiguous() for name, value in backbone.state_dict().items()}
     save_file(weights, path, metadata={name: str(value) for name, value in metadata.items()})
     return path
