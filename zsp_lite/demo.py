@@ -98,7 +98,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
 
 
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
-    """Camera-frame points of the pixels of the object with a measured depth, at most `most` of them.
+    """Camera-frame points of the pixels of the object with a measured depth, strays left out, at most `most` of them.
 
     The object is where the mask is above 0.5; without a mask, the patches of the foreground. Raises
     InputError where none of its pixels has a depth.
@@ -114,6 +114,9 @@ def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarra
     points = structured_point_cloud(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
+    # A soft mask's rim lets points of the background through, far behind the object.
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    points = points[distance <= 3 * np.median(distance)]
     if len(points) > most:
         points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
     return points

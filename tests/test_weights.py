@@ -1,0 +1,73 @@
+"""The shipped backbone: what is in the package, and that it is what the trainer makes by default."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from zsp_lite.backbones import TINY, load_backbone
+from zsp_lite.benchmark.run import random_backbone
+from zsp_lite.co3d import Co3D
+from zsp_lite.demo import demo_pairs
+from zsp_lite.doctor import sample_data
+from zsp_lite.pipeline import object_crop, patch_mask
+from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.synthetic.training_categories import TRAINING
+from zsp_lite.training.train import TrainingConfig
+from zsp_lite.vit import VisionTransformer
+
+
+def test_the_file_is_small_and_in_half_precision():
+    assert TINY.stat().st_size <= 12e6
+    with safe_open(TINY, "pt") as file:
+        assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
+
+
+def test_it_loads_strictly_into_a_plain_dino_transformer():
+    with safe_open(TINY, "pt") as file:
+        weights, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()
+    dim = weights["cls_token"].shape[-1]
+    model = VisionTransformer(224, 8, dim, 12, int(metadata["num_heads"]))
+    model.load_state_dict({name: value.float() for name, value in weights.items()}, strict=True)
+
+
+def test_its_configuration_is_the_trainers_default_and_its_log_is_complete():
+    config = json.loads((TINY.parent / "config.json").read_text())
+    assert config == json.loads(json.dumps(asdict(TrainingConfig())))
+    rows = [json.loads(line) for line in (TINY.parent / "log.jsonl").read_text().splitlines()]
+    assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
+
+
+def test_it_was_trained_on_none_of_the_evaluated_categories():
+    card = (TINY.parent / "MODEL_CARD.md").read_text()
+    assert all(name in card for name in TRAINING)
+    assert not TRAINING.keys() & EVALUATION.keys()
+    assert {path.name for path in sample_data().iterdir() if path.name in EVALUATION | TRAINING} <= EVALUATION.keys()
+
+
+@pytest.fixture(scope="module")
+def crops():
+    dataset = Co3D(sample_data())
+    return [
+        object_crop(dataset.load(dataset.frame(pair.category, pair.target_sequence, number)))
+        for pair in demo_pairs(dataset)
+        for number in pair.target_frames
+    ]
+
+
+def iou(backbone, crops) -> float:
+    values = []
+    for crop, found in zip(crops, backbone([crop.rgb for crop in crops]), strict=True):
+        mask, foreground = patch_mask(crop, found.grid), found.foreground()
+        values.append(float((mask & foreground).sum() / (mask | foreground).sum()))
+    return float(np.mean(values))
+
+
+def test_its_attention_finds_objects_that_it_has_never_seen(crops):
+    """The paper's rule, saliency above 0.05, on the sample categories; random weights for comparison."""
+    tiny = load_backbone("zsp-tiny", device="cpu")
+    torch.manual_seed(0)
+    assert iou(tiny, crops) > 0.7 > iou(random_backbone(tiny, 0), crops) + 0.1
