@@ -48,8 +48,7 @@ pytest.raises = raises
 
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
-    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with
-    labels.
+    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with labels.
 
     Sequence "b" stands in a world that is turned, moved and unlike that of "a", the reference of the labels.
     """

@@ -57,8 +57,8 @@ def test_mask_iou_counts_shared_patches():
 
 def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes to
-    # reference patch 0, and so comes back to target patch 0: from patch 3 that is 3 patches off, from 1.5
-    # nothing else counts.
+    # reference patch 0, and so comes back to target patch 0: that is 3 to 5 patches off,
+    # and with the default threshold of 1.5 it does not count.
     similarity = torch.zeros(6, 6)
     similarity[[0, 1, 2], [0, 1, 2]] = torch.tensor([3.0, 2.0, 2.0])
     similarity[0, 3:] = 1.0

@@ -193,8 +193,7 @@ def test_too_few_matches_fall_back_to_the_best_view_and_say_so(backbone, referen
 
 
 def test_collinear_points_fall_back_and_say_so(method, reference):
-    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a
-    # line.
+    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a line.
     flat = replace(reference, depth=np.full_like(reference.depth, 4.0))
     views = look(method.backbone, [object_crop(flat)] * 2)
     for view in views:

@@ -1,5 +1,4 @@
-"""Rigid alignment with scale: Umeyama's least squares inside RANSAC (paper eq. 4, supplement "Rigid body
-transform").
+"""Rigid alignment with scale: Umeyama's least squares inside RANSAC (paper eq. 4, supplement "Rigid body transform").
 
 All trials of RANSAC go through one batched SVD, which is what makes a thousand of them cost milliseconds.
 """
@@ -13,8 +12,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.errors import InputError
 
 # Below this ratio of the second to the first singular value of the covariance, the rotation about the points'
-# common line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is
-# wide.
+# common line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is wide.
 _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
 
@@ -94,14 +92,12 @@ def umeyama_batch(
 ]:
     """`umeyama` on a batch of point sets, unchecked: scales, rotations, translations, and conditionings.
 
-    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear
-    points.
+    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
     left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
-    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a
-    # mirror.
+    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
     flip = np.sign(np.linalg.det(left @ right))
     left[:, :, 2] *= flip[:, None]
     rotation = left @ right

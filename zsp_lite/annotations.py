@@ -40,9 +40,7 @@ class MaskAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 
 class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """PyTorch3D camera: row vectors, +x left, +y up; intrinsics in the units of `intrinsics_format`
-    (absent in v1).
-    """
+    """PyTorch3D camera: row vectors, +x left, +y up; intrinsics in the units of `intrinsics_format` (absent in v1)."""
 
     R: tuple[Triple, Triple, Triple]
     T: Triple
@@ -52,9 +50,7 @@ class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class FrameAnnotation(msgspec.Struct, frozen=True):
-    """One frame: its 0-based number in its sequence, its time (s), its files and its camera; `meta` is
-    v2's.
-    """
+    """One frame: its 0-based number in its sequence, its time (s), its files and its camera; `meta` is v2's."""
 
     sequence_name: str
     frame_number: int
@@ -120,8 +116,7 @@ class FrameIndex:
 def read_frame_index(path: Path) -> FrameIndex:
     """Open a category's frame annotations. Raises InputError where they cannot be read."""
     data = decompress(path)
-    # Two passes over the bytes, each skipping what it does not need, cost less than one that builds every
-    # frame.
+    # Two passes over the bytes, each skipping what it does not need, cost less than one that builds every frame.
     keys = decode(data, list[FrameKey], path)
     entries = msgspec.json.decode(data, type=list[msgspec.Raw])  # views into `data`, not copies
     of_sequence: dict[str, list[int]] = {}

@@ -1,8 +1,7 @@
 """Backbones by name or by checkpoint file, and what makes one: images in, one FeatureMap each out.
 
 The released DINO models (Caron et al. 2021) are plain data below; "zsp-tiny" is this project's own small
-model, part of the package. Any checkpoint in the DINO layout works by its path; its geometry is read off its
-shapes.
+model, part of the package. Any checkpoint in the DINO layout works by its path; its geometry is read off its shapes.
 """
 
 import os
@@ -104,8 +103,8 @@ class Backbone:
         """Features of (H, W, 3) images, uint8 or float in [0, 1], of any sizes, in float32 on its device.
 
         Images are resized to the model's square (224 pixels) without keeping their aspect, as in the paper.
-        Saliency is the CLS attention averaged over the saliency heads, minimum to 0, maximum to 1. Raises
-        InputError on others.
+        Saliency is the CLS attention averaged over the saliency heads, minimum
+        to 0, maximum to 1. Raises InputError on others.
         """
         features = []
         for first in range(0, len(images), self.batch_size):
@@ -190,8 +189,7 @@ def prepare_images(
 ) -> Float[Tensor, "b 3 s s"]:
     """Images (H, W, 3), uint8 or float in [0, 1], as one batch in [0, 1], resized (bilinear, antialiased).
 
-    `first` is the number of the first image in error messages. Raises InputError on other types, shapes or
-    values.
+    `first` is the number of the first image in error messages. Raises InputError on other types, shapes or values.
     """
     prepared = []
     for index, image in enumerate(images, first):

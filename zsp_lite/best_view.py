@@ -1,5 +1,4 @@
-"""Which target view to align with: the paper's correspondence score and its three alternatives (sec. 4.2,
-table 3).
+"""Which target view to align with: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
 
 Each score is a plain function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a
 `Comparison`. The view with the highest score is chosen.
@@ -53,8 +52,7 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
 
 
 def mask_iou(first: Mask, second: Mask) -> float:
-    """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two
-    foregrounds."""
+    """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two foregrounds."""
     first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
@@ -69,8 +67,7 @@ def cyclical_iou(
     to within `threshold` patches of themselves.
 
     The paper does not give its threshold; 1.5 patches takes a return to the patch itself or to one of its
-    eight neighbours. (The published code compares a rescaled map with the saliency without thresholding
-    either.)
+    eight neighbours. (The published code compares a rescaled map with the saliency without thresholding either.)
     """
     distances = cyclical_distances(
         similarity.T,

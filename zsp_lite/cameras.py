@@ -77,9 +77,7 @@ class Camera:
         )
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy
-        float64.
-        """
+        """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy float64."""
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,

@@ -80,8 +80,7 @@ class Co3D:
         point_cloud_quality: float = 0.3,
         top: int | None = 10,
     ) -> list[SequenceAnnotation]:
-        """The sequences worth labelling: both scores above their bounds, best point clouds first, at most
-        `top`.
+        """The sequences worth labelling: both scores above their bounds, best point clouds first, at most `top`.
 
         The paper's supplementary, "Labelled categories"; a score that is not given passes no bound.
         """
@@ -117,8 +116,8 @@ class Co3D:
         """The frame's image, camera and, where annotated, depth and mask.
 
         Depth is unknown (0) where its file or its depth mask says so. Raises InputError where the annotation
-        has no viewpoint, a path leaves the data folder, or a file is missing, corrupt or of another size than
-        annotated.
+        has no viewpoint, a path leaves the data folder, or a file is missing,
+        corrupt or of another size than annotated.
         """
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         view, size = annotation.viewpoint, annotation.image.size
@@ -153,8 +152,7 @@ class Co3D:
         raise InputError(f"category {category} has no sequence {sequence!r}")
 
     def set_lists(self, category: str) -> dict[str, dict[str, list[tuple[str, int, str]]]]:
-        """The published splits, {file stem: {subset: [(sequence, frame number, image path), ...]}}, {}
-        without any.
+        """The published splits, {file stem: {subset: [(sequence, frame number, image path), ...]}}, {} without any.
 
         v1 has one `set_lists.json`, v2 a folder `set_lists/` of them.
         """

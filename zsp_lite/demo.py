@@ -1,6 +1,4 @@
-"""One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks
-reuse.
-"""
+"""One pair of every sample category, from folder to pose: what `zsp-lite demo` shows and the notebooks reuse."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,8 +25,7 @@ _SEQUENCE_FRAMES = 6
 @dataclass(frozen=True, eq=False)
 class DemoResult:
     """One pair and its estimate. `error`: rotation error in degrees; `seconds`: for the whole estimate, from
-    frames in memory; `sequence`: whole frames spread over the target sequence, which the pose is propagated
-    to.
+    frames in memory; `sequence`: whole frames spread over the target sequence, which the pose is propagated to.
     """
 
     pair: Pair

@@ -1,6 +1,4 @@
-"""What is installed, what is at hand, where data is looked for, and the command that mends what is
-missing.
-"""
+"""What is installed, what is at hand, where data is looked for, and the command that mends what is missing."""
 
 import importlib.metadata
 import importlib.util
@@ -33,9 +31,7 @@ class Check:
 
 
 def examine(data: Path | None = None) -> list[Check]:
-    """All checks, in the order in which one would mend them. `data`: a CO3D folder to look at besides the
-    usual ones.
-    """
+    """All checks, in the order in which one would mend them. `data`: a CO3D folder besides the usual ones."""
     return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_data(data), _jupyter()]
 
 
@@ -53,17 +49,13 @@ def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
 
 
 def sample_data() -> Path:
-    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is
-    in.
-    """
+    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is in."""
     here = Path("data_samples")
     return here if here.is_dir() else REPOSITORY / "data_samples"
 
 
 def compare(requirement: Requirement, installed: str | None, pinned: str | None) -> Check:
-    """The state of one package: its installed version against the range it must be in and the version tested
-    with.
-    """
+    """The state of one package: its installed version against the range it must be in and the version tested with."""
     name, mend = requirement.name, f"{_pip()} install '{requirement.name}{requirement.specifier}'"
     if installed is None:
         return Check(name, BAD, f"not installed, expected {requirement.specifier or 'any version'}", mend)
@@ -76,9 +68,7 @@ def compare(requirement: Requirement, installed: str | None, pinned: str | None)
 
 
 def read_pins(text: str) -> dict[str, str]:
-    """Package name (lower case) to version, from a requirements file of exact pins; other lines are passed
-    over.
-    """
+    """Package name (lower case) to version, from a requirements file of exact pins; other lines are passed over."""
     pins = {}
     for line in text.splitlines():
         try:

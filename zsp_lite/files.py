@@ -34,9 +34,7 @@ def read_bytes(path: str | Path, what: str) -> bytes:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """`root / relative`, resolved; InputError where that leaves `root` (by `..`, an absolute path or a
-    link).
-    """
+    """`root / relative`, resolved; InputError where that leaves `root` (by `..`, an absolute path or a link)."""
     resolved_root = Path(root).resolve()
     try:
         resolved = (resolved_root / relative).resolve()

@@ -1,8 +1,8 @@
 """Pose labels in the upstream form, and the ground-truth relative pose that they give with the cameras.
 
 A label is a rigid motion (unit scale, column vectors) from the point cloud of the category's reference
-sequence into the world of its own sequence; the reference sequence has the identity. Files:
-ROOT/class_labels/CATEGORY/SEQ.json.
+sequence into the world of its own sequence; the reference sequence has the
+identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
 """
 
 import json
@@ -21,7 +21,6 @@ from zsp_lite.files import plain_name, read_bytes, write_atomic
 # Labels are printed numbers; what deviates more than this from a rotation is no rigid motion.
 _RIGID_TOLERANCE = 1e-3
 
-
 _Row = tuple[float, float, float, float]
 
 
@@ -33,10 +32,7 @@ class _LabelFile(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """`trans` (4, 4) takes points of `reference_seq`'s cloud into `seq`'s world.
-
-    InputError where it is not rigid.
-    """
+    """`trans` (4, 4) takes points of `reference_seq`'s cloud into `seq`'s world. InputError where it is not rigid."""
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -106,8 +102,7 @@ def relative_pose(
     """Ground truth: what takes points of reference camera a's frame to target camera b's frame.
 
     `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`: the supplementary's composition, whose matrices act on row
-    vectors and so stand in the other order. Raises InputError where the labels belong to different reference
-    sequences.
+    vectors and so stand in the other order. Raises InputError where the labels belong to different reference sequences.
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(

@@ -222,8 +222,7 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
     """k-means labels of m points known by their inner products.
 
     The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
-    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only
-    faster.
+    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only faster.
     """
     values, vectors = np.linalg.eigh(gram)
     points = vectors * np.sqrt(np.maximum(values, 0.0))

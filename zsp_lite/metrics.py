@@ -1,5 +1,4 @@
-"""Errors of an estimated pose, and what to say about many of them (paper sec. 5.1, supplement "evaluation
-metrics")."""
+"""Errors of an estimated pose, and what to say about many of them (paper sec. 5.1, supplement "evaluation metrics")."""
 
 from collections.abc import Callable
 from math import comb
@@ -34,8 +33,7 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
 
 
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
-    """Euclidean distance between translations (..., 3), in their unit.  Raises InputError for other
-    shapes."""
+    """Euclidean distance between translations (..., 3), in their unit.  Raises InputError for other shapes."""
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if first.shape[-1:] != (3,) or second.shape[-1:] != (3,):
         raise InputError(f"translation_error: shapes {first.shape} and {second.shape}, expected (..., 3)")
@@ -43,8 +41,7 @@ def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float
 
 
 def accuracy(errors: ArrayLike, threshold: float) -> np.ndarray | float:
-    """Percentage of errors (..., n) strictly below the threshold, over the last axis: Acc30 is
-    threshold=30."""
+    """Percentage of errors (..., n) strictly below the threshold, over the last axis: Acc30 is threshold=30."""
     return 100 * np.mean(_errors(errors) < threshold, axis=-1)
 
 
@@ -74,8 +71,7 @@ def bootstrap_ci(
 def summarise(errors: ArrayLike, seed: int | np.random.Generator = 0) -> dict:
     """The paper's figures for rotation errors (n,) in degrees, with 95 % bootstrap intervals.
 
-    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), and for each of the three NAME_ci: [low,
-    high]}.
+    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), and for each of the three NAME_ci: [low, high]}.
     Raises InputError where there is nothing to summarise.
     """
     errors = _errors(errors)

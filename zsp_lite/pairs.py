@@ -1,6 +1,6 @@
 """Evaluation pairs: one reference frame of a sequence against N target frames of another in its category.
 
-The paper's section 4, "Evaluation setting". Pairs are sampled here or read from upstream's evaluation sets,
+The paper's section 5.1, "Evaluation setting". Pairs are sampled here or read from upstream's evaluation sets,
 torch files whose ids are positions in the category's frame list.
 """
 
@@ -52,8 +52,8 @@ def sample_pairs(
     The reference goes round the category's labelled sequences in sorted order, the target is another of them
     at random; the reference frame is random, the target frames are evenly spaced over the sequence from a
     random start, in that order. An integer seed gives each category its own draws, and its first n pairs
-    whatever the n. Raises InputError on fewer than two labelled sequences or a sequence of fewer than
-    `n_targets` frames.
+    whatever the n. Raises InputError on fewer than two labelled sequences or a
+    sequence of fewer than `n_targets` frames.
     """
     if n < 1 or n_targets < 1:
         raise InputError(f"pairs to sample are {n} with {n_targets} targets each, expected at least 1 and 1")

@@ -40,8 +40,7 @@ class View:
 
     @cached_property
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether a measured depth stands behind it (see
-        `depth.patch_points`).
+        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
 
         Worked out when first asked for: of N target views only the chosen one's are needed.
         Raises InputError where the frame has no known depth.
@@ -106,8 +105,7 @@ class ZeroShotPose:
 
     k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 4.1).
     view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in
-    scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground
-    above it.
+    scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
     foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
     cycle_from: "reference" as in the paper, or "target" as in its published code.
     Raises InputError for a setting out of its range.
@@ -143,8 +141,7 @@ class ZeroShotPose:
         A frame without a mask is taken whole. Where the matches of the best view cannot carry a fit (fewer
         than sample_size, collinear, or of no plausible scale) the estimate is the best view itself: identity
         rotation, translation and scale from the foregrounds' centroids and spreads, and a flag that says so.
-        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen
-        target.
+        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen target.
         """
         timings: dict[str, float] = {}
         with _timed(timings, "crop"):
@@ -231,8 +228,7 @@ def frame_view(
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
-    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a
-    mask."""
+    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
     if frame.mask is None:
         raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
     covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)

@@ -1,8 +1,7 @@
 """Pictures of every stage, as primitives that are put on top of each other.
 
 First `show_images` draws images side by side; then add to its axes: `overlay_map`, `mark`, `draw_points`,
-`draw_axes`. `draw_matches` draws two images and the lines between them. Colours are safe for colour-blind
-readers.
+`draw_axes`. `draw_matches` draws two images and the lines between them. Colours are safe for colour-blind readers.
 """
 
 from collections.abc import Callable, Sequence
@@ -94,9 +93,7 @@ def overlay_map(
 
 
 def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
-    """Frame the image of `axis` and write `text` into its corner: the marked one differs by more than its
-    colour.
-    """
+    """Frame the image of `axis` and write `text` into its corner: the marked one differs by more than its colour."""
     axis.add_patch(
         Rectangle(
             (0, 0), 1, 1, transform=axis.transAxes, fill=False, edgecolor=colour, linewidth=5, zorder=10
@@ -110,9 +107,7 @@ def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
 def patch_centres(
     cells: Integer[np.ndarray, "n 2"], grid: tuple[int, int], size: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixels (x, y) of the centres of patches (row, col) of a (rows, cols) grid over an image of size (H,
-    W).
-    """
+    """Pixels (x, y) of the centres of patches (row, col) of a (rows, cols) grid over an image of size (H, W)."""
     scale = np.array([size[1] / grid[1], size[0] / grid[0]])
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
@@ -171,8 +166,7 @@ def pca_colours(
     """Feature maps as colours: their first three principal components, the same ones for all maps, in [0, 1].
 
     Like colours mean like features, across images too. The components and their range are those of the
-    `foreground` where it is given; all else is white. Raises InputError where fewer than three patches are
-    left.
+    `foreground` where it is given; all else is white. Raises InputError where fewer than three patches are left.
     """
     features = [np.asarray(features, dtype=np.float64) for features in maps]
     if foreground is None:
@@ -203,8 +197,7 @@ def draw_points(
 ) -> None:
     """Camera-frame points over the image of `axis`, as `camera` sees them; those behind it are left out.
 
-    Far points are drawn first, so that near ones cover them. `colours` is one colour or an (n, 3) array in
-    [0, 1].
+    Far points are drawn first, so that near ones cover them. `colours` is one colour or an (n, 3) array in [0, 1].
     """
     points = np.asarray(points, dtype=np.float64)
     order = np.argsort(-points[:, 2])

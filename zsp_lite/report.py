@@ -1,6 +1,4 @@
-"""The demo as one HTML page that needs nothing beside itself: pictures inline, plotly's script inline
-once.
-"""
+"""The demo as one HTML page that needs nothing beside itself: pictures inline, plotly's script inline once."""
 
 import base64
 import html
@@ -51,9 +49,7 @@ img { max-width: 100%; height: auto; display: block; }
 def write_report(
     path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str
 ) -> Path:
-    """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in
-    it.
-    """
+    """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in it."""
     path = Path(path)
     write_atomic(path, page(results, data, data_note, backbone).encode())
     return path

@@ -7,9 +7,7 @@ from jaxtyping import Real
 from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, ORANGE
 
-MAX_POINTS = (
-    4000  # of both clouds together: beyond that browsers and notebooks grow heavy and nothing more is seen
-)
+MAX_POINTS = 4000  # of both clouds together: beyond that browsers and notebooks grow heavy and nothing more is seen
 
 
 def aligned_clouds(
@@ -19,8 +17,7 @@ def aligned_clouds(
     title: str | None = None,
     seed: int = 0,
 ) -> go.Figure:
-    """Two clouds in one frame: the reference after its Sim3, and the target, both in the target camera's
-    frame.
+    """Two clouds in one frame: the reference after its Sim3, and the target, both in the target camera's frame.
 
     The view is the target camera's, moved a little aside: +x right, +y down, +z away. At most 4,000 points
     are drawn, chosen with `seed`. Besides the colour the symbols differ. Raises InputError on an empty cloud
@@ -64,9 +61,7 @@ def aligned_clouds(
 
 
 def _axes(clouds: list[np.ndarray]) -> list[tuple[str, str, list[float]]]:
-    """Name, label and one common span for each axis, from the middle 98 % of the points: strays must not
-    shrink all.
-    """
+    """Name, label and one common span for each axis, from the middle 98 % of the points: strays must not shrink all."""
     low, high = np.percentile(np.concatenate(clouds), [1, 99], axis=0)
     centre, half = (low + high) / 2, 0.6 * float((high - low).max())
     labels = ("x (right)", "y (down)", "z (away)")

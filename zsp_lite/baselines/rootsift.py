@@ -17,8 +17,8 @@ class RootSift:
     (Arandjelovic and Zisserman 2012): the square root of the L1-normalised histogram, whose dot products are
     Hellinger kernels. A keypoint `keypoint_size` pixels wide has 4 x 4 cells of 1.5 times that side, so the
     default of 24 describes a patch by most of the object around it.
-    SIFT knows no foreground: callers give masks, or take the whole image. The global feature is the mean
-    descriptor, normalised.
+    SIFT knows no foreground: callers give masks, or take the whole image. The
+    global feature is the mean descriptor, normalised.
     """
 
     name = "rootsift"

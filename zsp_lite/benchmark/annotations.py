@@ -20,15 +20,13 @@ from pathlib import Path
 from zsp_lite.co3d import Co3D
 
 def memory(field):
-    # ru_maxrss starts at the parent's size on Linux, where a child inherits it; /proc knows this process
-    # alone.
+    # ru_maxrss starts at the parent's size on Linux, where a child inherits it; /proc knows this process alone.
     try:
         status = Path("/proc/self/status").read_text()
         return int(next(line.split()[1] for line in status.splitlines() if line.startswith(field))) / 1024
     except OSError:
         import resource
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else
-        1024)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
 
 before = memory("VmRSS:")
 start = time.perf_counter()
@@ -47,8 +45,8 @@ def annotation_benchmark(frames: int = 86_000) -> dict:
 
     Returns `frames`; `seconds` to open the category (decompress and index it); `sequence_seconds` to decode
     one sequence of it; `json_mb`, the size of the decompressed JSON; `memory_mb`, the process's peak beyond
-    what it had before; and `extra_memory_mb`, that peak less the JSON itself. A megabyte is 2^20 bytes. Needs
-    Linux or macOS.
+    what it had before; and `extra_memory_mb`, that peak less the JSON itself. A
+    megabyte is 2^20 bytes. Needs Linux or macOS.
     """
     with tempfile.TemporaryDirectory() as root:
         size = _write_category(Path(root), frames)

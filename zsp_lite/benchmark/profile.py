@@ -33,8 +33,7 @@ N_TARGETS = 5
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure. `limit` is what it has to keep: at most where `at_most`, else at least; None for
-    none."""
+    """One measured figure. `limit` is what it has to keep: at most where `at_most`, else at least; None for none."""
 
     name: str
     value: float
@@ -70,8 +69,7 @@ def profile(repeats: int = 5) -> Iterator[Row]:
 
 
 def stage_rows(repeats: int = 5) -> list[Row]:
-    """Median seconds of each stage of one estimate (N = 5, K = 50), and all but the forward as a share of
-    it."""
+    """Median seconds of each stage of one estimate (N = 5, K = 50), and all but the forward as a share of it."""
     method = ZeroShotPose(random_vits8())
     reference, *targets = made_up_frames(1 + N_TARGETS)
     method.estimate(reference, targets)  # the first run pays for allocations and lazy imports
@@ -86,11 +84,9 @@ def stage_rows(repeats: int = 5) -> list[Row]:
 
 
 def similarity_rows(repeats: int = 5, tokens: int = 8) -> list[Row]:
-    """The log-binned similarity of a reference with 5 targets, against a cosine per token of materialised
-    descriptors.
+    """The log-binned similarity of a reference with 5 targets, against a cosine per token of materialised descriptors.
 
-    The loop is timed on `tokens` of the 784 reference tokens and scaled up; making the descriptors is not
-    counted.
+    The loop is timed on `tokens` of the 784 reference tokens and scaled up; making the descriptors is not counted.
     """
     generator = torch.Generator().manual_seed(0)
     keys = [torch.randn(28, 28, 384, generator=generator) for _ in range(1 + N_TARGETS)]
@@ -127,8 +123,7 @@ def ransac_rows(repeats: int = 5) -> list[Row]:
 def ransac_by_loop(
     source: np.ndarray, target: np.ndarray, threshold: float = 0.2, trials: int = 1000, seed: int = 0
 ) -> np.ndarray:
-    """RANSAC as one writes it down, with the same fit: sample, fit, count, keep the best.  Returns the
-    inliers (N,)."""
+    """RANSAC as one writes it down, with the same fit: sample, fit, count, keep the best.  Returns the inliers (N,)."""
     rng = np.random.default_rng(seed)
     best = np.zeros(len(source), dtype=bool)
     for _ in range(trials):
@@ -193,8 +188,7 @@ def random_vits8() -> Backbone:
 
 
 def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) -> list[Frame]:
-    """Frames of a textured ellipsoid on a plain ground, with its mask, and depth with a third of its pixels
-    unknown."""
+    """Frames of a textured ellipsoid on a plain ground, with its mask, and depth with a third of its pixels unknown."""
     rng = np.random.default_rng(seed)
     height, width = size
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, float(width)), np.array([width, height]) / 2, size)
@@ -214,8 +208,7 @@ def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) ->
 
 
 def _median_seconds(works: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median wall time of each; they take turns, so that whatever else the machine does meets all of them
-    alike."""
+    """Median wall time of each; they take turns, so that whatever else the machine does meets all of them alike."""
     times = np.empty((repeats, len(works)))
     for work in works:
         work()

@@ -1,8 +1,8 @@
 """Rotation errors of methods over many pairs of a CO3D-format folder with pose labels (paper sec. 5).
 
 Features are computed once per frame and shared by every pair and method. A finished pair is a line of
-OUT/pairs.jsonl at once, so that an interrupted run goes on where it stopped; OUT/summary.json is made of
-those lines alone.
+OUT/pairs.jsonl at once, so that an interrupted run goes on where it stopped;
+OUT/summary.json is made of those lines alone.
 """
 
 import hashlib
@@ -41,8 +41,7 @@ _FAILED = 180.0
 class Method:
     """A row of the table.
 
-    features: what describes the images: the backbone under test, one of its shape with random weights, or
-    RootSIFT.
+    features: what describes the images: the backbone under test, one of its shape with random weights, or RootSIFT.
     answer: the fitted pose, the best view taken as it is ("Ours-BV"), or the pose fitted in the target view
     that is truly nearest in rotation.  settings: of `ZeroShotPose`, where they differ from the paper's.
     """
@@ -82,8 +81,7 @@ def evaluate(
     progress(done, total): called after each pair.
     Per-pair seeds come from the pair's key, so results do not depend on order. Running again with the same
     arguments continues, with other methods adds them.
-    Raises InputError for unknown methods or categories, missing labels or files, and an OUT that holds
-    another run.
+    Raises InputError for unknown methods or categories, missing labels or files, and an OUT that holds another run.
     """
     dataset = Co3D(root)
     categories = list(categories or dataset.categories())
@@ -127,8 +125,7 @@ def evaluate(
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """The first n pairs of the folder's own evaluation set for n_targets, where it holds so many; else n
-    sampled."""
+    """The first n pairs of the folder's own evaluation set for n_targets, where it holds so many; else n sampled."""
     for path in sorted(Path(dataset.root).glob(f"determ_eval/*samples_{n_targets}tgt/{category}.pt")):
         shipped = read_upstream_pairs(path, dataset)
         if len(shipped) >= n:
@@ -140,8 +137,8 @@ def summarise_run(records: Sequence[dict], methods: Sequence[str], data: dict, b
     """The summary of finished pairs: figures per method and category, saliency, and median seconds per stage.
 
     "median", "acc30" and "acc15" are over all pairs; "mean_category_median" is the paper's way of averaging
-    medians. "against_ours": paired tests of "ours" against each other method.  "saliency_iou": mean over the
-    frames used.
+    medians. "against_ours": paired tests of "ours" against each other method.
+    "saliency_iou": mean over the frames used.
     """
     errors = {name: np.array([record["methods"][name]["error"] for record in records]) for name in methods}
     category_of = np.array([record["category"] for record in records])
@@ -205,8 +202,7 @@ def _merge(record: dict, line: dict) -> None:
 
 
 class _Views:
-    """The category's frames as views, each cropped and described once; kept while the category is worked
-    on."""
+    """The category's frames as views, each cropped and described once; kept while the category is worked on."""
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Extractor]):
         self.dataset, self.category, self.extractors = dataset, category, extractors
@@ -217,8 +213,7 @@ class _Views:
         self.seconds_per_frame: float | None = None
 
     def load(self, keys: Sequence[tuple[str, int]]) -> None:
-        """Read and crop frames. A file that cannot be read is an error; one without an object fails its
-        pairs."""
+        """Read and crop frames. A file that cannot be read is an error; one without an object fails its pairs."""
         for key in keys:
             if key not in self.frames:
                 frame = self.dataset.load(self.dataset.frame(self.category, *key))
@@ -354,8 +349,7 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
 
 
 def _fingerprint(backbone: Extractor) -> str:
-    """The backbone's name and a hash of its weights: retrained weights of the same name are another
-    backbone."""
+    """The backbone's name and a hash of its weights: retrained weights of the same name are another backbone."""
     name = getattr(backbone, "name", type(backbone).__name__)
     if not isinstance(backbone, Backbone):
         return name

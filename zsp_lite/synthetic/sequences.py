@@ -51,8 +51,7 @@ def handheld_sweep(
     """`frames` cameras of (height, width) `size` once around the object, in the frame of its vertices.
 
     The walk starts anywhere and goes either way; height, distance, aim and roll drift and shake. One focal
-    length for all, so that the object fills 55 to 75 % of the shorter image side in the typical view and is
-    never cut.
+    length for all, so that the object fills 55 to 75 % of the shorter image side in the typical view and is never cut.
     """
     rng = np.random.default_rng(seed)
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames

@@ -2,8 +2,8 @@
 
 The recipe, in the order of the stages: first the patch tokens learn geometry, for correspondence alone drowns in
 its own gradient noise when it starts from nothing; then correspondence takes over at 96 px, where crops are
-cheap; last come larger crops, up to the size that the method uses. An exponential average of the weights is what is
-evaluated and exported.
+cheap; last come larger crops, up to the size that the method uses. An exponential
+average of the weights is what is evaluated and exported.
 """
 
 import json
@@ -198,8 +198,8 @@ def train(
 
     folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights;
     `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
-    its shards. The checkpoint holds model, average, optimiser
-    and step; batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
+    its shards. The checkpoint holds model, average, optimiser and step; batches depend only on (seed, step), so a
+    resumed run continues as if nothing had happened.
     Raises InputError when `folder` holds a run of another configuration.
     """
     folder = Path(folder)
