@@ -41,16 +41,13 @@ def test_the_relative_pose_of_a_view_to_itself_is_the_identity(seed):
     np.testing.assert_allclose(relative_pose(label, camera, label, camera), np.eye(4), atol=1e-9)
 
 
-def test_the_relative_pose_agrees_with_the_papers_row_vector_composition():
+def test_the_relative_pose_is_the_papers_composition_from_left_to_right():
     labels, cameras = [random_label(1), random_label(2, "b")], [random_camera(1), random_camera(2)]
-    (row_a, row_b), (cam_a, cam_b) = (
-        [label.trans.T for label in labels],
-        [camera.matrix.T for camera in cameras],
-    )
-    paper = np.linalg.inv(cam_a) @ np.linalg.inv(row_a) @ row_b @ cam_b
-    np.testing.assert_allclose(
-        relative_pose(labels[0], cameras[0], labels[1], cameras[1]).T, paper, atol=1e-12
-    )
+    point = np.array([0.3, -0.2, 1.5, 1.0])  # seen by camera a
+    for step in (np.linalg.inv(cameras[0].matrix), np.linalg.inv(labels[0].trans), labels[1].trans, cameras[1].matrix):
+        point = step @ point
+    pose = relative_pose(labels[0], cameras[0], labels[1], cameras[1])
+    np.testing.assert_allclose(pose @ [0.3, -0.2, 1.5, 1.0], point, atol=1e-12)
 
 
 def test_labels_of_different_references_have_no_relative_pose():

@@ -8,7 +8,14 @@ from co3d_folders import edit_json, sequence_data
 from zsp_lite.co3d import Co3D, write_co3d
 from zsp_lite.errors import InputError
 from zsp_lite.labels import PoseLabel, write_label
-from zsp_lite.pairs import Pair, read_upstream_pairs, sample_pairs, upstream_pairs_path, write_upstream_pairs
+from zsp_lite.pairs import (
+    Pair,
+    read_upstream_pairs,
+    sample_pairs,
+    shipped_pairs,
+    upstream_pairs_path,
+    write_upstream_pairs,
+)
 
 NAMES = ["s3", "s1", "s2"]
 
@@ -130,6 +137,22 @@ def test_upstream_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
     assert pair.target_frames == tuple(frames[position].frame_number for position in given["all_target_id"])
 
 
+@pytest.mark.parametrize("place", ["", "data"])
+def test_a_folders_own_pairs_are_found_where_this_library_and_upstream_keep_them(tmp_path, place):
+    names = ("a", "b")
+    write_co3d(tmp_path, "chair", [sequence_data(name) for name in names])
+    for name in names:
+        write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
+    dataset = Co3D(tmp_path)
+    assert shipped_pairs(dataset, "chair", 2) == []
+    pairs = sample_pairs(dataset, "chair", 5, 2, seed=8)
+    for n in (3, 5):
+        write_upstream_pairs(upstream_pairs_path(tmp_path / place, "chair", n, 2), pairs[:n], dataset)
+    assert shipped_pairs(dataset, "chair", 2) == pairs[:3]
+    assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs
+    assert shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
+
+
 class Dangerous:
     def __reduce__(self):
         return os.system, ("echo executed > executed",)
@@ -165,6 +188,8 @@ def test_what_is_no_pair_list_is_refused(dataset, tmp_path):
         ({"reference_frame_id": "3"}, "frame id is '3'"),
         ({"all_target_id": []}, "all_target_id"),
         ({"all_target_id": 3}, "all_target_id"),
+        ({"all_target_id": torch.tensor(3)}, "all_target_id"),
+        ({"all_target_id": torch.tensor([[1, 2]])}, r"frame id is \[1, 2\]"),
         ({"target_seq_name": "s3"}, "expected s3"),
         ({"class": "sofa"}, "category 'sofa'"),
     ],

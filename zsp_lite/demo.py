@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +14,7 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame
 from zsp_lite.labels import read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import Pair, read_upstream_pairs, sample_pairs
+from zsp_lite.pairs import Pair, sample_pairs, shipped_pairs
 from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
 
 N_TARGETS = 5
@@ -46,9 +45,8 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
         raise InputError(f"{dataset.root}: no category found, expected folders with frame_annotations.jgz")
     pairs = []
     for category in categories:
-        shipped = sorted(Path(dataset.root).glob(f"determ_eval/*samples_{n_targets}tgt/{category}.pt"))
-        read = read_upstream_pairs(shipped[0], dataset) if shipped else []
-        pairs.append((read or sample_pairs(dataset, category, 1, n_targets, seed=0))[0])
+        shipped = shipped_pairs(dataset, category, n_targets)
+        pairs.append((shipped or sample_pairs(dataset, category, 1, n_targets, seed=0))[0])
     return pairs
 
 

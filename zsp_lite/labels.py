@@ -101,8 +101,8 @@ def relative_pose(
 ) -> Float[np.ndarray, "4 4"]:
     """Ground truth: what takes points of reference camera a's frame to target camera b's frame.
 
-    `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`: the supplementary's composition, whose matrices act on row
-    vectors and so stand in the other order. Raises InputError where the labels belong to different reference sequences.
+    `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)` ("Labelling pose for evaluation" in the supplementary, which writes
+    the composition from left to right). Raises InputError where the labels belong to different reference sequences.
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(

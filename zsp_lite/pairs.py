@@ -91,6 +91,20 @@ def upstream_pairs_path(root: str | Path, category: str, n: int, n_targets: int)
     return folder / f"{plain_name(category, 'category')}.pt"
 
 
+def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
+    """The data folder's own pairs with `n_targets` targets, from the first set of so many; [] where it has none.
+
+    Sets lie in ROOT/determ_eval or, as upstream has them, in ROOT/data/determ_eval. Raises InputError as
+    `read_upstream_pairs`.
+    """
+    name = f"determ_eval/*samples_{n_targets}tgt/{plain_name(category, 'category')}.pt"
+    for path in [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]:
+        pairs = read_upstream_pairs(path, dataset)
+        if len(pairs) >= at_least:
+            return pairs
+    return []
+
+
 def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     """The pairs of one upstream evaluation file, whose ids are positions in `dataset.frame_list(category)`.
 
@@ -113,7 +127,8 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
                 f"{where}: missing {', '.join(missing)}, expected a dict of {', '.join(_FIELDS)}"
             )
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)
-        if not isinstance(target_ids, (list, tuple, torch.Tensor)) or len(target_ids) == 0:
+        target_ids = target_ids.tolist() if isinstance(target_ids, torch.Tensor) else target_ids
+        if not isinstance(target_ids, (list, tuple)) or not target_ids:
             raise InputError(
                 f"{where}: all_target_id is {target_ids!r}, expected positions in the frame list"
             )
