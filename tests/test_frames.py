@@ -173,6 +173,15 @@ def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path)
     (tmp_path / "image.jpg").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="expected a complete JPEG"):
         read_image(tmp_path / "image.jpg")
+    # The same with a preview inside its header, which is a complete JPEG.
+    write_image(tmp_path / "preview.jpg", np.zeros((8, 8, 3), np.uint8))
+    preview = b"Exif\0\0" + (tmp_path / "preview.jpg").read_bytes()
+    header = b"\xff\xe1" + (len(preview) + 2).to_bytes(2, "big") + preview
+    (tmp_path / "image.jpg").write_bytes(data[:2] + header + data[2:])
+    assert read_image(tmp_path / "image.jpg").shape == (64, 64, 3)
+    (tmp_path / "image.jpg").write_bytes(data[:2] + header + data[2 : len(data) // 2])
+    with pytest.raises(InputError, match="expected a complete JPEG"):
+        read_image(tmp_path / "image.jpg")
 
 
 def test_an_8_bit_picture_is_no_depth(tmp_path):

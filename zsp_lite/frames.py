@@ -188,10 +188,12 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
 
 def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
-    # Decoders fill what a cut-off file lacks with grey and return it: look for the format's end mark as well.
-    ends = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(data[:2], b"")
+    # Decoders fill what a cut-off file lacks with grey and return it: look for the format's end mark as well, behind
+    # the last start of pixels, for a JPEG's preview has an end mark of its own.
+    starts, ends = {b"\xff\xd8": (b"\xff\xda", b"\xff\xd9"), b"\x89P": (b"IDAT", b"IEND")}.get(data[:2], (b"", b""))
+    complete = data and (not ends or data.rfind(ends) > data.rfind(starts))
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and ends in data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
     except cv2.error:  # a header that promises more pixels than OpenCV accepts
         image = None
     if image is None:
