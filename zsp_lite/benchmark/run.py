@@ -27,7 +27,7 @@ from zsp_lite.files import write_atomic
 from zsp_lite.frames import Frame
 from zsp_lite.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.metrics import median, paired_test, rotation_error, summarise, translation_error
-from zsp_lite.pairs import Pair, read_upstream_pairs, sample_pairs
+from zsp_lite.pairs import Pair, sample_pairs, shipped_pairs
 from zsp_lite.pipeline import View, ZeroShotPose, frame_view, object_crop, patch_mask, view_alignment
 from zsp_lite.vit import VisionTransformer
 
@@ -126,11 +126,8 @@ def evaluate(
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
     """The first n pairs of the folder's own evaluation set for n_targets, where it holds so many; else n sampled."""
-    for path in sorted(Path(dataset.root).glob(f"determ_eval/*samples_{n_targets}tgt/{category}.pt")):
-        shipped = read_upstream_pairs(path, dataset)
-        if len(shipped) >= n:
-            return shipped[:n]
-    return sample_pairs(dataset, category, n, n_targets, seed)
+    shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
+    return shipped[:n] or sample_pairs(dataset, category, n, n_targets, seed)
 
 
 def summarise_run(records: Sequence[dict], methods: Sequence[str], data: dict, backbone: str) -> dict:
@@ -198,7 +195,10 @@ def read_records(path: Path) -> dict[str, dict]:
 
 def _merge(record: dict, line: dict) -> None:
     methods = record.get("methods", {}) | line["methods"]
-    record.update(line, methods=methods, saliency_iou=record.get("saliency_iou", {}) | line["saliency_iou"])
+    iou = record.get("saliency_iou", {}) | line["saliency_iou"]
+    # A later line of the pair, for other methods, need not have described its frames again.
+    seconds = line["seconds_per_frame"] or record.get("seconds_per_frame")
+    record.update(line, methods=methods, saliency_iou=iou, seconds_per_frame=seconds)
 
 
 class _Views:
