@@ -6,9 +6,14 @@ from functools import wraps
 
 import pytest
 from beartype import BeartypeConf, beartype
+from hypothesis import settings
 from jaxtyping import config, install_import_hook
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures are drawn, never shown
+
+# An example's time says more about what else the machine does than about the library.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 # An int is fine where a float is asked for.
 typechecker = beartype(conf=BeartypeConf(is_pep484_tower=True))
