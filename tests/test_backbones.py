@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from zsp_lite import backbones
-from zsp_lite.backbones import Backbone, Release, available_backbones, load_backbone, prepare_images
+from zsp_lite.backbones import Backbone, Release, available_backbones, load_backbone, prepare_images, verify
 from zsp_lite.download import fetch
 from zsp_lite.errors import InputError
 from zsp_lite.vit import VisionTransformer
@@ -382,6 +382,22 @@ def test_dino_models_come_from_the_server_into_the_cache(server, vit, pictures, 
     assert loaded.name == "dino_vits8"
     assert available_backbones()["dino_vits8"] == tmp_path / "cache" / "vit.pth"
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+
+
+def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
+    torch.save(small_vit(num_heads=1).state_dict(), tmp_path / "vit.pth")
+    content = (tmp_path / "vit.pth").read_bytes()
+    monkeypatch.setitem(
+        backbones.RELEASES, "dino_vits16", Release("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+    )
+    verify("dino_vits16")
+    torch.save(small_vit(num_heads=1, seed=1).state_dict(), tmp_path / "vit.pth")  # as long, and loads as well
+    with pytest.raises(InputError, match="not the released file.*weights fetch dino_vits16"):
+        verify("dino_vits16")
+    (tmp_path / "vit.pth").unlink()
+    with pytest.raises(InputError, match="not at hand"):
+        verify("dino_vits16")
 
 
 @pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])

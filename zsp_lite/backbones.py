@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from zsp_lite.checkpoints import build_vit, read_checkpoint
-from zsp_lite.download import cache_folder, fetch
+from zsp_lite.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.vit import VisionTransformer
@@ -182,6 +182,22 @@ def download(name: str) -> Path:
         raise InputError(
             f"{name}: {error}; fetch that file elsewhere and put it at {release.path}, or use zsp-tiny"
         ) from error
+
+
+def verify(name_or_path: str | Path) -> None:
+    """Raises InputError where a backbone is not at hand, not the released file, damaged, or of another layout."""
+    name = str(name_or_path)
+    backbones = available_backbones()
+    if name in backbones and backbones[name] is None:
+        raise InputError(f"{name} is not at hand; zsp-lite weights fetch {name}")
+    release = RELEASES.get(name)
+    if release is not None and not has_size_and_hash(release.path, release.size, release.md5_prefix):
+        raise InputError(
+            f"{name}: {release.path} is not the released file, expected "
+            f"{release.size or 'any number of'} bytes with MD5 {release.md5_prefix}...; "
+            f"remove it, then zsp-lite weights fetch {name}"
+        )
+    load_backbone(name, "cpu")
 
 
 def prepare_images(

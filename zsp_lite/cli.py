@@ -251,7 +251,7 @@ def _add_weights(commands) -> None:
 
 
 def _weights(arguments: argparse.Namespace) -> None:
-    from zsp_lite.backbones import available_backbones, download, load_backbone
+    from zsp_lite.backbones import available_backbones, download, verify
 
     backbones, name = available_backbones(), arguments.name
     if arguments.action == "list":
@@ -263,9 +263,7 @@ def _weights(arguments: argparse.Namespace) -> None:
     if arguments.action == "fetch":
         print(f"At hand: {download(name)}")
         return
-    if name in backbones and backbones[name] is None:
-        raise InputError(f"{name} is not at hand; zsp-lite weights fetch {name}")
-    load_backbone(name)  # refuses what is damaged, not finite or of another layout
+    verify(name)
     print(f"{name}: complete, and loads")
 
 

@@ -42,7 +42,13 @@ def fetch(
                 f"download of {url} broke off three times, last at {part.stat().st_size} bytes; "
                 f"call again to resume"
             )
-        _check(url, part, size, md5_prefix)
+        if not has_size_and_hash(part, size, md5_prefix):
+            received = part.stat().st_size
+            part.unlink()  # to resume from wrong bytes would fail for ever
+            raise InputError(
+                f"download of {url} gave {received} bytes of another file, expected "
+                f"{size if size is not None else 'any number of'} bytes with MD5 {md5_prefix or '(any)'}...; removed"
+            )
         os.replace(part, path)
     except urllib.error.HTTPError as error:
         raise InputError(f"download of {url} failed: HTTP {error.code} {error.reason}") from error
@@ -52,6 +58,15 @@ def fetch(
         reason = getattr(error, "reason", error)
         raise InputError(f"download of {url} failed: {reason}") from error
     return path
+
+
+def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:
+    """Whether the file has that size (bytes, where known) and an MD5 that begins so."""
+    if size is not None and path.stat().st_size != size:
+        return False
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+    return digest.startswith(md5_prefix)
 
 
 def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
@@ -88,16 +103,3 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
                 return False
             received = file.tell()
     return total is None or received >= total
-
-
-def _check(url: str, part: Path, size: int | None, md5_prefix: str) -> None:
-    with open(part, "rb") as file:
-        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
-    received = part.stat().st_size
-    if (size is None or received == size) and digest.startswith(md5_prefix):
-        return
-    part.unlink()  # to resume from wrong bytes would fail for ever
-    raise InputError(
-        f"download of {url} gave {received} bytes with MD5 {digest[:6]}, expected "
-        f"{size if size is not None else 'any number of'} bytes with MD5 {md5_prefix or '(any)'}; removed"
-    )
