@@ -91,7 +91,7 @@ def cyclical_distances(
     be on the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and
     looks for the mark in each coordinate by itself). Raises InputError where shapes do not fit.
     """
-    sim = torch.as_tensor(sim)
+    sim, grid1, grid2 = torch.as_tensor(sim), tuple(grid1), tuple(grid2)
     n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
     if tuple(sim.shape) != (n1, n2):
         raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, grids expect {(n1, n2)}")
