@@ -1,6 +1,7 @@
 """The trainer: renders of one object at a time, three objectives, exact export, resumption."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,4 +170,15 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):
     (tmp_path / "config.json").write_text('{"seed": 5}')
     with pytest.raises(InputError, match="another configuration"):
+        train(TINY, tmp_path, folder, log=lambda line: None)
+
+
+def test_a_damaged_run_and_a_single_object_are_refused_in_one_line(folder, renders, tmp_path):
+    with pytest.raises(InputError, match="expected at least 2"):
+        train(replace(TINY, objects=1), tmp_path, folder, log=lambda line: None)
+    (tmp_path / "checkpoint.pt").write_bytes(b"cut off")
+    with pytest.raises(InputError, match="checkpoint.pt: damaged"):
+        train(TINY, tmp_path, folder, log=lambda line: None)
+    (tmp_path / "config.json").write_text('{"seed": ')
+    with pytest.raises(InputError, match="config.json are not valid JSON"):
         train(TINY, tmp_path, folder, log=lambda line: None)

@@ -19,8 +19,10 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from zsp_lite.annotations import decode
 from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD
 from zsp_lite.errors import InputError
+from zsp_lite.files import read_bytes
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss
 from zsp_lite.training.renders import SHARD, RenderSet, load_render_set, render_set
@@ -200,13 +202,16 @@ def train(
     `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
     its shards. The checkpoint holds model, average, optimiser and step; batches depend only on (seed, step), so a
     resumed run continues as if nothing had happened.
-    Raises InputError when `folder` holds a run of another configuration.
+    Raises InputError for fewer than 2 objects (one is held out), and where `folder` holds a run of another
+    configuration or a damaged one.
     """
+    if config.objects < 2:
+        raise InputError(f"training has {config.objects} objects, expected at least 2: the last ones are held out")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     settings = json.loads(json.dumps(asdict(config)))
     config_file, checkpoint_file = folder / "config.json", folder / "checkpoint.pt"
-    if config_file.exists() and json.loads(config_file.read_text()) != settings:
+    if config_file.exists() and decode(read_bytes(config_file, "configuration"), dict, config_file) != settings:
         raise InputError(f"{config_file}: holds a run of another configuration; expected a new folder for this one")
     config_file.write_text(json.dumps(settings, indent=1) + "\n")
     shard = min(SHARD, max(1, config.objects // 8))
@@ -223,11 +228,14 @@ def train(
     optimiser = _optimiser(model, config)
     step = 0
     if checkpoint_file.exists():
-        state = torch.load(checkpoint_file, map_location=device, weights_only=True)
-        model.load_state_dict(state["model"])
-        average.load_state_dict(state["average"])
-        optimiser.load_state_dict(state["optimiser"])
-        step = state["step"]
+        try:
+            state = torch.load(checkpoint_file, map_location=device, weights_only=True)
+            model.load_state_dict(state["model"])
+            average.load_state_dict(state["average"])
+            optimiser.load_state_dict(state["optimiser"])
+            step = state["step"]
+        except Exception as error:  # torch raises whatever its unpickler stumbles over
+            raise InputError(f"{checkpoint_file}: damaged, remove it to train from the start") from error
     start, smooth = time.monotonic(), {}
     log_file = (folder / "log.jsonl").open("a")
     ends = np.cumsum([stage.steps for stage in config.stages])
