@@ -1,11 +1,14 @@
 """The command line: help for everything, one line for bad input, never a traceback."""
 
+import json
 import subprocess
 import sys
 
 import pytest
+from synthetic_views import CoordinateBackbone
 
 from zsp_lite import cli, errors
+from zsp_lite.co3d import Co3D
 
 COMMANDS = ("demo", "benchmark", "synth", "weights", "train", "profile", "doctor")
 
@@ -61,13 +64,18 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, capsys):
         (["demo", "--backbone", "resnet"], "resnet"),
         (["benchmark", "--data", "no/such/folder"], "no/such/folder"),
         (["benchmark", "--methods", "magic"], "magic"),
+        (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
+        (["synth", "--preset", "samples", "--frames", "3", "--out", "x"], "--category"),
+        (["synth", "--category", "sofa", "--out", "x"], "sofa"),
+        (["train", "--objects", "1", "--out", "x"], "at least 2"),
         (["weights", "fetch"], "expected one of zsp-tiny"),
         (["weights", "fetch", "resnet"], "resnet"),
         (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, names, capsys, ellipsoids):
-    data = [] if "--data" in arguments or arguments[0] == "weights" else ["--data", str(ellipsoids.root)]
+    takes_data = arguments[0] in ("demo", "benchmark") and "--data" not in arguments
+    data = ["--data", str(ellipsoids.root)] if takes_data else []
     assert cli.main(arguments + data) == 2
     assert names in assert_one_line(capsys)
 
@@ -100,6 +108,31 @@ def test_the_doctor_names_each_thing_and_says_what_is_missing(capsys, ellipsoids
     for name in ("Python", "torch", "open3d loads", "backbone zsp-tiny", "data: --data", "Jupyter"):
         assert name in text
     assert (code == 0) == ("All essentials are there." in text)
+
+
+def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zsp_lite.backbones.load_backbone", lambda name: CoordinateBackbone())
+    assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "ellipsoid" in text and " of 5" in text and "°" in text and cli.USER_NOTE in text
+    assert (tmp_path / "report.html").stat().st_size > 1_000_000  # plotly's script and the pictures
+
+
+def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellipsoids, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zsp_lite.benchmark.run.load_backbone", lambda name: CoordinateBackbone())
+    arguments = ["--pairs", "2", "--targets", "3", "--methods", "ours,ours-bv", "--out", str(tmp_path)]
+    assert cli.main(["benchmark", "--data", str(ellipsoids.root), *arguments]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    text = capsys.readouterr().out
+    assert all(name in text and row["n"] == 2 for name, row in summary["methods"].items())
+
+
+def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):
+    arguments = ["--category", "mouse", "--sequences", "1", "--frames", "2", "--seed", "3", "--out", str(tmp_path)]
+    assert cli.main(["synth", *arguments]) == 0
+    dataset = Co3D(tmp_path)
+    (sequence,) = dataset.sequences("mouse")
+    assert len(dataset.frames("mouse", sequence.sequence_name)) == 2
 
 
 def test_the_weights_list_has_every_name(capsys):

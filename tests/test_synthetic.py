@@ -348,6 +348,14 @@ def test_a_folder_made_with_other_settings_is_refused(folder):
         export_categories(["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
 
 
+@pytest.mark.parametrize("name", ["synthetic.json", "chair/object_poses.json"])
+def test_a_damaged_export_is_refused_by_the_name_of_its_file(tmp_path, name):
+    (tmp_path / "chair").mkdir()
+    (tmp_path / name).write_text('{"seed": ')
+    with pytest.raises(InputError, match=name):
+        export_categories(["chair"], tmp_path, 1, 2, SEED, 48)
+
+
 def test_an_unknown_preset_is_refused(tmp_path):
     with pytest.raises(InputError, match="imagenet"):
         export.export_preset("imagenet", tmp_path, 0)

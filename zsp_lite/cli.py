@@ -222,8 +222,12 @@ def _add_synth(commands) -> None:
     what.add_argument(
         "--category", action="append", metavar="NAME", help="a category; may be given more than once"
     )
-    parser.add_argument("--sequences", type=_count, default=4, metavar="N", help="per category (default: 4)")
-    parser.add_argument("--frames", type=_count, default=24, metavar="N", help="per sequence (default: 24)")
+    parser.add_argument(
+        "--sequences", type=_count, metavar="N", help="with --category: sequences of each (default: 4)"
+    )
+    parser.add_argument(
+        "--frames", type=_count, metavar="N", help="with --category: frames per sequence (default: 24)"
+    )
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
@@ -233,11 +237,13 @@ def _synth(arguments: argparse.Namespace) -> None:
 
     from zsp_lite.synthetic.export import export_categories, export_preset
 
-    out, seed = arguments.out, arguments.seed
+    out, seed, sequences, frames = arguments.out, arguments.seed, arguments.sequences, arguments.frames
     if arguments.preset:
+        if sequences or frames:
+            raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
         export_preset(arguments.preset, out, seed, progress=tqdm)
     else:
-        export_categories(arguments.category, out, arguments.sequences, arguments.frames, seed, progress=tqdm)
+        export_categories(arguments.category, out, sequences or 4, frames or 24, seed, progress=tqdm)
     print(f"Written: {out}")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zsp_lite.annotations import decode
 from zsp_lite.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.errors import InputError
@@ -144,7 +145,7 @@ def _claim(out: Path, settings: dict) -> None:
     """Note the settings in the folder, or refuse one that was made with others."""
     path = out / SETTINGS_FILE
     if path.is_file():
-        found = json.loads(read_bytes(path, "settings"))
+        found = decode(read_bytes(path, "settings"), dict, path)
         if found != settings:
             raise InputError(f"folder {out} was made with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())
@@ -152,7 +153,7 @@ def _claim(out: Path, settings: dict) -> None:
 
 def _read_poses(out: Path, category: str) -> dict:
     path = out / category / POSES_FILE
-    return json.loads(read_bytes(path, "object poses")) if path.is_file() else {}
+    return decode(read_bytes(path, "object poses"), dict, path) if path.is_file() else {}
 
 
 def _complete(out: Path, category: str) -> set[str]:
