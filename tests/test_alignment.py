@@ -152,6 +152,7 @@ def test_torch_tensors_give_the_same_as_numpy_arrays():
 
 
 line = np.linspace(0, 1, 8)[:, None] * (1.0, 2.0, 3.0)
+rounded = (line + (0.1, 0.7, 5.0)).astype(np.float32)
 not_finite = cloud(0).copy()
 not_finite[3, 1] = np.nan
 
@@ -164,13 +165,17 @@ not_finite[3, 1] = np.nan
         (np.ones((5, 3)), np.ones((5, 3))),
         (cloud(0, 8), line),
         (cloud(0), np.ones((20, 3))),
+        (rounded, cloud(0, 8)),
         (not_finite, cloud(0)),
         (cloud(0), not_finite),
         (cloud(0, 5), cloud(0, 6)),
         (cloud(0)[:, :2], cloud(0)[:, :2]),
     ],
-    ids=["two", "collinear", "equal", "target line", "target point", "nan", "nan target", "lengths", "flat"],
-)
+    ids=[
+        "two", "collinear", "equal", "target line", "target point", "rounded line", "nan", "nan target", "lengths",
+        "flat",
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("solver", [umeyama, ransac])
 def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, source, target):
     with pytest.raises(InputError) as error:

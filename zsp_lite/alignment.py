@@ -15,6 +15,8 @@ from zsp_lite.errors import InputError
 # common line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is wide.
 _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
+# The same for one cloud by itself, a ratio of widths: what float32 rounding leaves of a line is below it.
+_COLLINEAR_CLOUD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,4 +212,8 @@ def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("source or target holds non-finite coordinates, expected finite ones")
+    for name, points in (("source", source), ("target", target)):
+        longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if width <= _COLLINEAR_CLOUD * longest:
+            raise InputError(f"the {len(points)} {name} points are all equal or collinear, expected some off the line")
     return source, target
