@@ -141,6 +141,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"principal_point": [np.nan, 0]}, "principal_point is not finite"),
         ({"size": (0, 5)}, "expected positive"),
         ({"size": 5}, "image size is 5"),
+        ({"size": (np.inf, 5)}, "image size is .*inf"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(changes, message):

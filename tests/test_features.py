@@ -76,6 +76,14 @@ def test_foreground_is_saliency_above_the_threshold():
     assert features.foreground(0.25).tolist() == [[False, False, False], [True, True, False]]
 
 
+@pytest.mark.parametrize("part", ["keys", "saliency"])
+def test_a_feature_map_refuses_what_is_not_finite(part):
+    parts = {"keys": torch.zeros(2, 3, 4), "saliency": torch.zeros(2, 3), "global_feature": torch.zeros(4)}
+    parts[part][1, 2] = torch.nan
+    with pytest.raises(InputError, match="not finite"):
+        FeatureMap(**parts)
+
+
 @pytest.mark.parametrize("keys, saliency", [((2, 3), (2, 3)), ((2, 3, 4), (3, 2)), ((0, 3, 4), (0, 3))])
 def test_a_feature_map_refuses_parts_that_do_not_fit(keys, saliency):
     with pytest.raises(InputError, match="FeatureMap"):

@@ -183,7 +183,7 @@ def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> 
 def _image_size(size: Sequence[int]) -> tuple[int, int]:
     try:
         height, width = (int(side) for side in size)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"image size is {size!r}, expected (height, width)") from error
     if height <= 0 or width <= 0:
         raise InputError(f"image size is {(height, width)}, expected positive (height, width)")

@@ -33,6 +33,8 @@ class FeatureMap:
             raise InputError(
                 f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
+        if not bool(self.keys.isfinite().all() & self.saliency.isfinite().all()):
+            raise InputError("FeatureMap: keys or saliency hold values that are not finite")
 
     @property
     def grid(self) -> Grid:
