@@ -216,8 +216,9 @@ def test_damaged_files_are_refused_in_one_line(vit, tmp_path, suffix, damage):
     whole = path.read_bytes()
     damaged = {"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"<html>404</html>"}
     path.write_bytes(damaged[damage])
-    with pytest.raises(InputError, match=f"^checkpoint [^\n]*model{suffix}: damaged[^\n]*$"):
+    with pytest.raises(InputError, match=f"^checkpoint [^\n]*model{suffix}: damaged[^\n]*$") as caught:
         load_backbone(path, "cpu", num_heads=4)
+    assert "PyTorch" not in str(caught.value)  # torch's advice is to load the file unsafely
 
 
 def test_no_code_from_a_checkpoint_runs(tmp_path):

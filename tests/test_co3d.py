@@ -212,6 +212,8 @@ def test_unknown_folders_categories_sequences_and_frames_are_named(root):
     dataset = Co3D(root)
     with pytest.raises(InputError, match="nowhere does not exist"):
         Co3D(root / "nowhere")
+    with pytest.raises(InputError, match="frame_annotations.jgz is not a folder"):
+        Co3D(frames_file(root))
     with pytest.raises(InputError, match="category 'sofa' is not in .*, which has chair"):
         dataset.frame_list("sofa")
     with pytest.raises(InputError, match="plain folder name"):

@@ -23,8 +23,10 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
                 return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        # Damaged files surface as whatever the unpickler stumbled over: a dozen types, none documented.
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        # Damaged files surface as whatever the unpickler stumbled over: a dozen types, none documented. Torch's own
+        # advice is to load the file unsafely.
+        reason = (str(error).splitlines() or [""])[0]
+        reason = type(error).__name__ if not reason or reason.startswith("Weights only load failed") else reason
         raise InputError(f"checkpoint {path}: damaged, or not of tensors alone ({reason[:120]})") from error
     for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints hold teacher and student
         if isinstance(content, dict) and isinstance(content.get(nested), dict):

@@ -53,9 +53,8 @@ class Co3D:
         """Raises InputError where `root` is not a folder."""
         self.root = Path(root)
         if not self.root.is_dir():
-            raise InputError(
-                f"data folder {root} does not exist, expected a folder with CATEGORY/{FRAMES_FILE}"
-            )
+            state = "is not a folder" if self.root.exists() else "does not exist"
+            raise InputError(f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE}")
         self._index: tuple[str, FrameIndex] | None = None
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 

@@ -75,7 +75,9 @@ class TrainingConfig:
         return sum(stage.steps for stage in self.stages)
 
     def shortened(self, factor: float) -> "TrainingConfig":
-        """The same recipe with every stage's steps multiplied by `factor`."""
+        """The same recipe with every stage's steps multiplied by `factor`, at most 1000. InputError on others."""
+        if not 0 < factor <= 1000:
+            raise InputError(f"steps are to be multiplied by {factor}, expected more than 0 and at most 1000")
         return replace(self, stages=tuple(replace(s, steps=max(1, round(s.steps * factor))) for s in self.stages))
 
 
