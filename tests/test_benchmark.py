@@ -12,10 +12,10 @@ from synthetic_views import CoordinateBackbone, look_at, render
 import zsp_lite
 from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.backbones import Backbone
+from zsp_lite.benchmark.annotations import process_memory
 from zsp_lite.benchmark.profile import (
     Row,
     made_up_frames,
-    peak_memory,
     ransac_by_loop,
     ransac_rows,
     similarity_rows,
@@ -265,4 +265,4 @@ def test_made_up_frames_have_an_object_and_holes_in_its_depth():
 
 
 def test_peak_memory_is_that_of_this_process():
-    assert 2**26 < peak_memory() < 2**36
+    assert 2**26 < process_memory() < 2**36

@@ -162,8 +162,9 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
     resumed = train(TINY, tmp_path / "killed", folder, log=lambda line: None, **options)
     expected, got = load_file(whole), load_file(resumed)
     assert all(torch.equal(expected[name], got[name]) for name in expected | got)
-    rows = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    for run in ("whole", "killed"):
+        rows = [json.loads(line) for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
+        assert [row["step"] for row in rows] == [1, 2, 3, 4]
     assert "held_out_accuracy" in rows[-1] and np.isfinite(rows[-1]["loss"])
 
 

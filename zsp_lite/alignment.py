@@ -99,10 +99,11 @@ def umeyama_batch(
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
     left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
-    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
-    flip = np.sign(np.linalg.det(left @ right))
-    left[:, :, 2] *= flip[:, None]
     rotation = left @ right
+    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
+    flip = np.sign(np.linalg.det(rotation))
+    mirrored = np.flatnonzero(flip < 0)
+    rotation[mirrored] -= 2 * left[mirrored, :, 2:] * right[mirrored, 2:, :]
     if with_scale:
         spread = np.square(centred_source).sum(axis=(1, 2))
         scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(spread > 0, spread, 1)
@@ -120,14 +121,15 @@ def ransac(
     trials: int = 1000,
     sample_size: int = 4,
     seed: int | np.random.Generator = 0,
-    scale_range: tuple[float, float] = (0.2, 5.0),
+    scale_range: tuple[float, float] = (0.0, np.inf),
 ) -> tuple[Sim3, Bool[np.ndarray, "n"]]:
     """Umeyama in RANSAC: the most inliers among `trials` samples, then a fit on those inliers.
 
     source, target: (N, 3) corresponding points, N >= sample_size, numpy or torch.
     threshold: largest distance |target - (scale * R @ source + t)| of an inlier, in target units; the paper's
     0.2 is for clouds of unit standard deviation.  sample_size: points per trial, drawn without replacement;
-    the paper takes 4 because 3 can be degenerate.  scale_range: hypotheses with another scale are discarded.
+    the paper takes 4 because 3 can be degenerate.  scale_range: hypotheses with another scale are discarded;
+    a lower bound keeps out those that shrink the source into one dense spot of the target.
     Returns the similarity and the (N,) bool inliers of the best trial (ties: the smaller sum of their
     residuals), which are what the fit used; where those cannot carry a fit of their own, the best trial's
     similarity. Deterministic for a seed.

@@ -64,7 +64,8 @@ def patch_points(
 
     A patch's point is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
     silhouette the nearer surface is the object, and a single stray pixel does not decide. A patch without a
-    known depth takes the in-painted depth at its central pixel. Raises InputError where the whole map is
+    known depth takes the in-painted depth at its central pixel. (The paper in-paints and unprojects the matches; it
+    does not say which of a patch's 64 pixels it takes.) Raises InputError where the whole map is
     unknown, the camera has another size, or the grid is finer than the image.
     """
     depth = np.asarray(depth, dtype=np.float32)

@@ -66,6 +66,8 @@ def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: f
     Raises InputError on an empty mask.
     """
     mask = np.asarray(mask)
+    if not 0 <= threshold <= 1:
+        raise InputError(f"object_box: threshold is {threshold}, expected 0 to 1")
     if mask.ndim != 2 or not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected (H, W) with a pixel above 0")
     while not (inside := mask > max(threshold, 0.0)).any():

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from zsp_lite.backbones import Backbone
 
 IMAGE_SIZE = 224
+# Instances of one category, each of unit spread, do not differ more: what the paper leaves open.
+SCALE_RANGE = (0.2, 5.0)
 # Thin parts (a chair's legs) never fill half a patch.
 _MASK_PATCH = 0.25
 _FEW = 10
@@ -184,8 +186,10 @@ class ZeroShotPose:
             try:
                 sim3, inliers = ransac(
                     *points, threshold=self.threshold, trials=self.trials, sample_size=self.sample_size,
-                    seed=self.seed,
+                    seed=self.seed, scale_range=SCALE_RANGE,
                 )  # fmt: skip
+                if (agreeing := int(inliers.sum())) < self.sample_size:
+                    flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
             except InputError as error:
                 sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
                 flags = (f"pose is the best view's, not a fit: {error}",)

@@ -17,18 +17,10 @@ _FRAMES_PER_SEQUENCE = 100
 _MEASURE = """
 import json, sys, time
 from pathlib import Path
+from zsp_lite.benchmark.annotations import process_memory
 from zsp_lite.co3d import Co3D
 
-def memory(field):
-    # ru_maxrss starts at the parent's size on Linux, where a child inherits it; /proc knows this process alone.
-    try:
-        status = Path("/proc/self/status").read_text()
-        return int(next(line.split()[1] for line in status.splitlines() if line.startswith(field))) / 1024
-    except OSError:
-        import resource
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
-
-before = memory("VmRSS:")
+before = process_memory("VmRSS")
 start = time.perf_counter()
 dataset = Co3D(sys.argv[1])
 keys = dataset.frame_list("category")
@@ -36,8 +28,20 @@ opened = time.perf_counter()
 frames = dataset.frames("category", keys[0].sequence_name)
 sequence = time.perf_counter()
 print(json.dumps({"frames": len(keys), "seconds": opened - start, "sequence_seconds": sequence - opened,
-                  "memory_mb": memory("VmHWM:") - before}))
+                  "memory_mb": (process_memory("VmHWM") - before) / 2**20}))
 """
+
+
+def process_memory(field: str = "VmHWM") -> int:
+    """Bytes of memory of this process: "VmHWM", the most so far, or "VmRSS", now.  macOS knows the most alone."""
+    try:
+        # ru_maxrss of a child starts at its parent's size on Linux; /proc knows this process alone.
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith(f"{field}:")))
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def annotation_benchmark(frames: int = 86_000) -> dict:

@@ -139,9 +139,10 @@ def ransac_by_loop(
 # A fresh interpreter: the peak of this one remembers everything that ran before.
 _MEMORY = """
 import json
-from zsp_lite.benchmark.profile import estimate_once, peak_memory
+from zsp_lite.benchmark.annotations import process_memory
+from zsp_lite.benchmark.profile import estimate_once
 estimate_once()
-print(json.dumps(peak_memory()))
+print(json.dumps(process_memory()))
 """
 
 
@@ -155,18 +156,6 @@ def estimate_once() -> None:
     """One estimate with N = 5 and a dino_vits8 of random weights."""
     reference, *targets = made_up_frames(1 + N_TARGETS)
     ZeroShotPose(random_vits8()).estimate(reference, targets)
-
-
-def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes.  Linux or macOS."""
-    try:
-        # ru_maxrss of a child starts at its parent's size on Linux; this does not.
-        with open("/proc/self/status") as status:
-            return 1024 * int(next(line.split()[1] for line in status if line.startswith("VmHWM:")))
-    except OSError:
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def annotation_rows(frames: int = 86_000) -> list[Row]:

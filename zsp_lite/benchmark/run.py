@@ -146,7 +146,7 @@ def summarise_run(records: Sequence[dict], methods: Sequence[str], data: dict, b
         rows[name] = summarise(errors[name]) | {
             "mean_category_median": float(np.mean([row["median"] for row in per_category.values()])),
             "failed": sum("failed" in record["methods"][name] for record in records),
-            "fallbacks": sum(record["methods"][name].get("note", "") != "" for record in records),
+            "flagged": sum(record["methods"][name].get("note", "") != "" for record in records),
             "per_category": per_category,
         }
     saliency: dict[str, float] = {}
@@ -314,7 +314,7 @@ def _evaluate_method(
         "view": first + estimate.view,
         "matches": len(estimate.matches),
         "inliers": int(estimate.inliers.sum()),
-        "note": estimate.note,
+        "note": estimate.note if method.answer != "best view" else "",
         "timings": {stage: round(seconds, 5) for stage, seconds in estimate.timings.items()},
     }
 

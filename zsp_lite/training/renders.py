@@ -98,10 +98,14 @@ def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, wo
 
 
 def load_render_set(paths: list[Path]) -> RenderSet:
-    """Read shards into memory."""
-    names = ("rgb", "surface", "geometry")
-    shards = []
-    for path in paths:
+    """Read shards into memory, one at a time: joining them afterwards would need all of it twice."""
+    joined: list[np.ndarray] = []
+    for index, path in enumerate(paths):
         with np.load(path) as file:
-            shards.append([file[name] for name in names])
-    return RenderSet(*(np.concatenate(column) for column in zip(*shards, strict=True)))
+            shard = [file[name] for name in ("rgb", "surface", "geometry")]
+        count = len(shard[0])  # all shards have as many objects
+        if not joined:
+            joined = [np.empty((count * len(paths), *part.shape[1:]), part.dtype) for part in shard]
+        for whole, part in zip(joined, shard, strict=True):
+            whole[index * count : (index + 1) * count] = part
+    return RenderSet(*joined)

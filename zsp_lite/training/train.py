@@ -238,8 +238,11 @@ def train(
             step = state["step"]
         except Exception as error:  # torch raises whatever its unpickler stumbles over
             raise InputError(f"{checkpoint_file}: damaged, remove it to train from the start") from error
-    start, smooth = time.monotonic(), {}
-    log_file = (folder / "log.jsonl").open("a")
+    smooth: dict[str, float] = {}
+    earlier = _log_until(folder / "log.jsonl", step)
+    start = time.monotonic() - (json.loads(earlier[-1])["seconds"] if earlier else 0)
+    log_file = (folder / "log.jsonl").open("w")
+    log_file.writelines(earlier)
     ends = np.cumsum([stage.steps for stage in config.stages])
     while step < config.steps:
         k = int(np.searchsorted(ends, step, side="right"))
@@ -275,6 +278,12 @@ def train(
             torch.save(state, checkpoint_file.with_suffix(".part"))
             checkpoint_file.with_suffix(".part").replace(checkpoint_file)
     return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
+
+
+def _log_until(path: Path, step: int) -> list[str]:
+    """The log's lines up to `step`: what came after the checkpoint will be done, and logged, again."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
 
 
 def _optimiser(model: Trainee, config: TrainingConfig) -> torch.optim.Optimizer:
