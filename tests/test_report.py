@@ -8,7 +8,8 @@ import pytest
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.demo import demo_pairs, object_cloud, run_demo
-from zsp_lite.report import page, table_row, write_report
+from zsp_lite.frames import read_image
+from zsp_lite.report import page, table_row, write_overview, write_report
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +104,9 @@ def test_what_comes_from_outside_is_escaped(text):
 def test_the_report_is_written_where_asked(results, tmp_path):
     path = write_report(tmp_path / "deep" / "report.html", results, "folder", "note", "name")
     assert path.read_text().startswith("<!doctype html>")
+
+
+def test_the_overview_is_one_picture_of_all_results(results, tmp_path):
+    picture = read_image(write_overview(tmp_path / "deep" / "overview.jpg", results * 2))
+    height, width = picture.shape[:2]
+    assert 2 < width / height < 4  # two rows of six square pictures

@@ -132,7 +132,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     from zsp_lite.co3d import Co3D
     from zsp_lite.demo import run_demo
     from zsp_lite.doctor import sample_data
-    from zsp_lite.report import table_row, write_report
+    from zsp_lite.report import table_row, write_overview, write_report
     from zsp_lite.synthetic.export import SETTINGS_FILE
 
     console = Console()
@@ -149,6 +149,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     console.print(table)
     with console.status("writing the report"):
         path = write_report(arguments.out / "report.html", results, str(folder), note, arguments.backbone)
+        write_overview(arguments.out / "overview.jpg", results)
     console.print(f"Data: {note}", highlight=False)
     console.print(f"Every stage in pictures: {path}", soft_wrap=True)
 

@@ -95,23 +95,23 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Camera-frame points of the pixels of the object with a measured depth, strays left out, at most `most` of them.
 
-    The object is where the mask is above 0.5; without a mask, the patches of the foreground. Raises
+    The object is where the mask is above 0.9; without a mask, the patches of the foreground. Raises
     InputError where none of its pixels has a depth.
     """
     frame = view.frame
     if frame.depth is None:
         raise InputError(f"{frame.name or 'frame'}: no depth map, expected one for the point cloud")
     if frame.mask is not None:
-        inside = frame.mask > 0.5
+        inside = frame.mask > 0.9
     else:
         rows, cols = (np.arange(n) * m // n for n, m in zip(frame.depth.shape, view.foreground.shape))
         inside = view.foreground.cpu().numpy()[np.ix_(rows, cols)]
     points = structured_point_cloud(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
-    # A soft mask's rim lets points of the background through, far behind the object.
+    # A mask that is a pixel too wide lets points of the background through, far behind the object.
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    points = points[distance <= 3 * np.median(distance)]
+    points = points[distance <= 2.5 * np.median(distance)]
     if len(points) > most:
         points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
     return points

@@ -14,9 +14,11 @@ from zsp_lite import plots
 from zsp_lite.demo import DemoResult, object_cloud
 from zsp_lite.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
+from zsp_lite.pipeline import object_crop
 from zsp_lite.scene3d import aligned_clouds
 
 _DPI = 110
+_OVERVIEW_FRAMES = 4
 
 _CSS = """
 :root { color-scheme: light; --ink: #1c2733; --soft: #5a6773; --line: #dfe4e9; --accent: #0072b2; }
@@ -52,6 +54,28 @@ def write_report(
     """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in it."""
     path = Path(path)
     write_atomic(path, page(results, data, data_note, backbone).encode())
+    return path
+
+
+def write_overview(path: str | Path, results: Sequence[DemoResult]) -> Path:
+    """Write one JPEG with a row for each result: reference, chosen target view, the pose over the target sequence."""
+    path = Path(path)
+    images, titles = [], []
+    for result in results:
+        frames = [object_crop(frame) for frame in result.sequence[:_OVERVIEW_FRAMES]]
+        images += [view.frame.rgb for view in _best_views(result)] + [frame.rgb for frame in frames]
+        titles += [f"{result.pair.category}: reference", "chosen target view"]
+        titles += [f"pose {result.error:.0f}° off" if k == 0 else "" for k in range(len(frames))]
+    figure, axes = plots.show_images(images, titles, columns=2 + _OVERVIEW_FRAMES, size=1.7)
+    for row, result in enumerate(results):
+        cloud = object_cloud(result.estimate.reference_view, most=1500)
+        colours = plots.coordinate_colours(cloud)
+        first = row * (2 + _OVERVIEW_FRAMES)
+        plots.draw_points(axes[first], result.estimate.reference_view.frame.camera, cloud, colours, size=3)
+        cameras = [object_crop(frame).camera for frame in result.sequence[:_OVERVIEW_FRAMES]]
+        for axis, camera, pose in zip(axes[first + 2 :], cameras, result.estimate.propagate(cameras)):
+            plots.draw_points(axis, camera, pose.apply(cloud), colours, size=3)
+    write_atomic(path, _jpeg(figure))
     return path
 
 
@@ -251,8 +275,13 @@ def _figure(title: str, figure: Figure, wide: bool, alt: str, caption: str) -> s
 
 
 def _inline_image(figure: Figure) -> str:
-    """The figure as a data URI; JPEG, for most of it is photographs."""
+    """The figure as a data URI."""
+    return "data:image/jpeg;base64," + base64.b64encode(_jpeg(figure)).decode()
+
+
+def _jpeg(figure: Figure) -> bytes:
+    """The figure's bytes; JPEG, for most of it is pictures. Closes the figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="jpeg", dpi=_DPI, facecolor="white", pil_kwargs={"quality": 88})
     plt.close(figure)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return buffer.getvalue()
