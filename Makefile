@@ -38,8 +38,9 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(RUN) -m pytest --nbval-lax --nbval-current-env --nbval-cell-timeout=600 --durations=10 tests $(wildcard notebooks)
 
+# Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs.
 lab: $(STAMP)
-	$(RUN) -m jupyter lab notebooks
+	$(RUN) -m jupyter lab --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" notebooks
 
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
