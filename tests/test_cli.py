@@ -149,3 +149,14 @@ def assert_one_line(capsys) -> str:
     assert captured.out == ""
     assert captured.err.startswith("zsp-lite: ") and captured.err.count("\n") == 1
     return captured.err
+
+
+def test_the_help_names_every_method():
+    from zsp_lite.benchmark.run import METHODS
+
+    assert cli.METHOD_NAMES == tuple(METHODS)
+
+
+def test_weights_list_takes_no_name(capsys):
+    assert cli.main(["weights", "list", "dino_vits8"]) == 2
+    assert "takes no name" in capsys.readouterr().err

@@ -11,6 +11,7 @@ import pytest
 
 from zsp_lite.alignment import umeyama
 from zsp_lite.co3d import Co3D
+from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
 from zsp_lite.frames import crop_to_object
 from zsp_lite.labels import read_labels, relative_pose
@@ -359,3 +360,17 @@ def test_a_damaged_export_is_refused_by_the_name_of_its_file(tmp_path, name):
 def test_an_unknown_preset_is_refused(tmp_path):
     with pytest.raises(InputError, match="imagenet"):
         export.export_preset("imagenet", tmp_path, 0)
+
+
+def test_the_shipped_samples_are_what_the_preset_makes():
+    """Two sequences of data_samples, made again, picture by picture; the frames hold wall, floor and shadows."""
+    preset, dataset = export.PRESETS["samples"], Co3D(sample_data())
+    for category, index in (("teddybear", 2), ("toytruck", 2)):
+        data, _ = export.make_sequence(category, index, preset.frames, 0, preset.image_size)
+        shipped = [dataset.load(found) for found in dataset.frames(category, data.name)]
+        for made, found in zip(data.frames, shipped, strict=True):
+            jpeg = cv2.imencode(".jpg", made.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, export.JPEG_QUALITY])[1]
+            pixels = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1]
+            # One grey level: what another processor's instructions may round otherwise.
+            assert np.abs(pixels.astype(int) - found.rgb).max() <= 1
+            assert np.mean((made.depth > 0) == (found.depth > 0)) > 0.999

@@ -15,6 +15,8 @@ SYNTHETIC_NOTE = (
     "soft masks as CO3D has them; no photograph."
 )
 USER_NOTE = "a folder in CO3D's layout, as given."
+# Written down here too, for `--help` shall not wait for what defines them (a test holds them equal).
+METHOD_NAMES = ("ours", "ours-bv", "rootsift", "rootsift-bv", "ours-mask", "oracle-view", "random")
 
 
 class Parser(argparse.ArgumentParser):
@@ -136,6 +138,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     from zsp_lite.synthetic.export import SETTINGS_FILE
 
     console = Console()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     folder = arguments.data or sample_data()
     note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
     table = Table(title=f"One pair of each category in {folder}, backbone {arguments.backbone}")
@@ -170,10 +173,13 @@ def _add_benchmark(commands) -> None:
     )
     parser.add_argument(
         "--methods", type=_names, default=["ours", "ours-bv", "rootsift"], metavar="A,B",
-        help="rows of the table (default: ours,ours-bv,rootsift)",
+        help=f"rows of the table, some of {', '.join(METHOD_NAMES)} (default: ours,ours-bv,rootsift)",
     )  # fmt: skip
     parser.add_argument("--seed", type=_seed, default=0, help="of the pairs drawn (default: 0)")
-    parser.add_argument("--out", type=Path, default=Path("outputs/benchmark"), metavar="DIR")
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/benchmark"), metavar="DIR",
+        help="a run found there is continued (default: outputs/benchmark)",
+    )  # fmt: skip
 
 
 def _benchmark(arguments: argparse.Namespace) -> None:
@@ -258,6 +264,8 @@ def _add_weights(commands) -> None:
 
 
 def _weights(arguments: argparse.Namespace) -> None:
+    if arguments.action == "list" and arguments.name:
+        raise InputError(f"weights list takes no name, got {arguments.name}")
     from zsp_lite.backbones import available_backbones, download, verify
 
     backbones, name = available_backbones(), arguments.name

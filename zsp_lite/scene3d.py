@@ -43,7 +43,7 @@ def aligned_clouds(
     figure.update_layout(
         title=title,
         height=440,
-        margin={"l": 0, "r": 0, "t": 40 if title else 0, "b": 0},
+        margin={"l": 0, "r": 0, "t": 40 if title else 0, "b": 10},
         legend={
             "itemsizing": "constant",
             "orientation": "h",
@@ -54,7 +54,7 @@ def aligned_clouds(
         scene={
             **{f"{axis}axis": {"title": {"text": label}, "range": span} for axis, label, span in _axes(kept)},
             "aspectmode": "cube",
-            "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.8, "y": -0.6, "z": -1.9}},
+            "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.9, "y": -0.7, "z": -2.15}},
         },
     )
     return figure

@@ -23,6 +23,7 @@ from zsp_lite.synthetic.training_categories import TRAINING
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder: what it was made with
 POSES_FILE = "object_poses.json"  # in each category: where each sequence's object stands in its world
+JPEG_QUALITY = 88
 LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
@@ -114,10 +115,11 @@ def export_categories(
             # The pose goes first: a sequence counts as complete by the annotations, which come last.
             poses[name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale}
             write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-            write_co3d(out, category, [data], quality=88, intrinsics_format=LAYOUTS[layout])
+            write_co3d(out, category, [data], quality=JPEG_QUALITY, intrinsics_format=LAYOUTS[layout])
         reference = sequence_name(seed, category, 0)
         trans = np.array(poses[name]["trans"]) @ np.linalg.inv(poses[reference]["trans"])
-        write_label(out, category, PoseLabel(np.eye(4) if name == reference else trans, name, reference))
+        trans = np.eye(4) if name == reference else np.round(trans, 12) + 0.0  # the same on any processor
+        write_label(out, category, PoseLabel(trans, name, reference))
 
 
 def make_sequence(

@@ -101,8 +101,8 @@ class Scene:
         reach = np.where(down, (self.floor - eye[2]) / np.where(down, rays[off, 2], -1), np.inf)
         grounded = (reach < 25) & look.has_ground
         floor_point = eye + reach[grounded, None] * rays[off[grounded]]
-        direction = rays[off] / np.linalg.norm(rays[off], axis=1, keepdims=True)
-        room = backdrop(2.5 * direction, look.wall_waves, look.wall_colours)
+        wall_point = 2.5 * rays[off] / np.linalg.norm(rays[off], axis=1, keepdims=True)
+        room = backdrop(wall_point, look.wall_waves, look.wall_colours)
         room[grounded] = backdrop(floor_point, look.ground_waves, look.ground_colours)
         depth = np.where(mask, distance, 0).astype(np.float32)
         depth[off[grounded]] = reach[grounded]

@@ -328,4 +328,5 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     metadata |= dict(num_heads=config.num_heads, key_block=config.key_block)
     weights = {name: value.half().contiguous() for name, value in backbone.state_dict().items()}
     save_file(weights, path, metadata={name: str(value) for name, value in metadata.items()})
+    Path(path).chmod(0o644)  # safetensors makes files that only their owner reads
     return path
