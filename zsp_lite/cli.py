@@ -217,7 +217,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
 
 def _add_synth(commands) -> None:
     parser = _command(
-        commands, "synth", _synth, "make procedural objects as a CO3D folder, bit for bit from a seed",
+        commands, "synth", _synth, "make procedural objects as a CO3D folder, the same from the same seed",
         [
             "synth --preset samples --out data_samples",
             "synth --preset eval --out outputs/eval",
