@@ -9,7 +9,7 @@ import importlib
 
 __version__ = "0.1.0"
 
-# Where each name lives. Imported when first asked for: torch takes seconds, `zsp-lite --help` need not.
+# Where each name lives. Names and modules are imported when first asked for: torch takes seconds, `zsp-lite --help` need not.
 _HOMES = {
     "Camera": "cameras",
     "Co3D": "co3d",
@@ -23,10 +23,17 @@ _HOMES = {
     "load_backbone": "backbones",
 }
 
-__all__ = ["__version__", *_HOMES]
+_MODULES = (
+    "alignment", "backbones", "best_view", "cameras", "co3d", "depth", "features", "frames", "labels", "matching",
+    "metrics", "pairs", "pipeline", "plots", "scene3d", "vit",
+)  # fmt: skip
+
+__all__ = ["__version__", *_HOMES, *_MODULES]
 
 
 def __getattr__(name: str):
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
