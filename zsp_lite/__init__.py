@@ -9,7 +9,7 @@ import importlib
 
 __version__ = "0.1.0"
 
-# Where each name lives. Names and modules are imported when first asked for: torch takes seconds, `zsp-lite --help` need not.
+# Where each name lives. Names and modules come when first asked for: torch takes seconds, `zsp-lite --help` need not.
 _HOMES = {
     "Camera": "cameras",
     "Co3D": "co3d",
