@@ -104,6 +104,10 @@ def test_nothing_or_nan_is_not_summarised(errors):
         summarise(errors)
 
 
+def test_half_turns_are_counted():
+    assert summarise([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
+
+
 def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
     # 6 pairs only the second solves, 1 only the first: p = 2 * (C(7,0) + C(7,1)) / 2^7 = 0.125.
     first, second = np.r_[[90.0] * 6, 10.0, [5.0] * 3], np.r_[[10.0] * 6, 90.0, [5.0] * 3]

@@ -71,7 +71,8 @@ def bootstrap_ci(
 def summarise(errors: ArrayLike, seed: int | np.random.Generator = 0) -> dict:
     """The paper's figures for rotation errors (n,) in degrees, with 95 % bootstrap intervals.
 
-    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), and for each of the three NAME_ci: [low, high]}.
+    Returns {"n", "median" (degrees), "acc30", "acc15" (percent), for each of the three NAME_ci: [low, high], and
+    "above150": the percentage of errors above 150 degrees, mostly front taken for back}.
     Raises InputError where there is nothing to summarise.
     """
     errors = _errors(errors)
@@ -80,7 +81,7 @@ def summarise(errors: ArrayLike, seed: int | np.random.Generator = 0) -> dict:
     summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
     for name, figure in figures.items():
         summary[f"{name}_ci"] = list(bootstrap_ci(errors, figure, seed=rng))
-    return summary
+    return summary | {"above150": float(100 * np.mean(errors > 150))}
 
 
 def paired_test(
