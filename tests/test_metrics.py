@@ -94,7 +94,7 @@ def test_equal_errors_have_no_spread():
     summary = summarise([20.0] * 5)
     assert summary == {
         "n": 5, "median": 20, "acc30": 100, "acc15": 0,
-        "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0],
+        "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0,
     }  # fmt: skip
 
 
