@@ -11,14 +11,16 @@ from safetensors.torch import load_file
 
 from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, load_backbone
 from zsp_lite.errors import InputError
+from zsp_lite.synthetic.assembly import make_shape, make_sibling
+from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.batches import MEAN, STD, sample_batch
-from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss
+from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet, load_render_set, render_object, render_set
 from zsp_lite.training.train import Stage, Trainee, TrainingConfig, export_checkpoint, initialise, train
 
 TINY = TrainingConfig(
     objects=4, embed_dim=24, depth=2, num_heads=2, key_block=0,
-    stages=(Stage(2, 32, 2, 2, (0.5, 1.0), helpers=1.0), Stage(2, 32, 1, 6, (0.5, 1.0))),
+    stages=(Stage(2, 32, 2, 2, (0.5, 1.0), helpers=1.0), Stage(2, 32, 1, 8, (0.5, 1.0), view=1.0)),
 )  # fmt: skip
 
 
@@ -74,11 +76,12 @@ def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
 
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
     """A patch's surface point must be one that the uncropped view shows, and flips turn whole objects."""
-    batch = sample_batch(renders, np.random.default_rng(0), 3, 6, 96, (0.4, 1.0), members=np.array([0, 1, 2]))
-    assert batch.images.shape == (18, 3, 96, 96) and batch.surface.shape == (18, 144, 3)
-    for crop in range(18):
+    batch = sample_batch(renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2]))
+    crops = 3 * VIEWS
+    assert batch.images.shape == (crops, 3, 96, 96) and batch.surface.shape == (crops, 144, 3)
+    for crop in range(crops):
         points = batch.surface[crop][~batch.surface[crop, :, 0].isnan()].numpy()
-        view = renders.surface[crop // 6, crop % 6].reshape(-1, 3).astype(np.float32)
+        view = renders.surface[crop // VIEWS, crop % VIEWS].reshape(-1, 3).astype(np.float32)
         known = {tuple(point) for point in view[~np.isnan(view[:, 0])]}
         assert {tuple(point) for point in points} <= known
     covered = batch.coverage > 0.99
@@ -86,7 +89,7 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 
 def test_perfect_descriptors_match_and_random_ones_do_not(renders):
-    batch = sample_batch(renders, np.random.default_rng(1), 2, 6, 96, (0.8, 1.0))
+    batch = sample_batch(renders, np.random.default_rng(1), 2, VIEWS, 96, (0.8, 1.0))
 
     def loss(descriptors):
         return correspondence_loss(descriptors, batch.surface, 2, 0.15, 0.1, 256, torch.Generator().manual_seed(0))
@@ -99,15 +102,49 @@ def test_perfect_descriptors_match_and_random_ones_do_not(renders):
 
 def test_no_object_is_compared_with_another(renders):
     """The loss of two objects is the mean of the losses of each alone."""
-    batch = sample_batch(renders, np.random.default_rng(2), 2, 6, 96, (0.8, 1.0), members=np.array([0, 1]))
+    batch = sample_batch(renders, np.random.default_rng(2), 2, VIEWS, 96, (0.8, 1.0), members=np.array([0, 1]))
     z = fourier(batch.surface)
     full = dict(radius=0.15, temperature=0.1, queries=10**6)
     both = correspondence_loss(z, batch.surface, 2, generator=torch.Generator(), **full)[0]
     alone = [
         correspondence_loss(z[part], batch.surface[part], 1, generator=torch.Generator(), **full)[0]
-        for part in (slice(0, 6), slice(6, 12))
+        for part in (slice(0, VIEWS), slice(VIEWS, 2 * VIEWS))
     ]
     torch.testing.assert_close(both, torch.stack(alone).mean())
+
+
+def test_the_view_loss_asks_for_the_partner_and_takes_the_opposite_side_for_wrong():
+    """Two objects x 8 views; a pair shares its patches' descriptors, the others have their own."""
+    sides = F.normalize(torch.randn(2, 4, 9, 32, generator=torch.Generator().manual_seed(0)), dim=-1)
+    on_object = torch.ones(16, 9, dtype=torch.bool)
+    right, hits = view_loss(sides.repeat_interleave(2, 1).flatten(0, 1), on_object, 2, 0.03)
+    assert right < 1e-3 and hits == 1
+    # View 2k looks like view 2k + 5 of the opposite side: the partner never wins.
+    wrong, hits = view_loss(sides[:, [0, 2, 1, 3, 2, 0, 3, 1]].flatten(0, 1), on_object, 2, 0.03)
+    assert wrong > 5 and hits == 0
+
+
+def test_the_view_loss_sees_the_object_only():
+    z = F.normalize(torch.randn(8, 9, 16, generator=torch.Generator().manual_seed(1)), dim=-1)
+    on_object = torch.zeros(8, 9, dtype=torch.bool)
+    on_object[:, :5] = True
+    background = torch.where(on_object[..., None], z, z.flip(0))
+    torch.testing.assert_close(view_loss(z, on_object, 1, 0.1)[0], view_loss(background, on_object, 1, 0.1)[0])
+    highest = (z[0, :5] @ z[1, :5].T).amax(1).mean(), (z[1, :5] @ z[0, :5].T).amax(1).mean()
+    alone = view_loss(z[:2], on_object[:2], 1, 0.1)  # one partner, nothing to confuse it with
+    assert alone[0] == 0 and alone[1] == 1 and all(value <= 1 for value in highest)
+
+
+def test_siblings_keep_the_build_and_change_the_proportions():
+    """Vertex i of a sibling is the same place of the same part, so that correspondence is known."""
+    for generator in TRAINING.values():
+        first = make_shape(generator, 5)
+        other = make_sibling(generator, 5, np.random.default_rng(1))
+        np.testing.assert_array_equal(first.faces, other.faces)
+        np.testing.assert_array_equal(first.part, other.part)
+        assert np.abs(first.vertices - other.vertices).max() > 0.02
+    same = make_sibling(generator, 5, np.random.default_rng(1), amount=0.0)
+    np.testing.assert_allclose(same.vertices, first.vertices)
 
 
 def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
@@ -166,6 +203,20 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
         rows = [json.loads(line) for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
         assert [row["step"] for row in rows] == [1, 2, 3, 4]
     assert "held_out_accuracy" in rows[-1] and np.isfinite(rows[-1]["loss"])
+
+
+def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
+    quiet = dict(log=lambda line: None)
+    train(TINY, tmp_path / "first", folder, **quiet)
+    still = replace(TINY, learning_rate=0.0)
+    train(still, tmp_path / "second", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
+    load = dict(weights_only=True)
+    before = torch.load(tmp_path / "first" / "checkpoint.pt", **load)["average"]
+    after = torch.load(tmp_path / "second" / "checkpoint.pt", **load)["model"]
+    torch.testing.assert_close(after["backbone.pos_embed"], before["backbone.pos_embed"])
+    with pytest.raises(InputError, match="of another configuration"):
+        wider = replace(TINY, embed_dim=32)
+        train(wider, tmp_path / "third", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
 
 
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):

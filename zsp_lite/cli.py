@@ -114,13 +114,9 @@ def _add_demo(commands) -> None:
         commands, "demo", _demo, "one pair of each category, end to end: a table and a report of every stage",
         ["demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"],
     )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)"
-    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)")
     _add_backbone(parser)
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="default: outputs/demo"
-    )
+    parser.add_argument("--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="default: outputs/demo")
 
 
 def _demo(arguments: argparse.Namespace) -> None:
@@ -165,12 +161,8 @@ def _add_benchmark(commands) -> None:
     _add_data(parser)
     _add_backbone(parser)
     parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all of the folder's")
-    parser.add_argument(
-        "--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)"
-    )
-    parser.add_argument(
-        "--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)"
-    )
+    parser.add_argument("--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)")
+    parser.add_argument("--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)")
     parser.add_argument(
         "--methods", type=_names, default=["ours", "ours-bv", "rootsift"], metavar="A,B",
         help=f"rows of the table, some of {', '.join(METHOD_NAMES)} (default: ours,ours-bv,rootsift)",
@@ -226,15 +218,9 @@ def _add_synth(commands) -> None:
     )  # fmt: skip
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--preset", metavar="NAME", help="samples (what data_samples/ holds) or eval")
-    what.add_argument(
-        "--category", action="append", metavar="NAME", help="a category; may be given more than once"
-    )
-    parser.add_argument(
-        "--sequences", type=_count, metavar="N", help="with --category: sequences of each (default: 4)"
-    )
-    parser.add_argument(
-        "--frames", type=_count, metavar="N", help="with --category: frames per sequence (default: 24)"
-    )
+    what.add_argument("--category", action="append", metavar="NAME", help="a category; may be given more than once")
+    parser.add_argument("--sequences", type=_count, metavar="N", help="with --category: sequences of each (default: 4)")
+    parser.add_argument("--frames", type=_count, metavar="N", help="with --category: frames per sequence (default: 24)")
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
@@ -284,8 +270,9 @@ def _weights(arguments: argparse.Namespace) -> None:
 
 def _add_train(commands) -> None:
     parser = _command(
-        commands, "train", _train, "train the embedded backbone from random weights, or resume; hours on a CPU",
-        ["train --out outputs/train", "train --out outputs/try --shorten 0.02 --objects 60"],
+        commands, "train", _train, "train the embedded backbone, or resume; hours on a CPU",
+        ["train --out outputs/first", "train --out outputs/second --start-from outputs/first/checkpoint.pt",
+         "train --out outputs/try --shorten 0.02 --objects 60"],
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, default=Path("outputs/train"), metavar="DIR",
@@ -293,11 +280,11 @@ def _add_train(commands) -> None:
     )  # fmt: skip
     parser.add_argument("--renders", type=Path, metavar="DIR", help="training renders (default: OUT/renders)")
     parser.add_argument(
-        "--objects", type=_count, metavar="N", help="training objects (default: the configuration's)"
-    )
-    parser.add_argument(
-        "--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F"
-    )
+        "--start-from", type=Path, metavar="CKPT",
+        help="the second run of the recipe, from this checkpoint of the first one",
+    )  # fmt: skip
+    parser.add_argument("--objects", type=_count, metavar="N", help="training objects (default: the configuration's)")
+    parser.add_argument("--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F")
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
 
 
@@ -306,16 +293,18 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from tqdm import tqdm
 
-    from zsp_lite.training.train import TrainingConfig, train
+    from zsp_lite.training.train import CONTINUATION, TrainingConfig, train
 
-    config = TrainingConfig(seed=arguments.seed).shortened(arguments.shorten)
+    recipe = TrainingConfig() if arguments.start_from is None else CONTINUATION
+    config = replace(recipe, seed=arguments.seed).shortened(arguments.shorten)
     if arguments.objects:
         config = replace(config, objects=arguments.objects)
 
     def bar(shards, total):
         return tqdm(shards, "rendering", total, unit="shard", disable=None)
 
-    print(f"Written: {train(config, arguments.out, arguments.renders, progress=bar)}")
+    start = dict(start_from=arguments.start_from)
+    print(f"Written: {train(config, arguments.out, arguments.renders, progress=bar, **start)}")
 
 
 def _add_profile(commands) -> None:
@@ -323,9 +312,7 @@ def _add_profile(commands) -> None:
         commands, "profile", _profile, "time and memory of every stage, against the plain loops they replace",
         ["profile", "profile --repeats 2"],
     )  # fmt: skip
-    parser.add_argument(
-        "--repeats", type=_count, default=5, metavar="N", help="runs behind each median (default: 5)"
-    )
+    parser.add_argument("--repeats", type=_count, default=5, metavar="N", help="runs behind each median (default: 5)")
 
 
 def _profile(arguments: argparse.Namespace) -> None:
@@ -340,9 +327,7 @@ def _add_doctor(commands) -> None:
         commands, "doctor", _doctor, "what is installed and at hand, and the command that mends what is not",
         ["doctor", "doctor --data path/to/co3d"],
     )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="a CO3D folder to look at besides the usual ones"
-    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a CO3D folder to look at besides the usual ones")
 
 
 def _doctor(arguments: argparse.Namespace) -> int:

@@ -26,16 +26,25 @@ class Shape:
 
 
 class Assembly:
-    """Collects the parts of one object; generators draw every proportion from its random generator."""
+    """Collects the parts of one object; generators draw every proportion from its random generator.
 
-    def __init__(self, rng: np.random.Generator):
+    With `variation` every proportion moves from its draw by a normal deviate of `amount` of its range, while the
+    choices between parts stay: another object of the same build.
+    """
+
+    def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None, amount: float = 0.3):
         self.rng = rng
+        self._variation, self._amount = variation, amount
         self._meshes: list[Mesh] = []
         self._materials: list[int] = []
 
     def u(self, low: float, high: float) -> float:
         """A uniform draw from [low, high)."""
-        return float(self.rng.uniform(low, high))
+        value = float(self.rng.uniform(low, high))
+        if self._variation is not None:
+            low, high = min(low, high), max(low, high)
+            value = float(np.clip(value + self._variation.normal(0, self._amount) * (high - low), low, high))
+        return value
 
     def chance(self, probability: float) -> bool:
         """True with the given probability."""
@@ -77,6 +86,19 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 def make_shape(generator: Callable[[Assembly], None], seed: int | list[int]) -> Shape:
     """The object that `generator` builds from `seed`; the same seed gives the same object."""
     assembly = Assembly(np.random.default_rng(seed))
+    generator(assembly)
+    return assembly.shape()
+
+
+def make_sibling(
+    generator: Callable[[Assembly], None], seed: int | list[int], variation: np.random.Generator, amount: float = 0.3
+) -> Shape:
+    """The object that `generator` builds from `seed` with other proportions: the same parts in the same order.
+
+    As long as the generator takes only choices, not proportions, to decide which parts there are, vertex i is the
+    same place on all siblings: correspondence between objects that differ as instances of a category do.
+    """
+    assembly = Assembly(np.random.default_rng(seed), variation, amount)
     generator(assembly)
     return assembly.shape()
 

@@ -67,7 +67,7 @@ def sample_batch(
 ) -> Batch:  # fmt: skip
     """Draw a batch of square crops of `side` pixels whose width is a fraction `scale` (low, high) of the render's.
 
-    views is 6, all of them, or 2, a pair from one side of the object. `members` fixes the objects by index.
+    views is 8, all of them, or 2, a pair from one side of the object. `members` fixes the objects by index.
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)

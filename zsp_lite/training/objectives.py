@@ -49,6 +49,31 @@ def correspondence_loss(
     return torch.stack(losses).mean(), torch.stack(hits).mean().item()
 
 
+def view_loss(
+    descriptors: Float[Tensor, "crops n dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float
+) -> tuple[Tensor, float]:
+    """Which of the object's other views looks from the same side? Cross-entropy over the best-view score.
+
+    Views come in pairs (2k, 2k + 1). The score of two views is what the method chooses the best view by, in a form
+    with gradients: the mean over one view's object patches of the highest similarity in the other. Opposite sides,
+    front and back, are among the wrong answers. Returns the loss and the share of views whose partner scores highest.
+    """
+    crops, n, dim = descriptors.shape
+    views = crops // objects
+    z, on = descriptors.reshape(objects, views * n, dim), on_object.reshape(objects, views, n)
+    product = (z @ z.transpose(1, 2)).view(objects, views, n, views, n)
+    highest = product.masked_fill(~on[:, None, None], -1).amax(-1)  # (objects, views, n, views)
+    score = (highest * on[..., None]).sum(2) / on.sum(2).clamp_min(1)[..., None]
+    score = (score + score.transpose(1, 2)) / 2
+    itself = torch.eye(views, dtype=torch.bool, device=z.device)
+    logits = (score / temperature).masked_fill(itself, -1e4).flatten(0, 1)
+    partner = (torch.arange(views, device=z.device) ^ 1).repeat(objects)
+    seen = (on.sum(2) > 3).flatten()
+    loss = F.cross_entropy(logits[seen], partner[seen]) if seen.any() else descriptors.sum() * 0
+    hits = (logits.argmax(1) == partner)[seen].float().mean().item() if seen.any() else 0.0
+    return loss, hits
+
+
 def geometry_loss(
     prediction: Float[Tensor, "crops n 5"], geometry: Float[Tensor, "crops n 4"], on_object: Bool[Tensor, "crops n"]
 ) -> Tensor:

@@ -1,7 +1,7 @@
 """The training set: several views of one object at a time, with what a renderer knows about each."""
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.synthetic.appearance import random_appearance
-from zsp_lite.synthetic.assembly import deform, make_shape
+from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_sibling
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 
-VIEWS = 6
+VIEWS = 8
 SIZE = 192
 GRID = 48
 SHARD = 200
@@ -39,9 +39,11 @@ class RenderSet:
 def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render one training object; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
 
-    Half of the objects come from the named training categories, half are random assemblies. Views come in three pairs
-    around the object; every view shows a gently deformed copy under its own materials, light and room, so that only
-    what is shared by all views, the object's structure, can tell one place from another.
+    Half of the objects come from the named training categories, half are random assemblies. Views come in four pairs,
+    a quarter turn apart: the two of a pair look from nearly the same side, and every side's opposite is there too.
+    Every view shows a copy with other proportions (`make_sibling`), gently deformed, now and then without one of its
+    parts, under its own materials, light and room, so that only what all views share, the object's build, can tell
+    one place from another.
     """
     rng = np.random.default_rng([seed, 0])
     generators = list(TRAINING.values()) if generators is None else generators
@@ -54,9 +56,9 @@ def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, n
     step = SIZE // GRID
     for view in range(VIEWS):
         if view % 2 == 0:
-            azimuth = start + (view // 2) * 2 * np.pi / 3 + rng.normal(0, 0.3)
+            azimuth = start + (view // 2) * np.pi / 2 + rng.normal(0, 0.2)
             elevation = rng.uniform(-0.05, 0.9)
-        scene = Scene(shape, deform(shape, rng))
+        scene = _altered(shape, make_sibling(generator, [seed, 1], rng), rng)
         R, t = orbit_pose(
             azimuth + rng.normal(0, 0.2), np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
             rng.uniform(5, 10), scene.centre,
@@ -70,6 +72,17 @@ def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, n
         geometry[view, ..., :3] = image.normals[every]
         geometry[view, ..., 3] = np.where(mask, (depth - depth[mask].mean()) / spread, 0)
     return rgb, surface, geometry
+
+
+def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator) -> Scene:
+    """The scene of a deformed copy of `sibling` whose pixels keep the surface coordinates of `shape`."""
+    same_build = np.array_equal(shape.faces, sibling.faces)
+    vertices = deform(sibling if same_build else shape, rng)
+    part = shape.part[shape.faces[:, 0]]
+    size = np.bincount(part)
+    gone = (rng.random(len(size)) < 0.06) & (size < 0.3 * len(part))
+    kept = ~gone[part]
+    return Scene(replace(shape, faces=shape.faces[kept], material=shape.material[kept]), vertices)
 
 
 def _render_shard(first: int, count: int, folder: Path, seed: int) -> Path:
@@ -87,7 +100,7 @@ def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, wo
                progress=lambda iterable, total: iterable) -> list[Path]:  # fmt: skip
     """Render `objects` objects (rounded up to whole shards) into `folder`, or reuse what is there.
 
-    Returns the shard paths; a killed run continues with the first missing shard. About 90 ms and 0.7 MB per object.
+    Returns the shard paths; a killed run continues with the first missing shard. About 1.1 MB per object.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,10 @@
-"""Train the embedded backbone from random weights: stages from small crops and geometry to full size.
+"""Train the embedded backbone in two runs, each in stages from small crops to full size.
 
-The recipe, in the order of the stages: first the patch tokens learn geometry, for correspondence alone drowns in
-its own gradient noise when it starts from nothing; then correspondence takes over at 96 px, where crops are
-cheap; last come larger crops, up to the size that the method uses. An exponential
-average of the weights is what is evaluated and exported.
+The first run starts from random weights (`TrainingConfig`'s defaults). In the order of its stages: the patch tokens
+learn geometry, for correspondence alone drowns in its own gradient noise when it starts from nothing; then
+correspondence takes over at 96 px, where crops are cheap; last come larger crops, up to the size that the method
+uses. The second run (`CONTINUATION`) starts from there and adds the choice of the view. An exponential average of the
+weights is what is evaluated and exported.
 """
 
 import json
@@ -24,8 +25,8 @@ from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
-from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss
-from zsp_lite.training.renders import SHARD, RenderSet, load_render_set, render_set
+from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
+from zsp_lite.training.renders import SHARD, VIEWS, RenderSet, load_render_set, render_set
 from zsp_lite.vit import TrainingTokens, VisionTransformer
 
 
@@ -33,7 +34,8 @@ from zsp_lite.vit import TrainingTokens, VisionTransformer
 class Stage:
     """A stretch of training: crops of `side` pixels, `objects` x `views` of them a step.
 
-    `correspondence` is the weight of that loss at the stage's start and end, `helpers` that of the other two.
+    `correspondence` is the weight of that loss at the stage's start and end, `helpers` that of geometry and
+    attention, `view` that of the choice of the view, which needs all views of an object.
     """
 
     steps: int
@@ -44,6 +46,7 @@ class Stage:
     correspondence: tuple[float, float] = (1.0, 1.0)
     helpers: float = 0.4
     radius: float = 0.15
+    view: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class TrainingConfig:
     """Everything that decides the result; `seed` fixes objects, crops and initial weights."""
 
     seed: int = 0
-    objects: int = 7000
+    objects: int = 5600
     embed_dim: int = 192
     depth: int = 12
     num_heads: int = 6
@@ -59,15 +62,16 @@ class TrainingConfig:
     learning_rate: float = 1e-3
     weight_decay: float = 0.05
     temperature: float = 0.1
+    view_temperature: float = 0.03
     queries: int = 256
     average: float = 0.998
     stages: tuple[Stage, ...] = (
         Stage(1200, 96, 8, 2, (0.4, 1.0), correspondence=(0.1, 0.1), helpers=1.0),
-        Stage(700, 96, 4, 6, (0.4, 1.0), correspondence=(0.1, 1.0), helpers=1.0),
-        Stage(3000, 96, 4, 6, (0.4, 1.0)),
-        Stage(1300, 128, 4, 6, (0.5, 1.0)),
-        Stage(500, 184, 2, 6, (0.75, 1.0), radius=0.12),
-        Stage(250, 224, 2, 6, (0.85, 1.0), radius=0.12),
+        Stage(700, 96, 3, 8, (0.4, 1.0), correspondence=(0.1, 1.0), helpers=1.0),
+        Stage(3000, 96, 3, 8, (0.4, 1.0)),
+        Stage(1300, 128, 3, 8, (0.5, 1.0)),
+        Stage(500, 184, 2, 8, (0.75, 1.0), radius=0.12),
+        Stage(250, 224, 1, 8, (0.85, 1.0), radius=0.12),
     )
 
     @property
@@ -79,6 +83,18 @@ class TrainingConfig:
         if not 0 < factor <= 1000:
             raise InputError(f"steps are to be multiplied by {factor}, expected more than 0 and at most 1000")
         return replace(self, stages=tuple(replace(s, steps=max(1, round(s.steps * factor))) for s in self.stages))
+
+
+# The second run, which starts from the first one's weights: now the choice of the view counts as much.
+CONTINUATION = TrainingConfig(
+    learning_rate=5e-4,
+    stages=(
+        Stage(2800, 96, 3, 8, (0.4, 1.0), view=1.0),
+        Stage(1300, 128, 3, 8, (0.6, 1.0), view=1.0),
+        Stage(300, 184, 2, 8, (0.8, 1.0), radius=0.12, view=1.0),
+        Stage(350, 224, 1, 8, (0.9, 1.0), radius=0.12, view=1.0),
+    ),
+)
 
 
 class Trainee(nn.Module):
@@ -122,7 +138,7 @@ def initialise(model: Trainee, renders: RenderSet, seed: int) -> None:
         backbone.pos_embed.zero_()
         backbone.pos_embed[0, 1:] = 0.25 * _sincos(dim, backbone.image_size // backbone.patch_size)
         rng = np.random.default_rng([seed, 1])
-        images = torch.cat([sample_batch(renders, rng, 20, 6, 96, (0.4, 1.0)).images for _ in range(4)])
+        images = torch.cat([sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)).images for _ in range(4)])
         p = backbone.patch_size
         patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
         patches = patches - patches.mean(0)
@@ -154,32 +170,41 @@ def losses(model: Trainee, batch: Batch, stage: Stage, weight: float, config: Tr
         for head, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input))
     )
     attention, iou = attention_loss(out.cls_logits.float(), batch.coverage)
+    descriptors = model.descriptors(out.keys, update_mean=True)
     match, accuracy = correspondence_loss(
-        model.descriptors(out.keys, update_mean=True), batch.surface, batch.objects, stage.radius, config.temperature,
-        config.queries, generator,
-    )  # fmt: skip
+        descriptors, batch.surface, batch.objects, stage.radius, config.temperature, config.queries, generator
+    )
     total = weight * match + stage.helpers * (geometry + attention)
-    figures = dict(loss=total, match=match, geometry=geometry, attention=attention)
-    return total, {name: value.item() for name, value in figures.items()} | dict(accuracy=accuracy, iou=iou)
+    figures = dict(match=match, geometry=geometry, attention=attention)
+    shares = dict(accuracy=accuracy, iou=iou)
+    if stage.view:
+        figures["view"], shares["view_accuracy"] = view_loss(
+            descriptors, on_object, batch.objects, config.view_temperature
+        )
+        total = total + stage.view * figures["view"]
+    return total, {name: value.item() for name, value in (dict(loss=total) | figures).items()} | shares
 
 
 @torch.no_grad()
 def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 128, objects: int = 24) -> dict[str, float]:
-    """Match accuracy and saliency IoU on TRAINING-category objects that no step has seen; same crops every time."""
+    """Match accuracy, view accuracy and saliency IoU on TRAINING-category objects that no step has seen.
+
+    The same crops every time.
+    """
     rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)
-    hits, ious = [], []
+    hits, views, ious = [], [], []
     device = next(model.parameters()).device
     for first in range(0, min(objects, len(renders)), 2):
         members = np.arange(first, min(first + 2, len(renders)))
-        batch = _to(sample_batch(renders, rng, len(members), 6, side, (0.85, 1.0), members=members), device)
+        batch = _to(sample_batch(renders, rng, len(members), VIEWS, side, (0.85, 1.0), members=members), device)
         with torch.autocast(device.type, torch.bfloat16):
             out = model(batch.images)
-        _, accuracy = correspondence_loss(
-            model.descriptors(out.keys), batch.surface, len(members), 0.15, 0.1, 256, generator
-        )
-        hits.append(accuracy)
+        descriptors, on_object = model.descriptors(out.keys), ~batch.surface[..., 0].isnan()
+        hits.append(correspondence_loss(descriptors, batch.surface, len(members), 0.15, 0.1, 256, generator)[1])
+        views.append(view_loss(descriptors, on_object, len(members), 0.03)[1])
         ious.append(attention_loss(out.cls_logits.float(), batch.coverage)[1])
-    return dict(held_out_accuracy=float(np.mean(hits)), held_out_iou=float(np.mean(ious)))
+    means = dict(held_out_accuracy=hits, held_out_view_accuracy=views, held_out_iou=ious)
+    return {name: float(np.mean(values)) for name, values in means.items()}
 
 
 def _to(batch: Batch, device) -> Batch:
@@ -197,10 +222,12 @@ def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
 def train(
     config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
     progress=lambda iterable, total: iterable, checkpoint_every: int = 250, log_every: int = 50,
+    start_from: Path | None = None,
 ) -> Path:  # fmt: skip
     """Train from scratch, or resume from `folder`/checkpoint.pt, and export `folder`/zsp-tiny.safetensors.
 
     folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights;
+    `start_from` names a checkpoint of an earlier run of the same shape: its weight average becomes the start.
     `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
     its shards. The checkpoint holds model, average, optimiser and step; batches depend only on (seed, step), so a
     resumed run continues as if nothing had happened.
@@ -224,20 +251,18 @@ def train(
     torch.manual_seed(config.seed)
     model = Trainee(config)
     initialise(model, training, config.seed)
+    if start_from is not None:
+        _load(model, "average", start_from)
     model.to(device)
     average = Trainee(config).to(device)
     average.load_state_dict(model.state_dict())
     optimiser = _optimiser(model, config)
     step = 0
     if checkpoint_file.exists():
-        try:
-            state = torch.load(checkpoint_file, map_location=device, weights_only=True)
-            model.load_state_dict(state["model"])
-            average.load_state_dict(state["average"])
-            optimiser.load_state_dict(state["optimiser"])
-            step = state["step"]
-        except Exception as error:  # torch raises whatever its unpickler stumbles over
-            raise InputError(f"{checkpoint_file}: damaged, remove it to train from the start") from error
+        state = _load(model, "model", checkpoint_file)
+        average.load_state_dict(state["average"])
+        optimiser.load_state_dict(state["optimiser"])
+        step = state["step"]
     smooth: dict[str, float] = {}
     earlier = _log_until(folder / "log.jsonl", step)
     start = time.monotonic() - (json.loads(earlier[-1])["seconds"] if earlier else 0)
@@ -278,6 +303,16 @@ def train(
             torch.save(state, checkpoint_file.with_suffix(".part"))
             checkpoint_file.with_suffix(".part").replace(checkpoint_file)
     return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
+
+
+def _load(model: Trainee, name: str, path: Path) -> dict:
+    """Fill `model` with part `name` of a checkpoint, and return the whole checkpoint."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        model.load_state_dict(state[name])
+        return {"average": state["average"], "optimiser": state["optimiser"], "step": state["step"]}
+    except Exception as error:  # torch raises whatever its unpickler stumbles over
+        raise InputError(f"{path}: damaged, or of another configuration; remove it to train from the start") from error
 
 
 def _log_until(path: Path, step: int) -> list[str]:
