@@ -2,6 +2,7 @@
 
 The released DINO models (Caron et al. 2021) are plain data below; "zsp-tiny" is this project's own small
 model, part of the package. Any checkpoint in the DINO layout works by its path; its geometry is read off its shapes.
+"hf:NAME" is a vision transformer in Hugging Face's format (see `huggingface`).
 """
 
 import os
@@ -19,13 +20,12 @@ from torch import Tensor
 from zsp_lite.checkpoints import build_vit, read_checkpoint
 from zsp_lite.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.errors import InputError
+from zsp_lite.facets import Facet, block_index, check_facet, extract
 from zsp_lite.features import FeatureMap
+from zsp_lite.huggingface import PREFIX, HuggingFaceViT, load_huggingface, model_folder, nearest_multiple
 from zsp_lite.vit import VisionTransformer
 
-Image = (
-    Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"]
-    | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
-)
+Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 Precision = Literal["float32", "bfloat16"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -62,19 +62,23 @@ RELEASES = {
 class Backbone:
     """A vision transformer ready for the method: call it on a list of images.
 
-    Attributes: name, image_size (pixels, square), patch_size, embed_dim, key_block (0-based), saliency_heads,
-    device, precision, batch_size, model.
+    Attributes: name, image_size (pixels, square), patch_size, embed_dim, key_block (0-based), facet, saliency_heads,
+    mean, std (of RGB in [0, 1], normalised by), device, precision, batch_size, model.
     """
 
     def __init__(
         self,
-        model: VisionTransformer,
+        model: VisionTransformer | HuggingFaceViT,
         name: str,
-        key_block: int | None = None,
+        key_block: int | str | None = None,
         saliency_heads: Sequence[int] | None = None,
         device: str | torch.device | None = None,
         precision: Precision = "float32",
         batch_size: int = 8,
+        facet: Facet = "key",
+        image_size: int | None = None,
+        mean: Sequence[float] = IMAGENET_MEAN,
+        std: Sequence[float] = IMAGENET_STD,
     ):
         if precision not in ("float32", "bfloat16"):
             raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
@@ -87,22 +91,24 @@ class Backbone:
             small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
             saliency_heads = (0, 2, 4, 5) if small else range(model.num_heads)
         saliency_heads = tuple(int(head) for head in saliency_heads)
-        if not 0 <= key_block < model.depth:
-            raise InputError(f"{name}: key_block is {key_block}, expected 0 to {model.depth - 1}")
+        key_block = block_index(key_block, model.depth, name)
         if not saliency_heads or not set(saliency_heads) <= set(range(model.num_heads)):
             raise InputError(
                 f"{name}: saliency_heads are {saliency_heads}, expected some of 0 to {model.num_heads - 1}"
             )
         self.name, self.key_block, self.saliency_heads = name, key_block, saliency_heads
+        self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
         self.precision, self.batch_size = precision, batch_size
-        self.image_size, self.patch_size, self.embed_dim = model.image_size, model.patch_size, model.embed_dim
+        self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
+        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
         self.device = _device(device)
         self.model = model.to(self.device).eval().requires_grad_(False)
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Features of (H, W, 3) images, uint8 or float in [0, 1], of any sizes, in float32 on its device.
 
-        Images are resized to the model's square (224 pixels) without keeping their aspect, as in the paper.
+        Images are resized to a square (of 224 pixels unless told) without keeping their aspect, as in the paper.
+        A FeatureMap's keys are the chosen facet of the chosen block.
         Saliency is the CLS attention averaged over the saliency heads, minimum
         to 0, maximum to 1. Raises InputError on others.
         """
@@ -115,8 +121,8 @@ class Backbone:
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         half = self.precision == "bfloat16"
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-            mean, std = (batch.new_tensor(x).view(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_STD))
-            tokens = self.model.extract((batch - mean) / std, self.key_block)
+            mean, std = (batch.new_tensor(x).view(3, 1, 1) for x in (self.mean, self.std))
+            tokens = extract(self.model, (batch - mean) / std, self.key_block, self.facet)
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
@@ -131,34 +137,65 @@ def load_backbone(
     device: str | torch.device | None = None,
     *,
     num_heads: int | None = None,
+    layer: int | str | None = None,
+    facet: Facet = "key",
     key_block: int | None = None,
     saliency_heads: Sequence[int] | None = None,
+    image_size: int | None = None,
     precision: Precision = "float32",
     batch_size: int = 8,
 ) -> Backbone:
-    """A backbone by name ("zsp-tiny", "dino_vits8", ...: see `available_backbones`) or by checkpoint file.
+    """A backbone by name ("zsp-tiny", "dino_vits8", ...: see `available_backbones`), by checkpoint file, or "hf:NAME".
 
     DINO models are downloaded on first use to `cache_folder()`. A checkpoint is a .safetensors file or a
-    torch file of tensors alone, also nested under "teacher", "state_dict" or "model". num_heads, key_block
-    (0-based) and saliency_heads default to the file's metadata, then to the DINO conventions. device: None
-    takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises InputError
-    for unknown names, downloads that fail (saying what to do) and files that are not such a checkpoint.
+    torch file of tensors alone, also nested under "teacher", "state_dict" or "model". hf:NAME is a model of the
+    Hugging Face hub, or a folder in its format (see `huggingface.load_huggingface`; needs the extra "transformers").
+    layer: the block that describes patches, as "block9", "last", or a number from 0, negative ones from the end;
+    key_block is its older name. facet: what of that block, "key" (the paper's), "query", "value" or "token" (its
+    output). image_size: pixels, to the nearest multiple of the patch size; default the checkpoint's, 224 for hf:NAME.
+    num_heads, layer and saliency_heads default to the file's metadata, then to the DINO conventions; for hf:NAME to
+    the paper's depth (three quarters of the blocks) and all heads.
+    device: None takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises
+    InputError for unknown names, layers and facets, downloads that fail (saying what to do) and files that are not
+    such a checkpoint.
     """
     name = str(name_or_path)
     path = Path(name).expanduser()
+    if layer is not None and key_block is not None:
+        raise InputError(f"{name}: layer {layer!r} and key_block {key_block} are one thing, expected one of the two")
+    layer = key_block if layer is None else layer
+    check_facet(facet, name)
+    options = {"device": device, "precision": precision, "batch_size": batch_size, "facet": facet}
+    # Benchmark runs are told apart by name.
+    chosen = [] if facet == "key" else [facet]
+    chosen += [] if image_size is None else [f"{image_size} px"]
+    suffix = f" ({', '.join(chosen)})" if chosen else ""
+    if name.startswith(PREFIX):
+        if num_heads is not None:
+            raise InputError(f"{name}: num_heads is {num_heads}, expected none: the model's configuration has it")
+        model = load_huggingface(name, image_size)
+        layer = 3 * model.depth // 4 if layer is None else layer
+        heads = range(model.num_heads) if saliency_heads is None else saliency_heads
+        if model.mean is not None:
+            options |= {"mean": model.mean, "std": model.std}
+        folder = Path(name.removeprefix(PREFIX)).expanduser()
+        label = PREFIX + folder.resolve().name if folder.is_dir() else name
+        return Backbone(model, label + suffix, layer, heads, **options)
     if name in available_backbones():
         path, label = download(name), name
     elif path.is_file():
         label = path.stem
     else:
-        raise InputError(f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}")
+        raise InputError(
+            f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}, nor {PREFIX}NAME"
+        )
     weights, metadata = read_checkpoint(path)
     model = build_vit(weights, num_heads or _metadata_int(metadata, "num_heads", path), path.name)
-    if key_block is None:
-        key_block = _metadata_int(metadata, "key_block", path)
+    if layer is None:
+        layer = _metadata_int(metadata, "key_block", path)
     if saliency_heads is None and "saliency_heads" in metadata:
         saliency_heads = _metadata_ints(metadata, "saliency_heads", path)
-    return Backbone(model, label, key_block, saliency_heads, device, precision, batch_size)
+    return Backbone(model, label + suffix, layer, saliency_heads, image_size=image_size, **options)
 
 
 def available_backbones() -> dict[str, Path | None]:
@@ -168,7 +205,12 @@ def available_backbones() -> dict[str, Path | None]:
 
 
 def download(name: str) -> Path:
-    """The file of a named backbone, fetched if it is not at hand. Raises InputError saying what to do."""
+    """The file (of hf:NAME: the folder) of a named backbone, fetched if it is not at hand.
+
+    Raises InputError saying what to do.
+    """
+    if name.startswith(PREFIX):
+        return model_folder(name)
     if name == "zsp-tiny":
         if not TINY.is_file():
             raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")
@@ -200,9 +242,7 @@ def verify(name_or_path: str | Path) -> None:
     load_backbone(name, "cpu")
 
 
-def prepare_images(
-    images: Sequence[Image], size: int = 224, first: int = 0
-) -> Float[Tensor, "b 3 s s"]:
+def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:
     """Images (H, W, 3), uint8 or float in [0, 1], as one batch in [0, 1], resized (bilinear, antialiased).
 
     `first` is the number of the first image in error messages. Raises InputError on other types, shapes or values.
