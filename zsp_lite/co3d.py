@@ -111,6 +111,19 @@ class Co3D:
                 return index.frame(position)
         raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
 
+    def camera(self, annotation: FrameAnnotation) -> Camera:
+        """The frame's camera alone. Raises InputError where the annotation has no usable viewpoint."""
+        name = f"{annotation.sequence_name}/{annotation.frame_number}"
+        view = annotation.viewpoint
+        if view is None:
+            raise InputError(f"frame {name} has no viewpoint, expected a camera")
+        try:
+            return Camera.from_pytorch3d(
+                view.R, view.T, view.focal_length, view.principal_point, annotation.image.size, view.intrinsics_format
+            )
+        except InputError as error:
+            raise InputError(f"frame {name}: {error}") from error
+
     def load(self, annotation: FrameAnnotation) -> Frame:
         """The frame's image, camera and, where annotated, depth and mask.
 
@@ -118,16 +131,8 @@ class Co3D:
         has no viewpoint, a path leaves the data folder, or a file is missing,
         corrupt or of another size than annotated.
         """
+        camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
-        view, size = annotation.viewpoint, annotation.image.size
-        if view is None:
-            raise InputError(f"frame {name} has no viewpoint, expected a camera")
-        try:
-            camera = Camera.from_pytorch3d(
-                view.R, view.T, view.focal_length, view.principal_point, size, view.intrinsics_format
-            )
-        except InputError as error:
-            raise InputError(f"frame {name}: {error}") from error
         rgb = self._read(read_image, annotation.image.path, size)
         mask = None if annotation.mask is None else self._read(read_mask, annotation.mask.path, size)
         depth = None

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
+from zsp_lite.matchers import MATCHERS, Matcher
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 
@@ -35,7 +36,7 @@ class Matches:
     reference: Int[np.ndarray, "k 2"]  # (row, column) on the reference's grid
     target: Int[np.ndarray, "k 2"]  # (row, column) on the target's grid
     similarity: Float[np.ndarray, "k"]  # cosine of the two log-binned descriptors
-    distance: Float[np.ndarray, "k"]  # d(u, u') >= 0 of the cycle, in patches
+    distance: Float[np.ndarray, "k"]  # d(u, u') >= 0 of the cycle, in patches; of another matcher minus its score
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -67,6 +68,15 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
         cosine = summed.view(product.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
         results.append(cosine)
     return results
+
+
+def plain_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
+    """Cosine of the bare keys of one reference against several targets, without the log-binned surroundings."""
+    first = F.normalize(_keys(ref, "ref").flatten(0, 1), dim=1)
+    return [
+        first @ F.normalize(_keys(target, f"target {index}").flatten(0, 1), dim=1).T
+        for index, target in enumerate(targets)
+    ]
 
 
 def nearest_neighbours(
@@ -118,6 +128,7 @@ def match(
     ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,
+    matcher: str | Matcher = "cyclical",
 ) -> Matches:
     """At most k correspondences between two feature maps (section 4.1; supplement, "K-Means clustering").
 
@@ -128,9 +139,12 @@ def match(
     cycle_from="reference" is the paper's way. "target" is the published code's: cycles start in the target,
     clusters and salience are the target's, and `cyclical_distances` masks in its published form. Foreground
     is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
+    matcher: another way to choose and rank partners than by cyclical distance, a name in `MATCHERS` or a function.
     """
     if k < 1:
         raise InputError(f"match: k is {k}, expected at least 1")
+    if isinstance(matcher, str) and matcher not in ("cyclical", *MATCHERS):
+        raise InputError(f"match: matcher is {matcher!r}, expected one of cyclical, {', '.join(MATCHERS)}")
     if cycle_from not in ("reference", "target"):
         raise InputError(f"match: cycle_from is {cycle_from!r}, expected 'reference' or 'target'")
     sim = similarity(ref, target) if sim is None else torch.as_tensor(sim)
@@ -140,21 +154,27 @@ def match(
         start, end, on_start, on_end = ref, target, on_ref, on_target
     else:
         start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
-    published = cycle_from == "target"
-    cyclical = cyclical_distances(sim, start.grid, end.grid, on_start, on_end, published).flatten()
-    best, neighbour = sim.max(dim=1)
+    if matcher == "cyclical":
+        published = cycle_from == "target"
+        score = cyclical_distances(sim, start.grid, end.grid, on_start, on_end, published).flatten()
+        best, neighbour = sim.max(dim=1)
+    else:
+        on_start = _mask(on_start, start.grid, "ref_foreground", sim.device)
+        on_end = _mask(on_end, end.grid, "target_foreground", sim.device)
+        neighbour, score = (MATCHERS[matcher] if isinstance(matcher, str) else matcher)(sim, on_start, on_end)
+        best = sim.gather(1, neighbour[:, None])[:, 0]
 
     # Off the device once; a few hundred candidates are a matter for numpy.
-    cyclical, best, neighbour = (x.cpu().numpy() for x in (cyclical, best, neighbour))
-    order = np.lexsort((np.arange(len(best)), -best, -cyclical))
-    order = order[np.isfinite(cyclical[order])][: 2 * k if kmeans else k]
+    score, best, neighbour = (x.cpu().numpy() for x in (score, best, neighbour))
+    order = np.lexsort((np.arange(len(best)), -best, -score))
+    order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order), k, np.random.default_rng(seed))
         order = order[_most_salient(clusters, start.saliency.flatten().cpu().numpy()[order])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
     v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
     reference, matched = (u, v) if cycle_from == "reference" else (v, u)
-    return Matches(reference, matched, best[order], -cyclical[order])
+    return Matches(reference, matched, best[order], -score[order])
 
 
 def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
@@ -232,9 +252,7 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
 
 
-def _most_salient(
-    labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]
-) -> Int[np.ndarray, "clusters"]:
+def _most_salient(labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]) -> Int[np.ndarray, "clusters"]:
     """Index of each cluster's most salient point (ties: the first), ascending."""
     order = np.lexsort((np.arange(len(labels)), -salience, labels))
     _, first = np.unique(labels[order], return_index=True)

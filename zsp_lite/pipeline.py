@@ -19,7 +19,8 @@ from zsp_lite.depth import patch_points
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame, crop_to_object, resize_frame
-from zsp_lite.matching import Matches, match, similarities
+from zsp_lite.matchers import MATCHERS, Matcher
+from zsp_lite.matching import Matches, match, plain_similarities, similarities
 
 if TYPE_CHECKING:
     from zsp_lite.backbones import Backbone
@@ -110,6 +111,8 @@ class ZeroShotPose:
     scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
     foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
     cycle_from: "reference" as in the paper, or "target" as in its published code.
+    matcher: "cyclical" as in the paper, or another way to choose matches: see `matchers`.
+    binning: compare log-binned descriptors as in the paper, or the bare keys.
     Raises InputError for a setting out of its range.
     """
 
@@ -123,10 +126,14 @@ class ZeroShotPose:
     saliency_threshold: float = 0.05
     foreground: Literal["saliency", "mask"] = "saliency"
     cycle_from: Literal["reference", "target"] = "reference"
+    matcher: str | Matcher = "cyclical"
+    binning: bool = True
     seed: int = 0
 
     def __post_init__(self):
+        matchers = ("cyclical", *MATCHERS)
         for name, value, allowed in (
+            ("matcher", self.matcher if isinstance(self.matcher, str) else "cyclical", matchers),
             ("view_selector", self.view_selector, tuple(VIEW_SELECTORS)),
             ("foreground", self.foreground, ("saliency", "mask")),
             ("cycle_from", self.cycle_from, ("reference", "target")),
@@ -160,22 +167,34 @@ class ZeroShotPose:
             raise InputError("no target views, expected at least one")
         timings = dict(timings or {})
         with _timed(timings, "matching"):
-            features = [target.features for target in targets]
-            comparisons = [
-                Comparison(
-                    reference.features,
-                    target.features,
-                    reference.foreground,
-                    target.foreground,
-                    sim,
-                    match(
-                        reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
-                        ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim,
-                    ),
-                    self.k,
-                )
-                for target, sim in zip(targets, similarities(reference.features, features))
-            ]  # fmt: skip
+            sims = self.similarities(reference, targets)
+            comparisons = [self.compare(reference, target, sim) for target, sim in zip(targets, sims)]
+        return self.estimate_from_comparisons(reference, targets, comparisons, timings)
+
+    def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
+        """Cosines between the descriptors of the reference's patches and of each target's."""
+        compared = similarities if self.binning else plain_similarities
+        return compared(reference.features, [target.features for target in targets])
+
+    def compare(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> Comparison:
+        """The matches between the reference and one target view, and what a view selector looks at."""
+        matches = match(
+            reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
+            ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
+        )  # fmt: skip
+        return Comparison(
+            reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
+        )
+
+    def estimate_from_comparisons(
+        self,
+        reference: View,
+        targets: Sequence[View],
+        comparisons: Sequence[Comparison],
+        timings: dict[str, float] | None = None,
+    ) -> PoseEstimate:
+        """The last two stages: choose the view and align (sec. 4.2 and 4.3)."""
+        timings = dict(timings or {})
         with _timed(timings, "view"):
             scores = np.array([VIEW_SELECTORS[self.view_selector](comparison) for comparison in comparisons])
             best = int(scores.argmax())

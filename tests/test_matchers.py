@@ -1,0 +1,97 @@
+"""Matchers against their definitions, worked out another way: POT for the transport, loops for mutual neighbours."""
+
+import numpy as np
+import ot
+import pytest
+import torch
+from test_matching import feature_map
+
+from zsp_lite.errors import InputError
+from zsp_lite.matchers import MATCHERS, dual_softmax, mutual, optimal_transport, sinkhorn
+from zsp_lite.matching import match, plain_similarities
+from zsp_lite.pipeline import ZeroShotPose
+
+
+def similarities(seed: int = 0, n1: int = 12, n2: int = 15) -> torch.Tensor:
+    return torch.rand(n1, n2, generator=torch.Generator().manual_seed(seed))
+
+
+def masks(n1: int = 12, n2: int = 15) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.arange(n1) % 4 > 0, torch.arange(n2) % 3 > 0
+
+
+def test_the_transport_plan_is_pots():
+    sim = similarities()
+    uniform = [np.full(n, 1 / n) for n in sim.shape]
+    expected = ot.sinkhorn(*uniform, 1 - sim.double().numpy(), reg=0.05, numItermax=5000, stopThr=1e-14)
+    assert np.abs(sinkhorn(1 - sim, 0.05, 5000).numpy() - expected).max() < 1e-9
+
+
+def test_the_transport_of_a_permutation_is_the_permutation():
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(1))
+    everywhere = torch.ones(12, dtype=torch.bool)
+    partner, score = optimal_transport(torch.eye(12)[order], everywhere, everywhere)
+    assert (partner == order).all() and score == pytest.approx(np.full(12, 1 / 12), rel=1e-3)
+
+
+def test_the_dual_softmax_is_the_product_of_two_softmaxes():
+    sim, everywhere = similarities(), [torch.ones(n, dtype=torch.bool) for n in (12, 15)]
+    product = (sim / 0.1).softmax(0) * (sim / 0.1).softmax(1)
+    partner, score = dual_softmax(sim, *everywhere)
+    assert (partner == product.argmax(1)).all()
+    assert score.exp().numpy() == pytest.approx(product.max(1).values.numpy(), rel=1e-4)
+
+
+def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
+    sim, (on1, on2) = similarities(), masks()
+    partner, score = mutual(sim, on1, on2)
+    hidden = sim.clone()
+    hidden[~on1] = hidden[:, ~on2] = -1
+    for u in range(len(sim)):
+        v = int(hidden[u].argmax())
+        if on1[u] and int(hidden[:, v].argmax()) == u:
+            assert partner[u] == v and score[u] == sim[u, v]
+        else:
+            assert score[u] == -torch.inf
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_partners_are_on_the_objects_and_nothing_is_found_without_one(name):
+    sim, (on1, on2) = similarities(), masks()
+    partner, score = MATCHERS[name](sim, on1, on2)
+    found = score.isfinite()
+    assert found.any() and on1[found].all() and on2[partner[found]].all()
+    assert not MATCHERS[name](sim, on1, torch.zeros_like(on2))[1].isfinite().any()
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_every_matcher_finds_an_image_in_itself(name):
+    features = feature_map(3)
+    for kmeans in (False, True):
+        found = match(features, features, k=10, kmeans=kmeans, matcher=name)
+        assert len(found) == 10 and (found.reference == found.target).all()
+        assert found.similarity == pytest.approx(np.ones(10), abs=1e-5)
+
+
+def test_your_own_matcher_goes_where_a_name_would():
+    def last_patch(sim, on1, on2):
+        return torch.full((len(on1),), sim.shape[1] - 1), torch.arange(len(on1), dtype=torch.float64)
+
+    features = feature_map(4)
+    found = match(features, features, k=3, kmeans=False, matcher=last_patch)
+    assert found.target.tolist() == [[8, 8]] * 3
+    assert found.reference.tolist() == [[8, 8], [8, 7], [8, 6]]
+
+
+def test_plain_similarity_is_the_cosine_of_the_keys():
+    first, second = feature_map(5), feature_map(6)
+    (found,) = plain_similarities(first, [second])
+    u, v = first.keys[2, 3], second.keys[4, 5]
+    assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(float(u @ v / u.norm() / v.norm()), abs=1e-6)
+
+
+def test_a_matcher_that_is_not_there_is_refused():
+    with pytest.raises(InputError, match="guess"):
+        match(feature_map(0), feature_map(1), matcher="guess")
+    with pytest.raises(InputError, match="guess"):
+        ZeroShotPose(lambda images: [], matcher="guess")
