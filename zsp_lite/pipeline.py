@@ -4,10 +4,8 @@ import time
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -15,46 +13,24 @@ from jaxtyping import Bool, Float
 from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, Comparison
 from zsp_lite.cameras import Camera
-from zsp_lite.depth import patch_points
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame, crop_to_object, resize_frame
+from zsp_lite.frames import Frame
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, match, plain_similarities, similarities
+from zsp_lite.views import IMAGE_SIZE, View, frame_view, look, object_crop, patch_mask
 
 if TYPE_CHECKING:
     from zsp_lite.backbones import Backbone
 
-IMAGE_SIZE = 224
+# Views are pipeline's vocabulary, wherever they live.
+__all__ = [
+    "IMAGE_SIZE", "PoseEstimate", "View", "ZeroShotPose", "frame_view", "look", "match_points", "object_crop",
+    "patch_mask", "view_alignment",
+]  # fmt: skip
+
 # Instances of one category, each of unit spread, do not differ more: what the paper leaves open.
 SCALE_RANGE = (0.2, 5.0)
-# Thin parts (a chair's legs) never fill half a patch.
-_MASK_PATCH = 0.25
 _FEW = 10
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame cropped to its object, with its features: what one image brings to every pair it is in."""
-
-    frame: Frame
-    features: FeatureMap
-    foreground: Bool[torch.Tensor, "rows cols"]
-
-    @cached_property
-    def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
-
-        Worked out when first asked for: of N target views only the chosen one's are needed.
-        Raises InputError where the frame has no known depth.
-        """
-        name = self.frame.name or "frame"
-        if self.frame.depth is None:
-            raise InputError(f"{name}: no depth map, expected one to lift matches to 3D")
-        try:
-            return patch_points(self.frame.depth, self.frame.camera, self.features.grid)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +117,10 @@ class ZeroShotPose:
             if value not in allowed:
                 raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
         if self.k < 1 or self.trials < 1 or self.sample_size < 3 or not self.threshold > 0:
-            raise InputError(f"k={self.k}, trials={self.trials}, sample_size={self.sample_size}, threshold="
-                             f"{self.threshold}; expected k, trials >= 1, sample_size >= 3, threshold > 0")
+            raise InputError(
+                f"k={self.k}, trials={self.trials}, sample_size={self.sample_size}, threshold="
+                f"{self.threshold}; expected k, trials >= 1, sample_size >= 3, threshold > 0"
+            )
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """The pose of the reference's object in the best of N target views of another object of its category.
@@ -216,46 +194,6 @@ class ZeroShotPose:
             sim3, best, matches, inliers, points, scores, timings, targets[best].frame.camera,
             reference, tuple(targets), flags,
         )  # fmt: skip
-
-
-def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
-    """The frame's object crop, resized to (size, size) not keeping its aspect (supplement, "Object crops").
-
-    A frame without a mask is taken whole. Raises InputError for an empty mask.
-    """
-    return resize_frame(frame if frame.mask is None else crop_to_object(frame), (size, size))
-
-
-def look(
-    backbone: "Backbone",
-    frames: Sequence[Frame],
-    foreground: str = "saliency",
-    saliency_threshold: float = 0.05,
-) -> list[View]:
-    """Views of cropped frames, their features computed in one batch.  foreground: see `frame_view`."""
-    features = backbone([frame.rgb for frame in frames])
-    return [frame_view(*pair, foreground, saliency_threshold) for pair in zip(frames, features)]
-
-
-def frame_view(
-    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = 0.05
-) -> View:
-    """A cropped frame with its features, and which patches are the object.
-
-    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a
-    quarter of the patch). Raises InputError for "mask" where the frame has none.
-    """
-    if foreground == "mask":
-        return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device))
-    return View(frame, features, features.foreground(saliency_threshold))
-
-
-def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
-    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
-    if frame.mask is None:
-        raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
-    covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(covered >= _MASK_PATCH)
 
 
 def match_points(

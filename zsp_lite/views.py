@@ -1,0 +1,109 @@
+"""What one image brings to every pair it is in: its object crop, features, foreground and 3D points (fig. 2, left)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from zsp_lite.depth import patch_points
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.frames import Frame, crop_to_object, resize_frame
+
+if TYPE_CHECKING:
+    from zsp_lite.backbones import Backbone
+
+IMAGE_SIZE = 224
+# Thin parts (a chair's legs) never fill half a patch.
+_MASK_PATCH = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame cropped to its object, with its features and what of it is the object.
+
+    foreground: patches.  object_mask: how surely each pixel is the object, in [0, 1]; None: unknown.
+    """
+
+    frame: Frame
+    features: FeatureMap
+    foreground: Bool[torch.Tensor, "rows cols"]
+    object_mask: Float[np.ndarray, "height width"] | None = None
+
+    @property
+    def soft_mask(self) -> Float[np.ndarray, "height width"]:
+        """`object_mask`, or where there is none the foreground patches, interpolated between their centres."""
+        if self.object_mask is not None:
+            return self.object_mask
+        patches = self.foreground.cpu().numpy().astype(np.float32)
+        return cv2.resize(patches, self.frame.camera.size[::-1], interpolation=cv2.INTER_LINEAR)
+
+    @cached_property
+    def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
+
+        Worked out when first asked for: of N target views only the chosen one's are needed.
+        Raises InputError where the frame has no known depth.
+        """
+        name = self.frame.name or "frame"
+        if self.frame.depth is None:
+            raise InputError(f"{name}: no depth map, expected one to lift matches to 3D")
+        try:
+            return patch_points(self.frame.depth, self.frame.camera, self.features.grid)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+
+
+def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
+    """The frame's object crop, resized to (size, size) not keeping its aspect (supplement, "Object crops").
+
+    A frame without a mask is taken whole. Raises InputError for an empty mask.
+    """
+    return resize_frame(frame if frame.mask is None else crop_to_object(frame), (size, size))
+
+
+def look(
+    backbone: "Backbone",
+    frames: Sequence[Frame],
+    foreground: str = "saliency",
+    saliency_threshold: float = 0.05,
+) -> list[View]:
+    """Views of cropped frames, their features computed in one batch.  foreground: see `frame_view`."""
+    features = backbone([frame.rgb for frame in frames])
+    return [frame_view(*pair, foreground, saliency_threshold) for pair in zip(frames, features)]
+
+
+def frame_view(
+    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = 0.05
+) -> View:
+    """A cropped frame with its features, and which patches are the object.
+
+    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a
+    quarter of the patch). Raises InputError for "mask" where the frame has none.
+    """
+    if foreground == "mask":
+        return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device), frame.mask)
+    soft = soft_saliency(features, frame.camera.size, saliency_threshold)
+    return View(frame, features, features.foreground(saliency_threshold), soft)
+
+
+def soft_saliency(
+    features: FeatureMap, size: tuple[int, int], threshold: float = 0.05
+) -> Float[np.ndarray, "height width"]:
+    """Saliency as a soft mask of (height, width) pixels: 0 where there is none, a half at the threshold, 1 from
+    twice the threshold on, interpolated between the patches' centres."""
+    ramp = (features.saliency.cpu().numpy() / max(2 * threshold, 1e-6)).clip(0, 1)
+    return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
+    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
+    if frame.mask is None:
+        raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
+    covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(covered >= _MASK_PATCH)
