@@ -25,6 +25,7 @@ FILES = (
     "model.safetensors.index.json",
 )  # fmt: skip
 _ATTENTION = "zsp_lite_cls"  # the name under which transformers knows `_attend`
+_ROWS = "zsp_lite_cls_rows"  # an attention module's list to which `_attend` adds
 _PROJECTIONS = (("q_proj", "k_proj", "v_proj"), ("query", "key", "value"))
 _CLS = ("cls_token", "class_token", "class_embedding")
 _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
@@ -65,28 +66,21 @@ class HuggingFaceViT(nn.Module):
         Register and distillation tokens are dropped. Keys and queries are those before any rotary embedding, which
         would mix position into them; the attention is the model's own. Of several CLS tokens the first counts.
         """
-        kept = {}
-
-        def keep(name):
-            def hook(module, inputs, output):
-                kept[name] = output
-
-            return hook
-
+        found = []
         chosen = self._stack[block] if facet == "token" else _projections(self._attention[block])[facet]
-        hooks = [
-            chosen.register_forward_hook(keep("facet")),
-            self._attention[-1].register_forward_hook(keep("attention")),
-        ]
+        hook = chosen.register_forward_hook(lambda module, inputs, output: found.append(output))
+        rows: list[Tensor] = []
+        setattr(self._attention[-1], _ROWS, rows)
         try:
-            output = self.vit(pixel_values=images, **self._options(images))[0]
+            cls = self.vit(pixel_values=images, **self._options(images))[0][:, 0]
         finally:
-            for hook in hooks:
-                hook.remove()
-        described = kept["facet"] if torch.is_tensor(kept["facet"]) else kept["facet"][0]
-        attention = kept["attention"][1]  # what `_attend` gave back beside the attended values
+            hook.remove()
+            delattr(self._attention[-1], _ROWS)
+        if not rows:
+            raise InputError(f"{self.name}: {type(self.vit).__name__} attends past transformers' attention interface")
+        described = found[0] if torch.is_tensor(found[0]) else found[0][0]
         patches = slice(self._prefix, None)
-        return Tokens(described[:, patches], attention[:, :, patches], output[:, 0], self._grid(images))
+        return Tokens(described[:, patches], rows[0][:, :, patches], cls, self._grid(images))
 
     def _options(self, images: Tensor) -> dict:
         options = {}
@@ -107,11 +101,13 @@ class HuggingFaceViT(nn.Module):
         try:
             with torch.inference_mode():
                 tokens = self.extract(images, 0)
+        except InputError:
+            raise
         except Exception as error:
             # Of others' models each fails in its own way; all that matters here is that this one does not run.
             raise InputError(
-                f"{self.name}: {type(self.vit).__name__} does not run on {self.image_size} x {self.image_size} pixels, "
-                f"or its attention cannot be read ({_one_line(error)})"
+                f"{self.name}: {type(self.vit).__name__} does not run on {self.image_size} x {self.image_size} pixels "
+                f"({_one_line(error)})"
             ) from error
         if tokens.keys.shape[1] != rows * columns or tokens.attention.shape[1:] != (self.num_heads, rows * columns):
             raise InputError(
@@ -161,7 +157,9 @@ def model_folder(name: str) -> Path:
     Only what is not in the cache is fetched, so that without a network everything works that once worked with one.
     Raises InputError saying why there is none.
     """
-    wanted = name.removeprefix(PREFIX)
+    wanted = name.removeprefix(PREFIX).strip()
+    if not wanted:
+        raise InputError(f"{name}: expected a folder or a name of the hub's form OWNER/MODEL behind {PREFIX}")
     folder = Path(wanted).expanduser()
     if not folder.is_dir():
         folder = _from_hub(wanted, name)
@@ -200,7 +198,7 @@ def _from_hub(wanted: str, name: str) -> Path:
                 return folder
         return Path(snapshot_download(wanted, allow_patterns=FILES))
     except HFValidationError as error:
-        raise InputError(f"{name}: neither a folder nor a name of the hub's form OWNER/MODEL") from error
+        raise InputError(f"{name}: no such folder, and no name of the hub's form OWNER/MODEL") from error
     except GatedRepoError as error:
         raise InputError(
             f"{name}: its owner wants a licence accepted; do so at https://huggingface.co/{wanted}, then hf auth login"
@@ -236,21 +234,20 @@ def _attend(
     attention_mask: Tensor | None = None,
     scaling: float | None = None,
     **options,
-) -> tuple[Tensor, Tensor]:
-    """transformers' fused attention, and the attention of the first token (CLS) to all: (batch, heads, n).
+) -> tuple[Tensor, None]:
+    """transformers' fused attention; where asked to, the attention of the first token (CLS) to all is kept besides.
 
-    One row of the attention matrix; the matrix itself is never made. `attention_mask` is a bias to the logits.
+    That is one row of the attention matrix, (batch, heads, n); the matrix itself is never made. `attention_mask` is a
+    bias to the logits.
     """
     from transformers import AttentionInterface
 
-    fused = AttentionInterface()["sdpa"]
-    attended, _ = fused(module, query, key, value, attention_mask, scaling=scaling, **options)
-    scaling = query.shape[-1] ** -0.5 if scaling is None else scaling
-    with torch.autocast(query.device.type, enabled=False):
-        logits = ((query[:, :, :1].float() * scaling) @ key.float().transpose(-1, -2))[:, :, 0]
-    if attention_mask is not None:
-        logits = logits + attention_mask[:, :, 0]
-    return attended, logits.softmax(-1)
+    if (rows := getattr(module, _ROWS, None)) is not None:
+        with torch.autocast(query.device.type, enabled=False):
+            scale = query.shape[-1] ** -0.5 if scaling is None else scaling
+            logits = ((query[:, :, :1].float() * scale) @ key.float().transpose(-1, -2))[:, :, 0]
+            rows.append((logits if attention_mask is None else logits + attention_mask[:, :, 0]).softmax(-1))
+    return AttentionInterface()["sdpa"](module, query, key, value, attention_mask, scaling=scaling, **options)
 
 
 def _sizes(config, name: str) -> tuple[int, int]:
