@@ -105,7 +105,8 @@ def _add_data(parser: Parser) -> None:
 def _add_backbone(parser: Parser) -> None:
     parser.add_argument(
         "--backbone", default="zsp-tiny", metavar="NAME",
-        help="zsp-tiny (default), dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, or a checkpoint file",
+        help="zsp-tiny (default), dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, a checkpoint file, or hf:NAME: "
+        "a vision transformer of the Hugging Face hub or a folder in its format",
     )  # fmt: skip
 
 
@@ -246,7 +247,7 @@ def _add_weights(commands) -> None:
         ["weights list", "weights fetch dino_vits8", "weights verify path/to/checkpoint.pth"],
     )  # fmt: skip
     parser.add_argument("action", choices=("list", "fetch", "verify"))
-    parser.add_argument("name", nargs="?", help="a backbone's name (verify: or a checkpoint file)")
+    parser.add_argument("name", nargs="?", help="a backbone's name, or hf:NAME (verify: or a checkpoint file)")
 
 
 def _weights(arguments: argparse.Namespace) -> None:
