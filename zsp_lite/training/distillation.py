@@ -29,8 +29,9 @@ class DistillationConfig:
     """Everything that decides the result but the pictures and the backbone's first weights.
 
     A step takes `images` pictures and cuts 2 + `local_crops` crops out of each. Sides are pixels, scales the crops'
-    width as a fraction (low, high) of the picture's. Pairs of numbers are the values at the start and at the end.
-    InputError for numbers without a meaning.
+    width as a fraction (low, high) of the picture's. `teacher_momentum` and `weight_decay` go from their first to their
+    second number. Without `centring` the centre stays 0; without `sharpening` the teacher's temperature is the
+    student's. InputError for numbers without a meaning.
     """
 
     seed: int = 0
@@ -45,7 +46,7 @@ class DistillationConfig:
     hidden: int = 256
     bottleneck: int = 64
     student_temperature: float = 0.1
-    teacher_temperature: tuple[float, float] = (0.04, 0.07)
+    teacher_temperature: float = 0.04
     centre_momentum: float = 0.9
     teacher_momentum: tuple[float, float] = (0.99, 1.0)
     learning_rate: float = 1e-3
@@ -60,7 +61,7 @@ class DistillationConfig:
                 raise InputError(f"DistillationConfig: {name} is {getattr(self, name)}, expected at least 1")
         if self.local_crops < 0:
             raise InputError(f"DistillationConfig: local_crops is {self.local_crops}, expected 0 or more")
-        if min(self.student_temperature, *self.teacher_temperature) <= 0:
+        if min(self.student_temperature, self.teacher_temperature) <= 0:
             raise InputError("DistillationConfig: temperatures must be positive")
 
 
@@ -169,12 +170,12 @@ class Distillation:
         progress = self.steps_done / config.steps
 
         with torch.autocast(device.type, torch.bfloat16):
-            teacher = self.teacher(large.flatten(0, 1)).unflatten(0, large.shape[:2]).float()
+            with torch.no_grad():
+                teacher = self.teacher(large.flatten(0, 1)).unflatten(0, large.shape[:2]).float()
             student = [self.student(crops.flatten(0, 1)).unflatten(0, crops.shape[:2]).float()
                        for crops in (large, small) if len(crops)]  # fmt: skip
-        loss, figures = distillation_loss(
-            torch.cat(student), teacher, self.centre, config.student_temperature, self.teacher_temperature(progress)
-        )
+        sharp = config.teacher_temperature if config.sharpening else config.student_temperature
+        loss, figures = distillation_loss(torch.cat(student), teacher, self.centre, config.student_temperature, sharp)
         self.optimiser.zero_grad()
         loss.backward()
         if progress < 0.05:  # DINO holds the last layer for the first epoch: outputs first have to mean something
@@ -192,13 +193,6 @@ class Distillation:
                 self.centre.lerp_(teacher.mean((0, 1)), 1 - config.centre_momentum)  # eq. 4
         self.steps_done += 1
         return dict(step=self.steps_done) | figures
-
-    def teacher_temperature(self, progress: float) -> float:
-        """Linear over the first third of the run, then constant; without sharpening, the student's."""
-        first, last = self.config.teacher_temperature
-        if not self.config.sharpening:
-            return self.config.student_temperature
-        return first + (last - first) * min(1.0, 3 * progress)
 
     def save(self, path: Path) -> None:
         """Write all that `restore` needs; a file that is there is replaced only once the new one is whole."""

@@ -1,0 +1,191 @@
+"""Self-distillation: its loss, its two averages, and what happens without centring or sharpening."""
+
+import copy
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from zsp_lite.errors import InputError
+from zsp_lite.training.distillation import (
+    Distillation,
+    DistillationConfig,
+    Head,
+    cosine,
+    distillation_loss,
+    multi_crop,
+)
+from zsp_lite.vit import VisionTransformer
+
+TINY = DistillationConfig(
+    steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64, hidden=64, bottleneck=64,
+    teacher_momentum=(0.97, 1.0),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pictures() -> np.ndarray:
+    """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and direction."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:48, :48]
+    rgb = np.empty((8, 2, 48, 48, 3), np.uint8)
+    for k in range(8):
+        colour, angle = rng.uniform(60, 255, 3), k * np.pi / 8
+        for view in range(2):
+            phase = 0.6 * (x * np.cos(angle) + y * np.sin(angle)) + rng.uniform(0, 6)
+            rgb[k, view] = (0.5 + 0.5 * np.sin(phase))[..., None] * colour
+    return rgb
+
+
+@pytest.fixture(scope="module")
+def backbone() -> VisionTransformer:
+    """Small, with weights large enough that its output depends on the picture from the start."""
+    torch.manual_seed(1)
+    model = VisionTransformer(32, 8, embed_dim=24, depth=2, num_heads=2)
+    for module in model.modules():
+        if isinstance(module, torch.nn.Linear):
+            torch.nn.init.xavier_uniform_(module.weight)
+    return model
+
+
+def weights(run: Distillation) -> list[torch.Tensor]:
+    return [run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()]
+
+
+def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
+    rng = np.random.default_rng(0)
+    student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
+    terms, entropies = [], []
+    for picture in range(3):
+        for g in range(2):
+            p = np.exp((teacher[g, picture] - centre) / 0.5)
+            p /= p.sum()
+            entropies.append(-sum(p * np.log(p)))
+            for c in range(4):
+                if c != g:
+                    q = np.exp(student[c, picture] / 0.8)
+                    terms.append(-sum(p * np.log(q / q.sum())))
+    arrays = (torch.from_numpy(x) for x in (student, teacher, centre))
+    loss, figures = distillation_loss(*arrays, student_temperature=0.8, teacher_temperature=0.5)
+    assert len(terms) == 18 and float(loss) == pytest.approx(np.mean(terms))
+    assert figures["teacher_entropy"] == pytest.approx(np.mean(entropies))
+    assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
+
+
+def test_both_collapsed_answers_agree_perfectly_and_tell_nothing():
+    """A constant output and a uniform one have no divergence and no information; a telling one has log(pictures)."""
+    constant, uniform = torch.zeros(8), torch.zeros(8)
+    constant[3] = 50.0
+    for output, entropy in ((constant, 0.0), (uniform, math.log(8))):
+        _, figures = distillation_loss(output.expand(3, 4, 8), output.expand(2, 4, 8), torch.zeros(8), 1.0, 1.0)
+        assert figures["teacher_entropy"] == pytest.approx(entropy, abs=1e-5)
+        assert figures["kl"] == pytest.approx(0, abs=1e-5) and figures["information"] == pytest.approx(0, abs=1e-5)
+    telling = 50 * torch.eye(8)[:4]
+    _, figures = distillation_loss(telling.expand(3, 4, 8), telling.expand(2, 4, 8), torch.zeros(8), 1.0, 1.0)
+    assert figures["information"] == pytest.approx(math.log(4), abs=1e-5)
+
+
+def test_no_gradient_reaches_the_teacher():
+    student, teacher = (torch.randn(n, 3, 5, requires_grad=True) for n in (3, 2))
+    distillation_loss(student, teacher, torch.zeros(5), 0.1, 0.04)[0].backward()
+    assert student.grad.abs().sum() > 0 and teacher.grad is None
+
+
+def test_logits_are_cosines():
+    torch.manual_seed(0)
+    head = Head(12, 16, 8, 20)
+    with torch.no_grad():
+        x = torch.randn(7, 12)
+        logits = head(x)
+        assert logits.shape == (7, 20) and logits.abs().max() <= 1
+        head.directions *= torch.rand(20, 1) + 0.5
+        torch.testing.assert_close(head(x), logits)
+
+
+def test_crops_come_from_their_own_picture_and_differ(pictures):
+    rng = np.random.default_rng
+    large, small = multi_crop(pictures[:3, 0], rng(5), TINY)
+    assert large.shape == (2, 3, 3, 32, 32) and small.shape == (2, 3, 3, 16, 16)
+    assert not torch.equal(large[0], large[1])
+    other = pictures[:3, 0].copy()
+    other[2] = 255 - other[2]
+    for crops, changed in zip((large, small), multi_crop(other, rng(5), TINY), strict=True):
+        assert torch.equal(crops[:, :2], changed[:, :2])
+        assert not torch.equal(crops[:, 2], changed[:, 2])
+    assert multi_crop(pictures[:3, 0], rng(5), replace(TINY, local_crops=0))[1].shape == (0, 3, 3, 16, 16)
+
+
+def test_schedules_run_from_end_to_end():
+    assert cosine((0.99, 1.0), 0.0) == 0.99 and cosine((0.99, 1.0), 1.0) == 1.0
+    assert cosine((0.0, 2.0), 0.5) == pytest.approx(1.0)
+
+
+def test_centre_and_teacher_are_running_averages(pictures, backbone):
+    run = Distillation(TINY, backbone)
+    run.step(pictures)  # the first has no learning rate yet
+    centre, before = run.centre.clone(), copy.deepcopy(run.teacher)
+    rng = np.random.default_rng([TINY.seed, 3, 1])
+    chosen = pictures[rng.integers(8, size=8), rng.integers(2, size=8)]
+    large, _ = multi_crop(chosen, rng, TINY)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        said = before(large.flatten(0, 1)).float()
+    run.step(pictures)
+    torch.testing.assert_close(run.centre, 0.9 * centre + 0.1 * said.mean(0))
+    momentum = cosine((0.97, 1.0), 1 / 45)
+    triples = zip(before.parameters(), run.student.parameters(), run.teacher.parameters(), strict=True)
+    for slow, fast, after in triples:
+        torch.testing.assert_close(after, momentum * slow + (1 - momentum) * fast.detach())
+    assert any(not torch.equal(a, b) for a, b in zip(before.parameters(), run.teacher.parameters(), strict=True))
+
+
+def test_it_collapses_without_centring_and_without_sharpening(pictures, backbone):
+    """DINO, section 5.3: no centring, one output for all; no sharpening, all outputs alike; both together, neither."""
+    last = {}
+    settings = {"both": {}, "no centring": dict(centring=False), "no sharpening": dict(sharpening=False)}
+    for name, changes in settings.items():
+        run = Distillation(replace(TINY, **changes), backbone)
+        rows = [run.step(pictures) for _ in range(TINY.steps)]
+        last[name] = {key: np.mean([row[key] for row in rows[-8:]]) for key in rows[0]}
+    top = math.log(TINY.outputs)
+    assert last["no centring"]["teacher_entropy"] < 0.15 * top
+    assert last["no sharpening"]["teacher_entropy"] > 0.97 * top
+    assert 0.3 * top < last["both"]["teacher_entropy"] < 0.95 * top
+    assert last["both"]["information"] > 3 * last["no centring"]["information"]
+    assert last["both"]["information"] > 3 * last["no sharpening"]["information"]
+
+
+def test_same_seed_same_weights_and_a_restored_run_continues_exactly(pictures, backbone, tmp_path):
+    whole, killed = Distillation(TINY, backbone), Distillation(TINY, backbone)
+    figures = [whole.step(pictures) for _ in range(4)]
+    assert [killed.step(pictures) for _ in range(2)] == figures[:2]
+    killed.save(tmp_path / "run.pt")
+    resumed = Distillation(TINY, VisionTransformer(32, 8, embed_dim=24, depth=2, num_heads=2))
+    resumed.restore(tmp_path / "run.pt")
+    assert [resumed.step(pictures) for _ in range(2)] == figures[2:]
+    assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
+    other = Distillation(replace(TINY, seed=1), backbone)
+    other.step(pictures)
+    assert not torch.equal(other.centre, whole.centre)
+
+
+def test_the_given_backbone_is_left_as_it_was(pictures, backbone):
+    before = copy.deepcopy(backbone.state_dict())
+    run = Distillation(TINY, backbone)
+    for _ in range(3):
+        run.step(pictures)
+    assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())
+
+
+def test_bad_settings_and_foreign_checkpoints_are_refused_in_one_line(backbone, tmp_path):
+    for changes in (dict(steps=0), dict(local_crops=-1), dict(teacher_temperature=0.0)):
+        with pytest.raises(InputError, match=next(iter(changes)).split("_")[-1]):
+            replace(TINY, **changes)
+    run = Distillation(TINY, backbone)
+    run.save(tmp_path / "run.pt")
+    with pytest.raises(InputError, match="another configuration"):
+        Distillation(replace(TINY, images=7), backbone).restore(tmp_path / "run.pt")
+    (tmp_path / "run.pt").write_bytes(b"cut off")
+    with pytest.raises(InputError, match="no checkpoint"):
+        run.restore(tmp_path / "run.pt")
