@@ -1,16 +1,18 @@
 """The benchmark on a small CO3D folder whose features are perfect, so that every figure is known."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_views import CoordinateBackbone, look_at, render
+from benchmark_folder import small_folder
+from synthetic_views import CoordinateBackbone
 
 import zsp_lite
-from zsp_lite.alignment import Sim3, ransac
+from zsp_lite.alignment import ransac
 from zsp_lite.backbones import Backbone
 from zsp_lite.benchmark.annotations import process_memory
 from zsp_lite.benchmark.profile import (
@@ -21,37 +23,17 @@ from zsp_lite.benchmark.profile import (
     similarity_rows,
 )
 from zsp_lite.benchmark.run import METHODS, category_pairs, evaluate, random_backbone, read_records
-from zsp_lite.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, read_labels, write_label
+from zsp_lite.labels import read_labels
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pairs import sample_pairs, write_upstream_pairs
 from zsp_lite.vit import VisionTransformer
 
-SEQUENCES = ("100_a", "200_b", "300_c")
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Two categories of three sequences: one object, put into each sequence's world in its own way."""
-    root = tmp_path_factory.mktemp("co3d")
-    for offset, category in enumerate(("lump", "pebble")):
-        sequences = []
-        for index, name in enumerate(SEQUENCES):
-            turn = np.eye(3) if index == 0 else look_at(np.eye(3)[index] + (0.3, 0.2, 0.1 + offset)).R
-            placement = Sim3(1.0, turn, np.zeros(3))
-            angles = np.linspace(0, 2 * np.pi, 8, endpoint=False) + 0.3 * index
-            # Upright cameras around the object; the world they stand in is turned.
-            views = [look_at((np.cos(a), np.sin(a), 0.4), size=(90, 100), focal=120.0) for a in angles]
-            cameras = [replace(camera, R=camera.R @ turn.T) for camera in views]
-            frames = tuple(render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras))
-            times, cloud, colours = tuple(map(float, range(8))), np.eye(3), np.zeros((3, 3), np.uint8)
-            sequences.append(SequenceData(name, frames, times, cloud, colours))
-            trans = np.eye(4)
-            trans[:3, :3] = turn
-            write_label(root, category, PoseLabel(trans, name, SEQUENCES[0]))
-        write_co3d(root, category, sequences, quality=100)
-    return root
+def folder():
+    return small_folder()
 
 
 BACKBONE = CoordinateBackbone()
@@ -165,9 +147,9 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run, folder
 
 
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(folder, tmp_path):
-    dataset = Co3D(folder)
+    dataset = Co3D(shutil.copytree(folder, tmp_path / "copy"))
     sampled = sample_pairs(dataset, "lump", 4, 3, seed=9)
-    path = folder / "determ_eval" / "4samples_3tgt" / "lump.pt"
+    path = dataset.root / "determ_eval" / "4samples_3tgt" / "lump.pt"
     write_upstream_pairs(path, sampled, dataset)
     assert category_pairs(dataset, "lump", 3, 3) == sampled[:3]
     assert category_pairs(dataset, "lump", 5, 3, seed=1) == sample_pairs(dataset, "lump", 5, 3, seed=1)

@@ -10,7 +10,9 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite import cli, errors
 from zsp_lite.co3d import Co3D
 
-COMMANDS = ("demo", "benchmark", "synth", "weights", "train", "profile", "doctor")
+COMMANDS = (
+    "demo", "benchmark", "tables", "compare", "synth", "weights", "train", "train-baseline", "profile", "doctor",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -151,10 +153,32 @@ def assert_one_line(capsys) -> str:
     return captured.err
 
 
-def test_the_help_names_every_method():
-    from zsp_lite.benchmark.run import METHODS
+def test_the_list_names_every_row_and_group(capsys):
+    from zsp_lite.benchmark.run import GROUPS, METHODS
 
-    assert cli.METHOD_NAMES == tuple(METHODS)
+    assert cli.main(["benchmark", "--list"]) == 0
+    lines = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert lines == {*METHODS, *GROUPS, "Groups:"}
+
+
+def test_a_run_is_planned_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zsp_lite.benchmark.run.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setenv("COLUMNS", "200")
+    rows = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "2", "--targets", "3", "--methods", "table3"]
+    assert cli.main([*rows, "--out", str(tmp_path / "a"), "--plan"]) == 0
+    assert "2 (8 estimates in all rows)" in capsys.readouterr().out and not (tmp_path / "a").exists()
+    for name in "ab":
+        assert cli.main([*rows, "--out", str(tmp_path / name), "--quiet"]) == 0
+        assert capsys.readouterr().out == ""
+    assert cli.main(["tables", str(tmp_path / "a" / "results.json.gz"), "--out", str(tmp_path / "c")]) == 0
+    assert "GlobalSim" in capsys.readouterr().out
+    tables = [(tmp_path / name / "tables" / "table_3.csv").read_bytes() for name in "abc"]
+    assert tables[0] == tables[1] == tables[2]
+    assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
+    assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
+    assert "ours | ours-globalsim" in capsys.readouterr().out
+    assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
+    assert "nowhere" in assert_one_line(capsys)
 
 
 def test_weights_list_takes_no_name(capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from zsp_lite.alignment import umeyama
+from zsp_lite.benchmark.published import CATEGORIES
 from zsp_lite.co3d import Co3D
 from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
@@ -328,6 +329,8 @@ def test_presets_are_of_evaluation_categories():
         assert set(preset.categories) <= set(EVALUATION)
         assert all(getattr(preset, field.name) for field in fields(preset))
     assert len(PRESETS["samples"].categories) == 4 and len(PRESETS["eval"].categories) >= 8
+    paper = PRESETS["paper"]
+    assert paper.categories == CATEGORIES and (paper.sequences, paper.frames, paper.pairs) == (10, 100, 100)
 
 
 @pytest.mark.parametrize(

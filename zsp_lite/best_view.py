@@ -40,9 +40,13 @@ def correspondence_score(matches: Matches, k: int) -> float:
     With fewer than k matches, each missing one counts as orthogonal, d = sqrt(2): otherwise a view with
     hardly any foreground in common would win by having little to sum.
     """
-    cosine = torch.as_tensor(matches.similarity)
-    distances = (2 - 2 * cosine).clamp_min(0).sqrt()
-    return -float(distances.sum()) - max(k - len(cosine), 0) * _ORTHOGONAL
+    return strength(torch.as_tensor(matches.similarity), k)
+
+
+def strength(cosines: Float[torch.Tensor, "n"], k: int) -> float:
+    """`correspondence_score` of matches whose descriptors have these cosines."""
+    distances = (2 - 2 * cosines).clamp_min(0).sqrt()
+    return -float(distances.sum()) - max(k - len(cosines), 0) * _ORTHOGONAL
 
 
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:

@@ -15,8 +15,6 @@ SYNTHETIC_NOTE = (
     "soft masks as CO3D has them; no photograph."
 )
 USER_NOTE = "a folder in CO3D's layout, as given."
-# Written down here too, for `--help` shall not wait for what defines them (a test holds them equal).
-METHOD_NAMES = ("ours", "ours-bv", "rootsift", "rootsift-bv", "ours-mask", "oracle-view", "random")
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,7 +47,12 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr, exit code 2.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    for add in (_add_demo, _add_benchmark, _add_synth, _add_weights, _add_train, _add_profile, _add_doctor):
+    from zsp_lite import cli_benchmark as benchmark  # which takes its helpers from here
+
+    for add in (
+        _add_demo, benchmark.add_benchmark, benchmark.add_tables, benchmark.add_compare, _add_synth, _add_weights,
+        _add_train, benchmark.add_train_baseline, _add_profile, _add_doctor,
+    ):  # fmt: skip
         add(commands)
     return parser
 
@@ -154,71 +157,22 @@ def _demo(arguments: argparse.Namespace) -> None:
     console.print(f"Every stage in pictures: {path}", soft_wrap=True)
 
 
-def _add_benchmark(commands) -> None:
-    parser = _command(
-        commands, "benchmark", _benchmark, "rotation errors over many pairs: a table, and files to go on with",
-        ["benchmark", "benchmark --data outputs/eval --pairs 30 --methods ours,rootsift --out outputs/compared"],
-    )  # fmt: skip
-    _add_data(parser)
-    _add_backbone(parser)
-    parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all of the folder's")
-    parser.add_argument("--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)")
-    parser.add_argument("--targets", type=_count, default=5, metavar="N", help="target views per pair (default: 5)")
-    parser.add_argument(
-        "--methods", type=_names, default=["ours", "ours-bv", "rootsift"], metavar="A,B",
-        help=f"rows of the table, some of {', '.join(METHOD_NAMES)} (default: ours,ours-bv,rootsift)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=_seed, default=0, help="of the pairs drawn (default: 0)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs/benchmark"), metavar="DIR",
-        help="a run found there is continued (default: outputs/benchmark)",
-    )  # fmt: skip
-
-
-def _benchmark(arguments: argparse.Namespace) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from tqdm import tqdm
-
-    from zsp_lite.benchmark.run import evaluate
-    from zsp_lite.doctor import data_folders
-
-    root = data_folders(arguments.data)[0][1]
-    with tqdm(unit="pair", delay=1, disable=None) as bar:  # silent where the input is refused, and in logs
-
-        def progress(done: int, total: int) -> None:
-            bar.total, bar.n = total, done
-            bar.refresh()
-
-        summary = evaluate(
-            root, arguments.backbone, arguments.methods, arguments.pairs, arguments.targets, arguments.seed,
-            arguments.out, arguments.categories, progress,
-        )  # fmt: skip
-    table = Table(title=f"{root}, backbone {arguments.backbone}, {arguments.targets} target views")
-    for column in ("method", "pairs", "median (degrees)", "Acc30 (%)", "95 % interval", "Acc15 (%)"):
-        table.add_column(column, justify="left" if column == "method" else "right")
-    for name, figures in summary["methods"].items():
-        low, high = figures["acc30_ci"]
-        table.add_row(
-            name, str(figures["n"]), f"{figures['median']:.1f}", f"{figures['acc30']:.1f}",
-            f"{low:.1f} to {high:.1f}", f"{figures['acc15']:.1f}",
-        )  # fmt: skip
-    console = Console()
-    console.print(table)
-    console.print(f"Written: {arguments.out / 'summary.json'}", soft_wrap=True)
-
-
 def _add_synth(commands) -> None:
     parser = _command(
         commands, "synth", _synth, "make procedural objects as a CO3D folder, the same from the same seed",
         [
             "synth --preset samples --out data_samples",
             "synth --preset eval --out outputs/eval",
+            "synth --preset paper --out outputs/paper",
             "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
         ],
     )  # fmt: skip
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--preset", metavar="NAME", help="samples (what data_samples/ holds) or eval")
+    what.add_argument(
+        "--preset", metavar="NAME",
+        help="samples (what data_samples/ holds), eval, or paper: 20 categories of 10 sequences of 100 frames, about "
+        "half an hour and 2 GB; a folder that is there is continued",
+    )  # fmt: skip
     what.add_argument("--category", action="append", metavar="NAME", help="a category; may be given more than once")
     parser.add_argument("--sequences", type=_count, metavar="N", help="with --category: sequences of each (default: 4)")
     parser.add_argument("--frames", type=_count, metavar="N", help="with --category: frames per sequence (default: 24)")

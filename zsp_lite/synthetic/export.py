@@ -47,6 +47,8 @@ _EVAL = (
 PRESETS = {
     "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
     "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
+    # As large as the paper's evaluation: its twenty categories, ten sequences of about a hundred frames each.
+    "paper": Preset(tuple(EVALUATION), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
 }
 
 

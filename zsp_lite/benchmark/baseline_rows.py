@@ -1,0 +1,66 @@
+"""The paper's baselines as rows of the benchmark: from a problem to an answer (sec. 5.2 and supplement)."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from zsp_lite.alignment import ransac
+from zsp_lite.baselines.icp import align
+from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.baselines.sift import Keypoints, lifted, mutual_matches
+from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.best_view import strength
+from zsp_lite.errors import InputError
+from zsp_lite.pipeline import SCALE_RANGE
+
+_K = 50
+
+
+def icp(problem: Problem) -> Answer:
+    """ "ICP": the reference's camera is taken to stand where that of the first target frame stands."""
+    return _icp(problem, 0)
+
+
+def icp_best_view(problem: Problem) -> Answer:
+    """ "ICP + BV": it is taken to stand where that of the best view stands, as our method sees it."""
+    return _icp(problem, problem.estimate().view)
+
+
+def _icp(problem: Problem, view: int) -> Answer:
+    reference, *targets = problem.frames()
+    try:
+        sim3 = align(reference, targets, view, problem.first_cameras(), problem.seed)
+    except InputError as error:
+        return Answer(np.eye(3), view, note=f"pose is that of the camera it starts from: {error}")
+    return Answer(sim3.R, view, sim3.t, sim3.scale)
+
+
+def sift(problem: Problem) -> Answer:
+    """ "SIFT": the view whose mutual nearest neighbours are strongest, and RANSAC on their points."""
+    reference, *targets = problem.frames()
+    first: Keypoints
+    first, *others = problem.described("sift")
+    found = [mutual_matches(first, other, _K) for other in others]
+    view = int(np.argmax([strength(torch.from_numpy(similarity), _K) for *_, similarity in found]))
+    one, two, _ = found[view]
+    details = {"matches": len(one), "inliers": 0}
+    try:
+        points = lifted(reference, first.pixels[one]), lifted(targets[view], others[view].pixels[two])
+        sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
+    except InputError as error:
+        return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
+    return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})
+
+
+def posecontrast(problem: Problem, features: str = "posecontrast") -> Answer:
+    """ "PoseContrast": the view most alike in its feature, and what takes the one absolute rotation to the other."""
+    first: Viewpoint
+    first, *others = problem.described(features)
+    alike = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
+    view = int(np.argmax(alike))
+    return Answer(others[view].rotation @ first.rotation.T, view)
+
+
+def posecontrast_tiny(problem: Problem) -> Answer:
+    """The same with this project's small counterpart."""
+    return posecontrast(problem, "posecontrast-tiny")

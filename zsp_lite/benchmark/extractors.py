@@ -1,0 +1,71 @@
+"""Who describes images for the benchmark's rows, by name, and how to tell two of them apart."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from zsp_lite.backbones import Backbone
+from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast_tiny
+from zsp_lite.baselines.rootsift import RootSift
+from zsp_lite.baselines.sift import Sift
+from zsp_lite.baselines.swav import load_swav, load_swav_tiny
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.vit import VisionTransformer
+
+Extractor = Callable[[list[np.ndarray]], list[FeatureMap]]
+
+# Makers from the backbone under test. What one makes is called on a list of images, or, where it has `describe`, on
+# a list of frames.
+EXTRACTORS: dict[str, Callable[[Any], Any]] = {
+    "none": lambda backbone: None,  # for rows that look at depth alone
+    "backbone": lambda backbone: backbone,
+    "random": lambda backbone: random_backbone(backbone),
+    "rootsift": lambda backbone: RootSift(),
+    "sift": lambda backbone: Sift(),
+    "swav": lambda backbone: load_swav(),
+    "swav-tiny": lambda backbone: load_swav_tiny(),
+    "posecontrast": lambda backbone: load_posecontrast(),
+    "posecontrast-tiny": lambda backbone: load_posecontrast_tiny(),
+}
+
+
+def make_extractors(backbone: Extractor, names: Iterable[str]) -> dict[str, Any]:
+    """The named extractors. Raises InputError for unknown names, and where a row's weights are not at hand."""
+    names = list(dict.fromkeys(names))
+    if unknown := [name for name in names if name not in EXTRACTORS]:
+        raise InputError(f"features {unknown}: expected some of {', '.join(EXTRACTORS)}")
+    return {name: EXTRACTORS[name](backbone) for name in names}
+
+
+def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
+    """A backbone of the same shape with random weights: what the architecture alone is worth."""
+    if not isinstance(like, Backbone):
+        raise InputError(f"method 'random' needs a Backbone to copy the shape of, got {type(like).__name__}")
+    model = like.model
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
+    return Backbone(fresh, f"random like {like.name}", like.key_block, like.saliency_heads, like.device)
+
+
+def fingerprint(extractor: Any) -> str:
+    """An extractor's name and a hash of its weights: retrained weights of the same name are another extractor."""
+    name = getattr(extractor, "name", type(extractor).__name__)
+    if not isinstance(extractor, Backbone):
+        weights = extractor.state_dict() if hasattr(extractor, "state_dict") else {}
+        return f"{name} {_digest('', weights)}" if weights else name
+    chosen = f"{extractor.key_block} {extractor.saliency_heads} {extractor.precision}"
+    if (facet := getattr(extractor, "facet", "key")) != "key":
+        chosen += f" {facet} {extractor.mean} {extractor.std}"
+    return f"{name} {_digest(chosen, extractor.model.state_dict())}"
+
+
+def _digest(text: str, weights: Mapping[str, torch.Tensor]) -> str:
+    digest = hashlib.sha256(text.encode())
+    for key, weight in sorted(weights.items()):
+        digest.update(key.encode() + weight.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,109 @@
+"""The paper's figures from a run: how errors are distributed, what more target views bring, and error curves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from zsp_lite.benchmark import published
+from zsp_lite.benchmark.results import Results
+from zsp_lite.errors import InputError
+from zsp_lite.plots import BLUE, GREEN, ORANGE, VERMILLION
+
+_VIEWS = (1, 3, 5, 10, 20)
+_COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")
+_DPI = 150
+
+
+def error_distribution(results: Results, row: str = "ours") -> Figure:
+    """Every pair's rotation error, a line per category (the supplement's figure "err_distrib").
+
+    A second cluster near 180 degrees is front taken for back. Raises InputError for a row that the run has not.
+    """
+    by_category: dict[str, list[float]] = {}
+    for key, error in results.errors(row).items():
+        by_category.setdefault(key.split("/")[0], []).append(error)
+    categories = sorted(by_category, reverse=True)
+    figure, axis = plt.subplots(figsize=(7, 0.9 + 0.32 * len(categories)), layout="constrained")
+    jitter = np.random.default_rng(0)
+    for height, category in enumerate(categories):
+        errors = np.array(by_category[category])
+        axis.scatter(errors, height + jitter.uniform(-0.28, 0.28, len(errors)), s=9, alpha=0.55, color=BLUE, lw=0)
+        axis.plot([np.median(errors)] * 2, [height - 0.38, height + 0.38], color=VERMILLION, lw=2)
+    axis.set_yticks(range(len(categories)), categories)
+    axis.set_xticks(range(0, 181, 30))
+    axis.set(xlim=(-3, 183), ylim=(-0.6, len(categories) - 0.4), xlabel="rotation error (degrees)")
+    axis.set_title(f'Errors of "{row}" by category; the bar is the median', fontsize=10)
+    axis.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def accuracy_against_views(results: Results) -> Figure:
+    """Acc30 and Acc15 over the number of target views, best view only and full, with 95 % intervals.
+
+    What the paper printed, for CO3D, is dotted grey. Raises InputError where the run has fewer than two numbers.
+    """
+    methods, views = results.summary["methods"], results.summary["data"]["targets"]
+    lines = {}
+    for label, row, printed in (("full method", "ours", "full"), ("best view only", "ours-bv", "bv")):
+        found = {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in _VIEWS}
+        lines[label] = {n: one for n, one in found.items() if one is not None}, printed
+    if max(len(found) for found, _ in lines.values()) < 2:
+        raise InputError("accuracy against views: the run has fewer than two numbers of target views")
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
+    for axis, name, title in zip(axes, ("acc30", "acc15"), ("Acc30 (%)", "Acc15 (%)"), strict=True):
+        for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN), strict=True):
+            numbers = list(found)
+            low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
+            axis.fill_between(numbers, low, high, color=colour, alpha=0.18, lw=0)
+            axis.plot(numbers, [found[n][name] for n in numbers], "o-", color=colour, label=label)
+            column = published.TARGETS.columns.index(f"{printed}_{name}")
+            values = [published.TARGETS.rows[str(n)][column] for n in _VIEWS]
+            axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=f"{label}, published on CO3D")
+        axis.set(xlabel="target views N", ylabel=title, xticks=_VIEWS, ylim=(0, None))
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    return figure
+
+
+def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
+    """The share of pairs within every error, one line per row.  rows: default the run's first seven."""
+    names = list(rows or list(results.summary["methods"])[: len(_COLOURS)])
+    figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
+    for index, name in enumerate(names):
+        errors = np.sort(list(results.errors(name).values()))
+        share = 100 * np.arange(len(errors) + 1) / len(errors)
+        style = {"color": _COLOURS[index % len(_COLOURS)], "ls": ("-", "--", ":")[index // len(_COLOURS) % 3]}
+        axis.step(np.concatenate([[0], errors]), share, where="post", label=name, **style)
+    for threshold in (15, 30):
+        axis.axvline(threshold, color="0.7", lw=1, zorder=0)
+    axis.set(xlim=(0, 180), ylim=(0, 100), xlabel="rotation error (degrees)", ylabel="pairs within it (%)",
+             xticks=range(0, 181, 30))  # fmt: skip
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def write_figures(results: Results, folder: str | Path) -> list[Path]:
+    """The figures that the run has rows for, as PNG files."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    first = "ours" if "ours" in results.rows else next(iter(results.rows))
+    makers = {
+        "error_distribution": lambda: error_distribution(results, first),
+        "accuracy_against_views": lambda: accuracy_against_views(results),
+        "error_curves": lambda: error_curves(results),
+    }
+    written = []
+    for name, make in makers.items():
+        try:
+            figure = make()
+        except InputError:  # too few numbers of views: this run has no such figure
+            continue
+        path = folder / f"{name}.png"
+        figure.savefig(path, dpi=_DPI)
+        plt.close(figure)
+        written.append(path)
+    return written

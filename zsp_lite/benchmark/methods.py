@@ -1,0 +1,188 @@
+"""The rows of the benchmark's tables as plain data, groups of them by name, and your own.
+
+A row is the paper's method with some of its settings changed, or a function of its own (`solve`). What a function is
+given and may answer stands in `problem`.
+"""
+
+import hashlib
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from zsp_lite.benchmark import baseline_rows
+from zsp_lite.errors import InputError
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the tables.
+
+    features: what describes the images, a name in `extractors.EXTRACTORS`.
+    answer: the fitted pose; the best view taken as it is ("Ours-BV"); the pose fitted in the target view that is truly
+    nearest in rotation; or, without depth, the essential matrix between the reference and the best view.
+    settings: of `ZeroShotPose`, where they differ from the paper's.
+    targets: target views per pair, where the row fixes them; None takes the run's.
+    solve: does everything instead, from a `Problem`; `features` then only says which extractor it will ask for.
+    """
+
+    features: str = "backbone"
+    answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    targets: int | None = None
+    solve: Callable[[Any], Any] | None = None
+
+
+def _numbers_of_views() -> dict[str, Method]:
+    rows = {}
+    for n in (1, 3, 5, 10, 20):
+        rows |= {f"ours-n{n}": Method(targets=n), f"ours-bv-n{n}": Method(answer="best view", targets=n)}
+    return rows
+
+
+_MASK = {"foreground": "mask"}
+_MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
+
+METHODS: dict[str, Method] = {
+    "ours": Method(),
+    "ours-bv": Method(answer="best view"),
+    # SIFT has no saliency: it gets the true mask, which no other row does unless its name says so.
+    "rootsift": Method("rootsift", settings=_MASK),
+    "rootsift-bv": Method("rootsift", "best view", _MASK),
+    "ours-mask": Method(settings=_MASK),
+    "oracle-view": Method(answer="true view"),
+    "random": Method("random"),
+    # Supplement, "Number and diversity of correspondences"; K = 50 with k-means is "ours".
+    "ours-k30": Method(settings={"k": 30}),
+    "ours-k70": Method(settings={"k": 70}),
+    "ours-k30-nokmeans": Method(settings={"k": 30, "kmeans": False}),
+    "ours-k50-nokmeans": Method(settings={"kmeans": False}),
+    "ours-k70-nokmeans": Method(settings={"k": 70, "kmeans": False}),
+    # Table 3: the other ways to choose a view.
+    "ours-globalsim": Method(settings={"view_selector": "global"}),
+    "ours-saliencyiou": Method(settings={"view_selector": "saliency"}),
+    "ours-cyclicaliou": Method(settings={"view_selector": "cyclical"}),
+    # Supplement, "Design of correspondence method", "RANSAC parameters", "Depth-free methods".
+    "ours-dualsoftmax": Method(settings={"matcher": "dual softmax"}),
+    "ours-transport": Method(settings={"matcher": "optimal transport"}),
+    "ours-trials500": Method(settings={"trials": 500}),
+    "ours-trials2000": Method(settings={"trials": 2000}),
+    "ours-nodepth": Method(answer="essential matrix"),
+    # Cycles, clusters and salience from the target view, as in the published code.
+    "ours-published": Method(settings={"cycle_from": "target"}),
+    # Table 1, the baselines. Convolutional features are told the object by the mask, too.
+    "icp": Method("none", solve=baseline_rows.icp),
+    "icp-bv": Method(solve=baseline_rows.icp_best_view),
+    "sift": Method("sift", solve=baseline_rows.sift),
+    "swav": Method("swav", settings=_MUTUAL),
+    "swav-tiny": Method("swav-tiny", settings=_MUTUAL),
+    "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
+    "posecontrast-tiny": Method("posecontrast-tiny", solve=baseline_rows.posecontrast_tiny),
+    # Table 2 and supplement, "Number of target views".
+    **_numbers_of_views(),
+}
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "default": ("ours", "ours-bv", "rootsift"),
+    "table1": ("icp", "sift", "swav-tiny", "icp-bv", "posecontrast-tiny", "ours-k30", "ours"),
+    "table2": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5)),
+    "table3": ("ours-cyclicaliou", "ours-globalsim", "ours-saliencyiou", "ours"),
+    "views": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5, 10, 20)),
+    "matchers": ("ours-transport", "ours-dualsoftmax", "ours"),
+    "correspondences": (
+        "ours-k30-nokmeans", "ours-k50-nokmeans", "ours-k70-nokmeans", "ours-k30", "ours", "ours-k70",
+    ),
+    "trials": ("ours-trials500", "ours", "ours-trials2000"),
+    "depth": ("ours-nodepth", "ours-bv", "ours"),
+    "published": ("ours", "ours-published"),
+}  # fmt: skip
+
+
+def _union(*names: str) -> tuple[str, ...]:
+    """Rows of several groups, each once."""
+    return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
+
+
+# Every switch of the paper at one number of views; then all its tables, with what stands in for the large networks.
+GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
+GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
+
+
+def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
+    """Rows by name, in order, each once.
+
+    methods: names in `METHODS` or `GROUPS` or of the form "module:name"; or a mapping from the names that the tables
+    shall show to such names, `Method`s, functions of a `Problem`, or objects with `ZeroShotPose`'s `estimate`.
+    Raises InputError for what is none of these.
+    """
+    if isinstance(methods, str):
+        methods = [methods]
+    if not isinstance(methods, Mapping):
+        names = [member for name in methods for member in GROUPS.get(name, (name,))]
+        methods = {name: name for name in names}
+    if not methods:
+        raise InputError(f"no methods, expected some of {', '.join((*GROUPS, *METHODS))}, or module:name")
+    return {str(name): _method(str(name), meant) for name, meant in methods.items()}
+
+
+def fingerprint(method: Method) -> str:
+    """What decides a row's results, as far as it can be told: its settings, and the source of functions.
+
+    Two rows of one name and different fingerprints must not share a file.
+    """
+    text = f"{method.features} {method.answer} {sorted(method.settings.items(), key=str)!r} {method.targets}"
+    functions = [method.solve, *(value for value in method.settings.values() if callable(value))]
+    text = text if not any(functions) else ""  # a function's repr has its address in it
+    for function in functions:
+        if function is None:
+            continue
+        known = function if inspect.isroutine(function) or inspect.isclass(function) else type(function)
+        try:
+            text += inspect.getsource(known)
+        except (OSError, TypeError):  # typed in at a prompt
+            text += getattr(known, "__qualname__", str(known))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _method(name: str, meant: Any) -> Method:
+    if isinstance(meant, str):
+        if meant in METHODS:
+            return METHODS[meant]
+        if ":" not in meant:
+            raise InputError(
+                f"method {meant!r} is unknown, expected one of {', '.join((*GROUPS, *METHODS))}, or module:name"
+            )
+        meant = _import(meant)
+    if isinstance(meant, Method):
+        return meant
+    if callable(getattr(meant, "estimate", None)):
+        return Method(solve=_Estimator(meant))
+    if callable(meant):
+        return Method(solve=meant)
+    raise InputError(
+        f"method {name!r} is a {type(meant).__name__}, expected a Method, a function of a problem, or an object "
+        "with estimate(reference, targets)"
+    )
+
+
+def _import(path: str) -> Any:
+    module, _, name = path.partition(":")
+    try:
+        found = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"method {path!r} cannot be imported: {error}") from error
+    return found
+
+
+@dataclass(frozen=True)
+class _Estimator:
+    """Someone's object with `estimate(reference, targets) -> PoseEstimate`: it is given the whole frames."""
+
+    estimator: Any
+
+    def __call__(self, problem: Any) -> Any:
+        reference, *targets = problem.full_frames()
+        return self.estimator.estimate(reference, targets)

@@ -1,0 +1,122 @@
+"""The figures that the paper printed (Goodwin et al., ECCV 2022), for comparison only.
+
+CO3D, 20 categories, 100 pairs each, DINO ViT-S/8: other data than this project's synthetic benchmark, so never in one
+column with its figures. "med" is the median rotation error in degrees, "acc30" and "acc15" are in percent, and so are
+the five categories of Table 1, which are Acc30.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A printed table: columns, and rows of as many figures by their label."""
+
+    columns: tuple[str, ...]
+    rows: dict[str, tuple[float, ...]]
+
+
+TABLE_1 = Printed(
+    ("med", "acc30", "acc15", "bike", "hydrant", "mcycle", "teddy", "toaster"),
+    {
+        "ICP": (111.8, 3.8, 0.7, 3.0, 6.0, 1.0, 1.0, 7.0),
+        "SIFT": (129.4, 4.0, 1.5, 3.0, 11.0, 1.0, 1.0, 0.0),
+        "SWaV": (123.1, 7.5, 3.3, 13.0, 9.0, 8.0, 5.0, 7.0),
+        "ICP+BV": (109.3, 5.4, 1.2, 6.0, 5.0, 8.0, 5.0, 5.0),
+        "PoseContrast": (111.5, 6.9, 1.1, 2.0, 4.0, 13.0, 4.0, 12.0),
+        "Ours (K=30)": (60.2, 43.5, 29.0, 63.0, 24.0, 80.0, 33.0, 39.0),
+        "Ours (K=50)": (53.8, 46.3, 31.1, 71.0, 26.0, 82.0, 39.0, 42.0),
+    },
+)
+
+TABLE_2 = Printed(
+    ("med", "acc30", "acc15"),
+    {
+        "Ours-BV (N=1)": (92.8, 12.6, 3.7),
+        "Ours-BV (N=3)": (69.5, 26.1, 8.0),
+        "Ours-BV (N=5)": (61.1, 35.4, 10.6),
+        "Ours (N=1)": (97.3, 23.8, 13.4),
+        "Ours (N=3)": (63.9, 38.9, 26.2),
+        "Ours (N=5)": (53.8, 46.3, 31.1),
+    },
+)
+
+TABLE_3 = Printed(
+    ("med", "acc30", "acc15"),
+    {
+        "CyclicalDistIoU": (94.7, 22.3, 13.1),
+        "GlobalSim": (71.9, 36.8, 23.7),
+        "SaliencyIoU": (87.0, 29.1, 18.1),
+        "CorrespondSim": (53.8, 46.3, 31.1),
+    },
+)
+
+TARGETS = Printed(
+    ("bv_acc30", "bv_acc15", "full_acc30", "full_acc15"),
+    {
+        "1": (12.6, 3.7, 23.8, 13.4),
+        "3": (26.1, 8.0, 38.9, 26.2),
+        "5": (35.4, 10.6, 46.3, 31.1),
+        "10": (45.0, 16.2, 52.5, 38.2),
+        "20": (47.0, 18.6, 52.1, 38.3),
+    },
+)
+
+MATCHERS = Printed(
+    ("med", "acc30", "acc15"),
+    {
+        "Optimal transport": (54.6, 44.8, 29.1),
+        "Dual softmax": (54.0, 44.5, 30.1),
+        "Cyclical distances": (53.8, 46.3, 31.1),
+    },
+)
+
+CORRESPONDENCES = Printed(
+    ("no_kmeans_acc30", "no_kmeans_acc15", "kmeans_acc30", "kmeans_acc15"),
+    {
+        "30": (38.7, 25.2, 43.5, 29.0),
+        "50": (42.0, 28.6, 46.3, 31.1),
+        "70": (43.4, 30.4, 47.1, 30.8),
+    },
+)
+
+DEPTH = Printed(
+    ("med", "acc30", "acc15"),
+    {
+        "No depth (essential matrix)": (81.7, 23.6, 6.8),
+        "Ours-BV": (61.1, 35.4, 10.6),
+        "Ours": (53.8, 46.3, 31.1),
+    },
+)
+
+TRIALS = Printed(
+    ("acc30",),
+    {
+        "500": (45.8,),
+        "1000": (46.3,),
+        "2000": (46.6,),
+    },
+)
+
+CATEGORIES = (
+    "backpack",
+    "bicycle",
+    "book",
+    "car",
+    "chair",
+    "hairdryer",
+    "handbag",
+    "hydrant",
+    "keyboard",
+    "laptop",
+    "motorcycle",
+    "mouse",
+    "remote",
+    "teddybear",
+    "toaster",
+    "toilet",
+    "toybus",
+    "toyplane",
+    "toytrain",
+    "toytruck",
+)

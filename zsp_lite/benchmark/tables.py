@@ -1,0 +1,205 @@
+"""The paper's tables from a run's summary, with intervals, and what the paper printed in columns of its own.
+
+Medians are means of the categories' medians, as the paper averages them; accuracies are over all pairs, which is the
+same average where every category has as many. A table without a single row in the run is left out.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from zsp_lite.benchmark import published
+from zsp_lite.benchmark.published import Printed
+
+THIS_RUN = "this run"
+OTHER_DATA = "published, on CO3D (other data)"
+NOTE = (
+    "Intervals: 95 %, bootstrap over pairs. Published figures are the paper's, on CO3D with DINO ViT-S/8: other data, "
+    "and another backbone unless the run says otherwise."
+)
+_TITLES = {"med": "Med. err. (°)", "acc30": "Acc30 (%)", "acc15": "Acc15 (%)"}
+_FEATURED = {
+    "bike": "bicycle", "hydrant": "hydrant", "mcycle": "motorcycle", "teddy": "teddybear", "toaster": "toaster",
+}  # fmt: skip
+_FIGURES = ("med", "acc30", "acc15")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A figure with its interval, where it has one."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    decimals: int = 1
+
+
+@dataclass(frozen=True)
+class Column:
+    """group: what stands above several columns of one kind."""
+
+    title: str
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """name: a file's stem.  rows: a label and one cell per column, None where there is no figure."""
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, tuple[Cell | str | None, ...]], ...]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Columns of one kind: `figures` of the row (a benchmark row's name, or None) that stands for each label."""
+
+    group: str
+    rows: Mapping[str, str | None]
+    figures: Sequence[str]
+
+
+def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Tables 1 to 3 and those of the supplement, as far as the run has rows for them, and what it has beyond them."""
+    names = {"icp": "ICP", "sift": "SIFT", "swav": "SWaV", "icp-bv": "ICP+BV", "posecontrast": "PoseContrast"}
+    table1 = {label: name for name, label in names.items()}
+    table1 |= {"swav-tiny (stand-in)": "swav-tiny", "posecontrast-tiny (stand-in)": "posecontrast-tiny"}
+    table1 |= {"Ours (K=30)": "ours-k30", "Ours (K=50)": "ours"}
+    table1 = {
+        label: name for label, name in table1.items() if name in summary["methods"] or label in published.TABLE_1.rows
+    }
+    categories = [name for name in _FEATURED.values() if name in summary["data"]["categories"]]
+    views = summary["data"]["targets"]
+
+    def at(row: str, n: int) -> str:
+        """The row at a number of views, under the name that the run has it by."""
+        named = f"{row}-n{n}"
+        return row if n == views and named not in summary["methods"] else named
+
+    numbers = (1, 3, 5, 10, 20)
+    kinds = (("Best view only", "ours-bv"), ("Full method", "ours"))
+    table2 = {f"{label} (N={n})": at(row, n) for label, row in (("Ours-BV", "ours-bv"), ("Ours", "ours"))
+              for n in (1, 3, 5)}  # fmt: skip
+    build = _builder(summary)
+    found = [
+        build("table_1", f"Table 1. Baselines and our method, N = {views}",
+              [_Block(THIS_RUN, table1, (*_FIGURES, *categories))], published.TABLE_1),
+        build("table_2", "Table 2. Number of target views", [_Block(THIS_RUN, table2, _FIGURES)], published.TABLE_2),
+        build("table_3", "Table 3. How to choose the view", [_Block(THIS_RUN, {
+            "CyclicalDistIoU": "ours-cyclicaliou", "GlobalSim": "ours-globalsim", "SaliencyIoU": "ours-saliencyiou",
+            "CorrespondSim": "ours"}, _FIGURES)], published.TABLE_3),
+        build("table_a_targets", "Supplement. More target views",
+              [_Block(f"{THIS_RUN}: {kind.lower()}", {str(n): at(row, n) for n in numbers}, ("acc30", "acc15"))
+               for kind, row in kinds], published.TARGETS, "views"),
+        build("table_a_matchers", "Supplement. Correspondence method", [_Block(THIS_RUN, {
+            "Optimal transport": "ours-transport", "Dual softmax": "ours-dualsoftmax", "Cyclical distances": "ours"},
+            _FIGURES)], published.MATCHERS),
+        build("table_a_correspondences", "Supplement. Number and diversity of correspondences", [
+            _Block(f"{THIS_RUN}: without k-means", {str(k): f"ours-k{k}-nokmeans" for k in (30, 50, 70)},
+                   ("acc30", "acc15")),
+            _Block(f"{THIS_RUN}: with k-means", {"30": "ours-k30", "50": "ours", "70": "ours-k70"},
+                   ("acc30", "acc15"))], published.CORRESPONDENCES, "K"),
+        build("table_a_trials", "Supplement. RANSAC trials", [_Block(THIS_RUN, {
+            "500": "ours-trials500", "1000": "ours", "2000": "ours-trials2000"}, _FIGURES)],
+            published.TRIALS, "trials"),
+        build("table_a_depth", "Supplement. Without depth", [_Block(THIS_RUN, {
+            "No depth (essential matrix)": "ours-nodepth", "Ours-BV": "ours-bv", "Ours": "ours"}, _FIGURES)],
+            published.DEPTH),
+        build("published_code", "The paper's way and the published code's", [_Block(THIS_RUN, {
+            "Cycle from the reference (paper)": "ours", "Cycle from the target (published code)": "ours-published"},
+            _FIGURES)]),
+    ]  # fmt: skip
+    tables = [table for table, used in found if len(used) > 1]
+    shown = {name for _, used in found for name in used}
+    beyond = {name: name for name in summary["methods"] if name not in shown or name == "ours"}
+    table, used = build("beyond", "Beyond the paper", [_Block(THIS_RUN, beyond, _FIGURES)])
+    return tables + [table] * (len(used) > 1)
+
+
+def all_rows(summary: Mapping[str, Any]) -> Table:
+    """Every row of the run: its figures, and how many of its answers say themselves that they are not to be trusted."""
+    columns = ("pairs", "Med. err. (°)", "Acc30 (%)", "Acc15 (%)", "above 150° (%)", "flagged", "failed", "p (Acc30)")
+    rows = []
+    for name, row in summary["methods"].items():
+        test = summary.get("against_ours", {}).get(name)
+        cells = [Cell(row["n"], decimals=0), *(_figure(row, figure) for figure in _FIGURES), Cell(row["above150"]),
+                 Cell(row["flagged"], decimals=0), Cell(row["failed"], decimals=0),
+                 None if test is None else Cell(test["accuracy_p"], decimals=3)]  # fmt: skip
+        rows.append((name, tuple(cells)))
+    note = 'p: sign test of Acc30 against "ours" on the same pairs. Intervals: 95 %, bootstrap over pairs.'
+    return Table("all_rows", "All rows", tuple(map(Column, columns)), tuple(rows), note)
+
+
+def category_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Every row by category: median error, Acc30 and Acc15, one table each."""
+    categories = list(dict.fromkeys(c for row in summary["methods"].values() for c in row["per_category"]))
+    columns = tuple(Column(category) for category in (*categories, "all"))
+    tables = []
+    for figure, stem in (("med", "median"), ("acc30", "acc30"), ("acc15", "acc15")):
+        rows = tuple(
+            (name, (*(_figure(row["per_category"].get(c), figure) for c in categories), _figure(row, figure)))
+            for name, row in summary["methods"].items()
+        )
+        tables.append(Table(f"categories_{stem}", f"By category: {_TITLES[figure]}", columns, rows, NOTE))
+    return tables
+
+
+def every_table(summary: Mapping[str, Any]) -> list[Table]:
+    """All of them."""
+    return [all_rows(summary), *paper_tables(summary), *category_tables(summary)]
+
+
+def _builder(summary: Mapping[str, Any]) -> Callable[..., tuple[Table, list[str]]]:
+    methods = summary["methods"]
+
+    def build(
+        name: str, title: str, blocks: Sequence[_Block], printed: Printed | None = None, unit: str = ""
+    ) -> tuple[Table, list[str]]:
+        """A table, and the names of the run's rows in it."""
+        columns = [Column(_TITLES.get(figure, f"{figure} Acc30"), block.group) for block in blocks
+                   for figure in block.figures]  # fmt: skip
+        if printed is not None:
+            columns += [Column(_printed_title(title), OTHER_DATA) for title in printed.columns]
+        rows = []
+        for row in dict.fromkeys(label for block in blocks for label in block.rows):
+            cells: list[Cell | str | None] = []
+            for block in blocks:
+                found = methods.get(block.rows.get(row))
+                cells += [_named_figure(found, figure) for figure in block.figures]
+            if printed is not None:
+                cells += map(Cell, printed.rows[row]) if row in printed.rows else [None] * len(printed.columns)
+            rows.append((f"{unit} = {row}" if unit else row, tuple(cells)))
+        used = [found for block in blocks for found in block.rows.values() if found in methods]
+        return Table(name, title, tuple(columns), tuple(rows), NOTE), list(dict.fromkeys(used))
+
+    return build
+
+
+def _named_figure(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
+    if row is None or figure in _FIGURES:
+        return _figure(row, figure)
+    return _figure(row["per_category"].get(figure), "acc30")
+
+
+def _figure(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
+    """A figure of a row, or of a row's category, with its interval."""
+    if row is None:
+        return None
+    name = figure
+    if figure == "med":
+        name = "mean_category_median" if "mean_category_median" in row else "median"
+    interval = row.get(f"{name}_ci", (None, None))
+    return Cell(row[name], *interval)
+
+
+def _printed_title(column: str) -> str:
+    if column in _FEATURED:
+        return f"{_FEATURED[column]} Acc30"
+    for short, long in (("no_kmeans_", "without k-means: "), ("kmeans_", "with k-means: "), ("bv_", "best view: "),
+                        ("full_", "full: ")):  # fmt: skip
+        if column.startswith(short):
+            return long + _TITLES[column.removeprefix(short)]
+    return _TITLES[column]
