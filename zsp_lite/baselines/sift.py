@@ -40,8 +40,8 @@ class Sift:
         points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
         if not points:
             return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
-        # OpenCV counts from the centre of the first pixel.
-        pixels = np.array([point.pt for point in points], dtype=np.float64) + 0.5
+        # OpenCV counts from the centre of the first pixel, in a picture that it has doubled with a shift of a quarter.
+        pixels = np.array([point.pt for point in points], dtype=np.float64) + 0.25
         length = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Keypoints(pixels, descriptors / np.maximum(length, 1e-12))
 

@@ -1,0 +1,297 @@
+"""The paper's baselines: networks load checkpoints of the published layouts, geometry is exact on exact input."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from synthetic_views import look_at, render, true_pose
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.baselines import icp as icp_module
+from zsp_lite.baselines import posecontrast, swav
+from zsp_lite.baselines.icp import align, icp, object_points
+from zsp_lite.baselines.posecontrast import (
+    PoseContrast,
+    TinyParts,
+    ViewpointHead,
+    angles_of,
+    load_posecontrast,
+    load_posecontrast_tiny,
+    pad_to_square,
+    padded,
+    predicted_angles,
+    rotation_of,
+)
+from zsp_lite.baselines.resnet import TINY, ResNet, Shape
+from zsp_lite.baselines.sift import Keypoints, Sift, lifted, mutual_matches
+from zsp_lite.baselines.swav import load_swav, load_swav_tiny
+from zsp_lite.benchmark.essential import essential_rotation
+from zsp_lite.errors import InputError
+from zsp_lite.frames import Frame
+from zsp_lite.matching import Matches
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import object_crop
+
+
+def torchvision_shapes() -> dict[str, tuple[int, ...]]:
+    """Keys and shapes of torchvision's ResNet-50 less its last layer, written down from its definition."""
+    shapes: dict[str, tuple[int, ...]] = {"conv1.weight": (64, 3, 7, 7)}
+    norms = {"bn1": 64}
+    entering = 64
+    for i, blocks in enumerate((3, 4, 6, 3)):
+        width = 64 * 2**i
+        for j in range(blocks):
+            at = f"layer{i + 1}.{j}"
+            shapes[f"{at}.conv1.weight"] = (width, entering, 1, 1)
+            shapes[f"{at}.conv2.weight"] = (width, width, 3, 3)
+            shapes[f"{at}.conv3.weight"] = (4 * width, width, 1, 1)
+            norms |= {f"{at}.bn1": width, f"{at}.bn2": width, f"{at}.bn3": 4 * width}
+            if j == 0:
+                shapes[f"{at}.downsample.0.weight"] = (4 * width, entering, 1, 1)
+                norms[f"{at}.downsample.1"] = 4 * width
+            entering = 4 * width
+    for name, channels in norms.items():
+        shapes |= {f"{name}.{part}": (channels,) for part in ("weight", "bias", "running_mean", "running_var")}
+        shapes[f"{name}.num_batches_tracked"] = ()
+    return shapes
+
+
+def random_state(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    state = {}
+    for name, shape in shapes.items():
+        if name.endswith("num_batches_tracked"):
+            state[name] = torch.tensor(3)
+        else:
+            scale = max(1, int(np.prod(shape[1:]))) ** -0.5
+            state[name] = scale * torch.randn(shape, generator=generator)
+            if name.endswith("running_var"):
+                state[name] = state[name].abs() + 0.5
+    return state
+
+
+def test_resnet50_has_torchvisions_keys_and_its_layers_their_strides():
+    model = ResNet()
+    assert {key: tuple(x.shape) for key, x in model.state_dict().items()} == torchvision_shapes()
+    with torch.inference_mode():
+        layers = model.eval().layers(torch.zeros(1, 3, 64, 64))
+    assert [tuple(x.shape[1:]) for x in layers] == [(256, 16, 16), (512, 8, 8), (1024, 4, 4), (2048, 2, 2)]
+
+
+def test_a_block_is_what_it_is_by_hand():
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        block = ResNet(TINY).layer1[0].eval()
+    x = torch.rand(1, 32, 8, 8)
+    first = torch.relu(block.bn1(torch.conv2d(x, block.conv1.weight, padding=1)))
+    second = block.bn2(torch.conv2d(first, block.conv2.weight, padding=1))
+    assert torch.allclose(block(x), torch.relu(second + x), atol=1e-6)
+
+
+def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path):
+    state = {f"module.{key}": x for key, x in random_state(torchvision_shapes()).items()}
+    heads = {"projection_head.0.weight": (8, 2048), "projection_head.0.bias": (8,), "prototypes.weight": (5, 8)}
+    path = tmp_path / "swav_800ep_pretrain.pth.tar"
+    torch.save(state | {f"module.{key}": x for key, x in random_state(heads).items()}, path)
+    model = load_swav(path)
+    (found,) = model([np.full((224, 224, 3), 100, np.uint8)])
+    assert found.keys.shape == (28, 28, 1024) and found.global_feature.shape == (2048,)
+    assert found.saliency.min() == 1
+    for change in ({"module.conv1.weight": torch.zeros(64, 3, 5, 5)}, {"module.bn1.bias": torch.full((64,), np.nan)}):
+        torch.save(state | change, path)
+        with pytest.raises(InputError, match="conv1.weight|bn1.bias"):
+            load_swav(path)
+
+
+def test_swav_that_cannot_be_fetched_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
+    monkeypatch.setattr(swav, "URL", "http://127.0.0.1:9/swav_800ep_pretrain.pth.tar")
+    with pytest.raises(InputError, match="swav-tiny"):
+        load_swav()
+
+
+def tiny_file(tmp_path, model: torch.nn.Module, name: str):
+    path = tmp_path / name
+    save_file({k: x.contiguous() for k, x in model.state_dict().items() if "num_batches" not in k}, path)
+    return path
+
+
+def test_swav_tiny_has_the_papers_grid(tmp_path):
+    model = load_swav_tiny(tiny_file(tmp_path, ResNet(TINY), "swav-tiny.safetensors"))
+    (found,) = model([np.zeros((224, 224, 3), np.uint8)])
+    assert found.keys.shape == (28, 28, TINY.channels[2])
+    with pytest.raises(InputError, match="train-baseline swav-tiny"):
+        load_swav_tiny(tmp_path / "nowhere.safetensors")
+
+
+angles = st.tuples(st.floats(0, 359.9), st.floats(1, 179), st.floats(0, 359.9))
+
+
+@given(angles)
+def test_angles_and_rotations_are_each_others_inverse(found):
+    rotation = rotation_of(np.array(found))
+    assert rotation_error(rotation_of(angles_of(rotation)), rotation) < 1e-4
+    assert angles_of(rotation) == pytest.approx(np.array(found), abs=1e-6)
+
+
+@pytest.mark.parametrize("pole", [0.0, 180.0])
+@pytest.mark.parametrize("azimuth", [0.0, 77.0, 300.0])
+def test_straight_from_above_or_below_angles_still_give_the_rotation(pole, azimuth):
+    rotation = rotation_of(np.array([azimuth, pole, 40.0]))
+    assert rotation_error(rotation_of(angles_of(rotation)), rotation) < 1e-4
+
+
+def test_a_viewpoint_is_pascals_in_front_of_the_object_and_beside_it():
+    """Azimuth, elevation and in-plane rotation 0: the camera at -y looks along +y, z upwards; labels count from -90."""
+    front = rotation_of(np.array([0.0, 90.0, 180.0]))
+    assert front == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), abs=1e-12)
+    # 90 degrees of elevation: from above, what was away from the camera is up in the picture.
+    above = rotation_of(np.array([0.0, 180.0, 180.0]))
+    assert above @ (0, 1, 0) == pytest.approx((0, -1, 0), abs=1e-12)
+    assert above @ (0, 0, 1) == pytest.approx((0, 0, -1), abs=1e-12)
+
+
+def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path):
+    network, head = ResNet(Shape(outputs=128)), ViewpointHead(2048)
+    path = tmp_path / "posecontrast.pth"
+    features = random_state(torchvision_shapes() | {"fc.weight": (128, 2048), "fc.bias": (128,)})
+    torch.save({"epoch": 14, "net_feat": features, "net_vp": head.state_dict()}, path)
+    model = load_posecontrast(path)
+    frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
+    (found,) = model.describe([frame])
+    assert found.feature.shape == (2048,)
+    assert found.rotation @ found.rotation.T == pytest.approx(np.eye(3), abs=1e-9)
+    network.load_state_dict(features)
+    batch = swav.normalised(torch.from_numpy(padded(frame, 224)).permute(2, 0, 1)[None] / 255)
+    with torch.inference_mode():
+        logits, offsets = model.head(network.eval()(batch))
+    chosen = [int(logit.argmax()) for logit in logits]
+    by_hand = [15 * (i + float(offset[0, i])) for i, offset in zip(chosen, offsets, strict=True)]
+    assert rotation_error(found.rotation, rotation_of(np.clip(by_hand, 0, 360))) < 0.1
+    keys = {"compress.0.weight", "compress.1.running_mean", "compress.7.bias", "fc_cls_azi.weight", "fc_reg_inp.bias"}
+    assert keys <= head.state_dict().keys()
+    for content in ([1], {"net_feat": features}, {"net_feat": {}, "net_vp": {}}):
+        torch.save(content, path)
+        with pytest.raises(InputError, match="posecontrast"):
+            load_posecontrast(path)
+    with pytest.raises(InputError, match="posecontrast-tiny"):
+        load_posecontrast(tmp_path / "nowhere.pth")
+
+
+def test_posecontrast_tiny_loads_what_its_trainer_writes(tmp_path):
+    model = load_posecontrast_tiny(tiny_file(tmp_path, TinyParts(), "posecontrast-tiny.safetensors"))
+    assert isinstance(model, PoseContrast) and model.image_size == posecontrast.TINY_SIZE
+    with pytest.raises(InputError, match="train-baseline"):
+        load_posecontrast_tiny(tmp_path / "nowhere.safetensors")
+
+
+def test_predicted_angles_are_bin_and_offset():
+    logits = [torch.eye(24)[[3]], torch.eye(12)[[11]], torch.eye(24)[[0]]]
+    offsets = [torch.full((1, 24), 0.5), torch.full((1, 12), 1.5), torch.full((1, 24), -0.4)]
+    assert predicted_angles(logits, offsets).tolist() == [[52.5, 187.5, 0.0]]
+
+
+def test_padding_gives_a_crop_its_own_aspect_again():
+    frame = render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity())
+    frame = replace(frame, mask=None)
+    square = padded(object_crop(frame), 80)
+    assert (square[:9] == 0).all() and (square[71:] == 0).all() and square[20:60].any()
+    assert pad_to_square(np.full((4, 4, 3), 9, np.uint8), 0.5, 8)[:, :, 0].tolist() == [[0, 0, 9, 9, 9, 9, 0, 0]] * 8
+
+
+def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(400, 3)) * (1.5, 1.0, 0.6)
+    truth = Sim3(1.1, Rotation.from_rotvec([0.05, -0.08, 0.06]).as_matrix(), np.array([0.05, 0.02, -0.04]))
+    found = icp(source, truth.apply(source))
+    assert rotation_error(found.R, truth.R) < 0.1 and found.scale == pytest.approx(1.1, rel=1e-3)
+    with pytest.raises(InputError):
+        icp(source, np.zeros((20, 3)))
+
+
+def test_icp_starts_where_the_first_cameras_stand(monkeypatch):
+    """The same object seen from about the same side in two worlds."""
+    clouds = []
+    monkeypatch.setattr(icp_module, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
+    sides = np.array([(1.0, 0.1, 0.3), (0.95, 0.2, 0.35), (-0.2, 1.0, 0.3)])
+    cameras = [look_at(side) for side in sides]
+    # As in CO3D, a world is turned so that its first camera looks the same way as that of any other.
+    turn = cameras[0].R.T @ cameras[1].R
+    placements = Sim3.identity(), Sim3(1.0, turn, np.zeros(3))
+    first = render(cameras.pop(0), placements[0])
+    cameras = [replace(camera, R=camera.R @ turn.T) for camera in cameras]
+    targets = [render(camera, placements[1]) for camera in cameras]
+    firsts = first.camera, targets[0].camera
+    found = align(first, targets, 0, firsts, seed=0)
+    assert rotation_error(found.R, np.eye(3)) < 1e-6
+    source, target = clouds
+    assert len(source) <= icp_module.POINTS and len(target) == icp_module.POINTS
+    distance, _ = cKDTree(target).query(source)
+    truth = true_pose(first.camera, placements[0], cameras[0], placements[1])
+    off = rotation_error(found.R, truth.R)
+    assert np.median(distance) < 0.15 and 2 < off < 10
+    # Placed by the truth instead of by the cameras, they would lie on each other.
+    placed = firsts[1].to_world(truth.apply(firsts[0].to_camera(source)))
+    assert np.median(cKDTree(target).query(placed)[0]) < 0.05
+    align(first, targets, 0, firsts, seed=0)
+    assert (clouds[2] == source).all() and (clouds[3] == target).all()
+    assert len(object_points(first)) == int((first.mask >= 0.5).sum())
+    with pytest.raises(InputError, match="depth"):
+        object_points(replace(first, depth=None))
+
+
+def test_sift_finds_a_turned_picture_in_itself():
+    rng = np.random.default_rng(0)
+    texture = cv2.resize(rng.integers(0, 255, (24, 24, 3)).astype(np.uint8), (224, 224), interpolation=cv2.INTER_CUBIC)
+    camera = look_at((1, 0, 0), size=(224, 224))
+    mask = np.zeros((224, 224), np.float32)
+    mask[40:200, 30:190] = 1
+    first, second = (Frame(np.ascontiguousarray(t), None, m, camera) for t, m in (
+        (texture, mask), (np.rot90(texture), np.rot90(mask)),
+    ))  # fmt: skip
+    one, two = Sift().describe([first, second])
+    a, b, similarity = mutual_matches(one, two)
+    assert len(a) == 50 and (np.diff(similarity) <= 0).all()
+    x, y = one.pixels[a].T
+    turned = np.stack([y, 224 - x], axis=1)
+    assert np.median(np.linalg.norm(turned - two.pixels[b], axis=1)) < 0.1
+    assert (one.pixels > (29, 39)).all() and (one.pixels < (191, 201)).all()
+    empty = Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    assert len(mutual_matches(one, empty)[0]) == 0
+    blank = Frame(np.zeros((224, 224, 3), np.uint8), None, mask, camera)
+    assert len(Sift().describe([blank])[0].pixels) == 0
+
+
+def test_keypoints_are_lifted_onto_the_surface():
+    frame = render(look_at((1, 0.2, 0.4)), Sim3.identity())
+    pixels = np.argwhere(frame.mask > 0)[::50, ::-1] + 0.5
+    points = lifted(frame, pixels)
+    back, depth = frame.camera.project(frame.camera.to_world(points))
+    assert back == pytest.approx(pixels, abs=1e-6)
+    rows, columns = np.floor(pixels).astype(int).T[::-1]
+    assert depth == pytest.approx(frame.depth[rows, columns], rel=1e-6)
+
+
+def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():
+    rng = np.random.default_rng(0)
+    grid = (224, 224)  # a patch per pixel: nearly exact matches
+    first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal=np.array([300.0, 260.0]))
+    second = replace(look_at((0.9, 0.45, 0.3), size=(224, 224)), focal=np.array([350.0, 330.0]))
+    points = rng.normal(size=(60, 3)) * 0.5
+    pixels = [np.floor(camera.project(points)[0]).astype(int)[:, ::-1] for camera in (first, second)]
+    pixels[1][:15] = rng.integers(40, 180, (15, 2))  # a quarter of the matches is wrong
+    image = np.zeros((224, 224, 3), np.uint8)
+    frames = [Frame(image, None, None, camera) for camera in (first, second)]
+    matches = Matches(pixels[0], pixels[1], np.ones(60), np.zeros(60))
+    rotation, inliers, note = essential_rotation(*frames, matches, grid)
+    assert rotation_error(rotation, second.R @ first.R.T) < 5 and 30 <= inliers <= 50 and note == ""
+    few = Matches(pixels[0][:4], pixels[1][:4], np.ones(4), np.zeros(4))
+    rotation, inliers, note = essential_rotation(*frames, few, grid)
+    assert (rotation == np.eye(3)).all() and inliers == 0 and "4 matches" in note

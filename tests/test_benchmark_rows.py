@@ -1,0 +1,123 @@
+"""The rows of the paper's tables on a folder whose features are perfect."""
+
+import pytest
+import torch
+from benchmark_folder import small_folder
+from synthetic_views import CoordinateBackbone
+
+from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.benchmark import extractors
+from zsp_lite.benchmark.methods import GROUPS, METHODS
+from zsp_lite.benchmark.run import evaluate, pairs_of_rows, read_records, resolve
+from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.labels import read_labels
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose
+
+BACKBONE = CoordinateBackbone()
+ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("rows")
+    summary = evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out=out, categories=["pebble"])
+    return summary["methods"], read_records(out / "pairs.jsonl")
+
+
+def test_every_row_answers_every_pair(run):
+    rows, _ = run
+    assert set(rows) == set(ROWS)
+    assert all(row["n"] == 6 and row["failed"] == 0 for row in rows.values())
+
+
+def test_with_perfect_features_every_way_to_match_and_fit_is_right(run):
+    rows, _ = run
+    exact = [*GROUPS["correspondences"], *GROUPS["matchers"], *GROUPS["trials"], *GROUPS["published"]]
+    assert all(rows[name]["acc30"] >= 80 for name in exact)
+    assert rows["ours-n1"]["acc30"] <= rows["ours-n3"]["acc30"] <= rows["ours-n5"]["acc30"]
+
+
+def test_a_row_with_the_runs_number_of_views_is_the_row_without_a_number(run):
+    rows, records = run
+    five = [record["methods"] for record in records.values() if "ours" in record["methods"]]
+    assert len(five) == 6 and rows["ours-n5"] == rows["ours"]
+    assert all(found["ours-n5"]["error"] == found["ours"]["error"] for found in five)
+    three = [key for key, record in records.items() if "ours-n3" in record["methods"]]
+    assert len(three) == 6 and all(key.count(",") == 2 for key in three)
+
+
+def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
+    _, records = run
+    dataset, labels = Co3D(small_folder()), read_labels(small_folder(), "pebble")
+    (pair, *_) = pairs_of_rows(small_folder(), resolve(["ours"]), 6, 5, categories=["pebble"])["ours"]
+    frames = [dataset.load(dataset.frame("pebble", pair.reference_sequence, pair.reference_frame))]
+    frames += [dataset.load(dataset.frame("pebble", pair.target_sequence, n)) for n in pair.target_frames]
+    for name in ("ours", "ours-published", "ours-k70-nokmeans", "ours-transport", "ours-saliencyiou"):
+        estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(frames[0], frames[1:])
+        camera = estimate.target_camera
+        truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
+        truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ frames[0].camera.R.T
+        found = records[pair.key]["methods"][name]
+        assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-9)
+        assert found["view"] == estimate.view and found["inliers"] == estimate.inliers.sum()
+
+
+def test_without_depth_there_is_a_rotation_and_no_translation(run):
+    _, records = run
+    found = [r["methods"]["ours-nodepth"] for r in records.values() if "ours-nodepth" in r["methods"]]
+    fitted = [one for one in found if one["note"] == ""]
+    assert len(fitted) >= 4 and all("translation_error" not in one and one["inliers"] >= 5 for one in fitted)
+
+
+def test_icp_starts_from_the_first_view_or_from_the_best(run):
+    _, records = run
+    for found in (record["methods"] for record in records.values() if "icp" in record["methods"]):
+        assert found["icp"]["view"] == 0 and found["icp-bv"]["view"] == found["ours"]["view"]
+
+
+def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
+    calls = []
+    compare = ZeroShotPose.compare
+    monkeypatch.setattr(ZeroShotPose, "compare", lambda *args: (calls.append(1), compare(*args))[1])
+    rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
+    evaluate(small_folder(), BACKBONE, rows, 2, 3, out=tmp_path, categories=["pebble"])
+    assert len(calls) == 2 * 3
+
+
+def test_more_views_than_a_sequence_has_are_refused(tmp_path):
+    with pytest.raises(InputError, match="20"):
+        evaluate(small_folder(), BACKBONE, ["ours-n20"], 2, out=tmp_path)
+
+
+class TrueViewpoints:
+    """Says of each frame the pose that its label says."""
+
+    name = "true viewpoints"
+
+    def describe(self, frames):
+        return [self.viewpoint(frame) for frame in frames]
+
+    def viewpoint(self, frame):
+        label = read_labels(small_folder(), "pebble")[frame.name.split("/")[0]]
+        return Viewpoint(frame.camera.R @ label.trans[:3, :3], torch.from_numpy(frame.camera.R[2].copy()))
+
+
+def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):
+    monkeypatch.setitem(extractors.EXTRACTORS, "posecontrast-tiny", lambda backbone: TrueViewpoints())
+    summary = evaluate(small_folder(), BACKBONE, ["posecontrast-tiny"], 4, 3, out=tmp_path, categories=["pebble"])
+    assert summary["methods"]["posecontrast-tiny"]["median"] < 1e-5
+
+
+def test_convolutional_features_are_matched_as_mutual_neighbours(tmp_path, monkeypatch):
+    monkeypatch.setitem(extractors.EXTRACTORS, "swav-tiny", lambda backbone: BACKBONE)
+    summary = evaluate(small_folder(), BACKBONE, ["swav-tiny"], 4, 5, out=tmp_path, categories=["pebble"])
+    assert summary["methods"]["swav-tiny"]["acc30"] >= 75
+
+
+def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(InputError, match="posecontrast"):
+        evaluate(small_folder(), BACKBONE, ["posecontrast"], 1, 2, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,239 @@
+"""Tables, figures and comparisons of a run that was made up, so that every figure in them is known."""
+
+import csv
+import gzip
+import io
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from zsp_lite.benchmark import published
+from zsp_lite.benchmark.compare import compare, comparison_table
+from zsp_lite.benchmark.figures import accuracy_against_views, error_curves, error_distribution, write_figures
+from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
+from zsp_lite.benchmark.methods import GROUPS, METHODS
+from zsp_lite.benchmark.reports import write_reports
+from zsp_lite.benchmark.results import Results, read_results, write_results
+from zsp_lite.benchmark.storage import RunFolder
+from zsp_lite.benchmark.summary import summarise_run
+from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, all_rows, category_tables, every_table, paper_tables
+from zsp_lite.errors import InputError
+from zsp_lite.metrics import paired_test
+from zsp_lite.pairs import Pair
+
+CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
+PAIRS = 8
+ROWS = [*GROUPS["table1"], *GROUPS["ablations"], *GROUPS["views"], "ours-bv", "rootsift", "verified"]
+
+
+def made_up_run(out, rows=ROWS, seed=0):
+    """A run's folder with random errors."""
+    rng = np.random.default_rng(seed)
+    rows = list(dict.fromkeys(rows))
+    pairs = {}
+    for name in rows:
+        n = METHODS[name].targets if name in METHODS else None
+        pairs[name] = [
+            Pair(category, f"s{i}", i, f"t{i}", tuple(range(n or 5))) for category in CATEGORIES for i in range(PAIRS)
+        ]
+    with RunFolder(out, {"seed": seed}, dict.fromkeys(rows, "x")) as folder:
+        for name in rows:
+            for pair in pairs[name]:
+                found = {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "", "inliers": 9}
+                folder.add({
+                    "key": pair.key, "category": pair.category, "methods": {name: found}, "saliency_iou": {},
+                    "seconds_per_frame": None,
+                })  # fmt: skip
+        folder.note(command=["zsp-lite", "benchmark"])
+        data = {"root": "made up", "categories": list(CATEGORIES), "pairs": 48, "targets": 5, "seed": seed}
+        summary = summarise_run(folder.records, pairs, data, "none")
+    (out / "summary.json").write_text(json.dumps(summary))
+    return summary
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("made-up")
+    return out, made_up_run(out)
+
+
+def cell(table, row, column, group=THIS_RUN):
+    index = [(c.group, c.title) for c in table.columns].index((group, column))
+    return dict(table.rows)[row][index]
+
+
+def test_every_table_of_the_paper_is_there(run):
+    names = [table.name for table in paper_tables(run[1])]
+    assert names == [
+        "table_1", "table_2", "table_3", "table_a_targets", "table_a_matchers", "table_a_correspondences",
+        "table_a_trials", "table_a_depth", "published_code", "beyond",
+    ]  # fmt: skip
+
+
+def test_a_tables_figures_are_the_runs_and_the_published_ones_stand_apart(run):
+    tables = {table.name: table for table in paper_tables(run[1])}
+    ours = run[1]["methods"]["ours"]
+    found = cell(tables["table_1"], "Ours (K=50)", "Acc30 (%)")
+    assert (found.value, found.low, found.high) == (ours["acc30"], *ours["acc30_ci"])
+    medians = [ours["per_category"][category]["median"] for category in CATEGORIES]
+    found = cell(tables["table_1"], "Ours (K=50)", "Med. err. (°)")
+    assert found.value == pytest.approx(np.mean(medians)) and found.low < found.value < found.high
+    toasters = run[1]["methods"]["icp"]["per_category"]["toaster"]
+    assert cell(tables["table_1"], "ICP", "toaster Acc30").value == toasters["acc30"]
+    assert cell(tables["table_1"], "ICP", "toaster Acc30", OTHER_DATA).value == 7.0
+    assert cell(tables["table_1"], "SWaV", "Acc30 (%)") is None
+    assert cell(tables["table_1"], "SWaV", "Acc30 (%)", OTHER_DATA).value == 7.5
+    assert cell(tables["table_1"], "swav-tiny (stand-in)", "Acc30 (%)", OTHER_DATA) is None
+    found = cell(tables["table_a_correspondences"], "K = 70", "Acc15 (%)", f"{THIS_RUN}: without k-means")
+    assert found.value == run[1]["methods"]["ours-k70-nokmeans"]["acc15"]
+    assert cell(tables["table_a_targets"], "views = 20", "full: Acc30 (%)", OTHER_DATA).value == 52.1
+    assert [row for row, _ in tables["beyond"].rows] == ["ours", "rootsift", "verified"]
+
+
+def test_a_run_of_three_rows_has_no_table_of_what_it_lacks(tmp_path):
+    summary = made_up_run(tmp_path, ["ours", "ours-bv", "rootsift"])
+    assert [table.name for table in paper_tables(summary)] == ["table_2", "table_a_targets", "table_a_depth", "beyond"]
+    assert len(all_rows(summary).rows) == 3
+    errors = [list(read_results(tmp_path).errors(name).values()) for name in ("rootsift", "ours")]
+    assert summary["against_ours"]["rootsift"] == paired_test(*errors)
+
+
+def test_every_category_has_its_figure_for_every_row(run):
+    for table, figure in zip(category_tables(run[1]), ("median", "acc30", "acc15"), strict=True):
+        assert [column.title for column in table.columns] == [*CATEGORIES, "all"]
+        for name, cells in table.rows:
+            row = run[1]["methods"][name]["per_category"]
+            assert [one.value for one in cells[:-1]] == [row[category][figure] for category in CATEGORIES]
+
+
+def test_rows_of_other_numbers_of_views_are_tested_where_they_ask_the_same(run):
+    against = run[1]["against_ours"]
+    assert "ours-n1" in against and "ours" not in against
+
+
+class Cells(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.rows, self.classes = [], []
+
+    def handle_starttag(self, tag, attributes):
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+            self.classes.append(dict(attributes).get("class"))
+
+    def handle_data(self, data):
+        if self.rows and self.rows[-1]:
+            self.rows[-1][-1] += data.strip()
+
+
+def test_all_formats_say_the_same(run):
+    table = next(table for table in paper_tables(run[1]) if table.name == "table_3")
+    ours = run[1]["methods"]["ours"]
+    text = f"{ours['acc30']:.1f} [{ours['acc30_ci'][0]:.1f}, {ours['acc30_ci'][1]:.1f}]"
+    lines = list(csv.DictReader(io.StringIO(as_csv(table))))
+    assert float(lines[3][f"{THIS_RUN}: Acc30 (%)"]) == ours["acc30"]
+    assert float(lines[3][f"{THIS_RUN}: Acc30 (%) low"]) == ours["acc30_ci"][0]
+    assert f"{OTHER_DATA}: Acc30 (%) low" not in lines[0]
+    markdown = as_markdown(table).splitlines()
+    assert text in markdown[-3] and markdown[2].count("|") == markdown[-3].count("|")
+    latex = as_latex(table)
+    assert text in latex and "46.3" in latex and "\\%" in latex and latex.count("\\begin") == latex.count("\\end") == 2
+    assert {line.count(" & ") for line in latex.splitlines() if line.endswith("\\\\") and "multi" not in line} == {6}
+    cells = Cells()
+    cells.feed(as_html(table))
+    assert text in cells.rows[-1] and cells.rows[-1][-2] == "46.3" and cells.classes.count("published") == 3 * 5 + 1
+    console = Console(width=250, file=io.StringIO())
+    console.print(as_rich(table))
+    assert text in console.file.getvalue() and "other data" in console.file.getvalue()
+
+
+def test_tables_are_written_in_all_formats(run, tmp_path):
+    written = write_tables(every_table(run[1]), tmp_path)
+    assert len(written) == 4 * len(every_table(run[1])) + 1 and all(path.stat().st_size for path in written)
+    assert (tmp_path / "tables.html").read_text().count("<table") == len(every_table(run[1]))
+
+
+def test_the_papers_figures_were_copied_right():
+    assert published.TABLE_1.rows["Ours (K=50)"] == (53.8, 46.3, 31.1, 71.0, 26.0, 82.0, 39.0, 42.0)
+    tables = (published.TABLE_1, published.TABLE_2, published.TABLE_3, published.TARGETS, published.MATCHERS,
+              published.CORRESPONDENCES, published.DEPTH, published.TRIALS)  # fmt: skip
+    for table in tables:
+        assert all(len(row) == len(table.columns) for row in table.rows.values())
+    assert len(published.CATEGORIES) == 20
+
+
+def test_a_run_in_one_file_gives_the_same_tables(run, tmp_path):
+    out, summary = run
+    first = write_results(read_results(out), tmp_path / "results.json.gz")
+    again = read_results(first)
+    assert again.summary == summary and again.invocations == [{"command": ["zsp-lite", "benchmark"]}]
+    errors = read_results(out).errors("ours")
+    assert again.errors("ours") == pytest.approx(errors, abs=1e-4) and list(again.errors("ours")) == list(errors)
+    assert write_results(again, tmp_path / "again.json.gz").read_bytes() == first.read_bytes()
+    with pytest.raises(InputError, match="nonesuch"):
+        again.errors("nonesuch")
+
+
+def test_what_is_no_run_is_refused(tmp_path):
+    (tmp_path / "a.json.gz").write_bytes(gzip.compress(b'{"pairs": []}'))
+    (tmp_path / "b.json.gz").write_bytes(gzip.compress(b"{}")[:15])
+    for path in (tmp_path, tmp_path / "a.json.gz", tmp_path / "b.json.gz", tmp_path / "c"):
+        with pytest.raises(InputError, match=str(path)):
+            read_results(path)
+
+
+def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
+    made_up_run(tmp_path, ["ours", "icp"], seed=1)
+    first, second = read_results(run[0]), read_results(tmp_path)
+    second.rows["ours"].pop(next(iter(second.rows["ours"])))
+    found = {one.first: one for one in compare(first, second)}
+    assert set(found) == {"ours", "icp"} and found["ours"].n == 47 and found["icp"].n == 48
+    a, b = first.errors("icp"), second.errors("icp")
+    test = paired_test(list(a.values()), [b[key] for key in a])
+    assert found["icp"].accuracy_p == test["accuracy_p"] and found["icp"].error_drop == test["error_drop"]
+    assert found["icp"].acc30[1] - found["icp"].acc30[0] == pytest.approx(test["accuracy_gain"])
+    (mixed,) = compare(first, first, [("ours", "icp")])
+    table = comparison_table([mixed], "a", "b")
+    assert table.rows[0][0] == "ours | icp" and len(table.rows[0][1]) == len(table.columns)
+    with pytest.raises(InputError, match="pair in common"):
+        compare(first, second, [("ours-n1", "ours")])
+    with pytest.raises(InputError, match="row in common"):
+        compare(Results({}, {}, [], {"x": {}}), second)
+
+
+def test_a_run_against_itself_shows_no_difference(run):
+    results = read_results(run[0])
+    for one in compare(results, results):
+        assert one.accuracy_gain == one.error_drop == 0 and one.accuracy_p == one.error_p == 1
+
+
+def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_path):
+    results = read_results(run[0])
+    (axis,) = error_distribution(results).axes
+    assert sum(len(points.get_offsets()) for points in axis.collections) == 48
+    assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES, reverse=True)
+    left, right = accuracy_against_views(results).axes
+    line = left.get_lines()[0]
+    assert list(line.get_xdata()) == [1, 3, 5, 10, 20]
+    assert line.get_ydata()[2] == results.summary["methods"]["ours-n5"]["acc30"]
+    assert list(right.get_lines()[1].get_ydata()) == [13.4, 26.2, 31.1, 38.2, 38.3]
+    (axis,) = error_curves(results, ["ours", "icp"]).axes
+    curve = axis.get_lines()[0]
+    errors = np.array(list(results.errors("ours").values()))
+    height = curve.get_ydata()[np.searchsorted(curve.get_xdata(), 30, side="right") - 1]
+    assert height == pytest.approx(100 * np.mean(errors <= 30))
+    few = read_results_of(tmp_path / "few", ["ours"])
+    assert {path.stem for path in write_figures(few, tmp_path / "f")} == {"error_distribution", "error_curves"}
+    write_reports(run[0], tmp_path / "all")
+    assert len(list((tmp_path / "all" / "figures").glob("*.png"))) == 3
+    assert (tmp_path / "all" / "results.json.gz").is_file()
+
+
+def read_results_of(out, rows):
+    made_up_run(out, rows)
+    return read_results(out)

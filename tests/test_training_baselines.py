@@ -1,0 +1,131 @@
+"""The trainers of the small stand-ins: their pictures' poses are right, their losses do what the papers say."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from zsp_lite.baselines.posecontrast import angles_of, load_posecontrast_tiny, rotation_of
+from zsp_lite.baselines.swav import load_swav_tiny
+from zsp_lite.errors import InputError
+from zsp_lite.metrics import rotation_error
+from zsp_lite.training import object_crops as crops_module
+from zsp_lite.training import posecontrast, swav
+from zsp_lite.training.object_crops import SIZE, VIEWS, ObjectCrops, object_crops, render_object
+from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
+from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Crops of two objects, rendered in this process."""
+    folder = tmp_path_factory.mktemp("crops")
+    (folder / "crops").mkdir()
+    crops_module._shard(0, 2, folder / "crops", 0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def crops(folder):
+    with np.load(next((folder / "crops").glob("*.npz"))) as file:
+        return ObjectCrops(*(file[name] for name in ("rgb", "aspect", "rotation")))
+
+
+def test_an_object_is_seen_from_all_sides_and_fills_its_crops(crops):
+    assert crops.rgb.shape == (2 * VIEWS, SIZE, SIZE, 3)
+    assert (crops.aspect > 0.2).all() and (crops.aspect < 5).all()
+    ahead = crops.rotation[:VIEWS, 2]  # the camera's axis in the object's frame
+    directions = np.degrees(np.arctan2(ahead[:, 1], ahead[:, 0])) % 360
+    assert np.diff(np.sort(directions)).max() < 180
+    again = render_object(0)
+    assert (again[0][0] == crops.rgb[0]).all() and (again[1][2] == crops.rotation[1]).all()
+
+
+def test_finished_crops_are_used_again(folder, crops):
+    found = object_crops(folder / "crops", 2, workers=1)
+    assert (found.rgb == crops.rgb).all()
+    first, last = found.split(VIEWS)
+    assert len(first) == len(last) == VIEWS and (last.rgb == crops.rgb[VIEWS:]).all()
+    with pytest.raises(InputError, match="objects"):
+        object_crops(folder, 0)
+
+
+def test_a_turned_picture_has_a_turned_pose(crops):
+    """Turned by a right angle, a square picture is `rot90`, and so is its label."""
+    config = PoseContrastConfig(batch=4, tilt=7)
+
+    class Right(np.random.Generator):
+        def normal(self, *args):  # the tilt, then nothing else that turns
+            return np.full(config.batch, 90.0)
+
+    rng = Right(np.random.PCG64(0))
+    first, second, labels = sample(crops, rng, config)
+    index = np.random.default_rng(0).integers(len(crops), size=config.batch)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert rotation_error(rotation_of(labels.numpy()), quarter @ crops.rotation[index]).max() < 0.01
+    plain = posecontrast._pictures(crops, index).mean(1).flatten(1)
+    for pictures in (first, second):
+        # x to the right becomes y downwards: clockwise on the screen.
+        back = torch.rot90(pictures, 1, (2, 3)).mean(1).flatten(1)
+        alike = torch.nn.functional.cosine_similarity(back - back.mean(1, True), plain - plain.mean(1, True))
+        assert alike.min() > 0.9
+
+
+def test_the_viewpoint_loss_is_least_for_the_true_bins_and_offsets():
+    rotation = rotation_of(np.array([[100.0, 70.0, 200.0], [10.0, 150.0, 359.0]]))
+    labels = torch.from_numpy(angles_of(rotation).astype(np.float32))
+    bins = [(labels[:, i] / 15).long() for i in range(3)]
+    logits = [20 * torch.nn.functional.one_hot(b, n).float() for b, n in zip(bins, (24, 12, 24), strict=True)]
+    offsets = [(labels[:, i] / 15 - b)[:, None].expand(-1, n) for i, (b, n) in enumerate(zip(bins, (24, 12, 24)))]
+    assert viewpoint_loss(logits, offsets, labels) < 1e-4
+    assert viewpoint_loss(logits, [offset + 0.3 for offset in offsets], labels) > 0.5
+    assert viewpoint_loss([logit.roll(1, 1) for logit in logits], offsets, labels) > 30
+
+
+def test_pictures_of_one_pose_are_no_negatives_of_each_other():
+    feature = torch.eye(3)[:2]
+    same = torch.tensor([[30.0, 90.0, 180.0]] * 2)
+    opposite = torch.tensor([[30.0, 90.0, 180.0], [210.0, 90.0, 180.0]])
+    assert pose_contrast(feature, feature, same, 0.5) == pytest.approx(0, abs=1e-6)
+    expected = np.log1p(np.exp((0 - 1) / 0.5))
+    assert float(pose_contrast(feature, feature, opposite, 0.5)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_swapped_predictions_of_agreeing_crops_cost_least():
+    config = SwavConfig()
+    scores = torch.eye(8)
+    agree, evenness = swapped_prediction(torch.stack([scores] * 4), config.temperature, config.regularisation)
+    differ, _ = swapped_prediction(
+        torch.stack([scores, scores, scores.roll(1, 0), scores.roll(2, 0)]), config.temperature, config.regularisation
+    )
+    assert agree < 0.05 < 3 < differ and evenness == pytest.approx(1, abs=1e-3)
+    # Even if all pictures prefer one prototype, assignments are spread over all of them.
+    one = torch.eye(8)[:1].repeat(8, 1) + 0.01 * torch.rand(8, 8, generator=torch.Generator().manual_seed(0))
+    assert swapped_prediction(torch.stack([one] * 2), 0.1, 0.05)[1] > 0.9
+
+
+def test_crops_are_two_large_and_two_small_ones():
+    pictures = torch.rand(3, 3, SIZE, SIZE)
+    large, small = multi_crop(pictures, np.random.default_rng(0), SwavConfig())
+    assert large.shape == (6, 3, 96, 96) and small.shape == (6, 3, 48, 48)
+
+
+def test_both_trainers_write_what_the_loaders_read(folder):
+    lines = []
+    path = swav.train(SwavConfig(objects=2, steps=2, batch=4, prototypes=3), folder, lines.append)
+    assert load_swav_tiny(path)([np.zeros((224, 224, 3), np.uint8)])[0].keys.shape[:2] == (28, 28)
+    path = posecontrast.train(PoseContrastConfig(objects=2, steps=2, batch=4), folder, lines.append)
+    load_posecontrast_tiny(path)
+    row = json.loads((folder / "posecontrast-tiny.jsonl").read_text().splitlines()[-1])
+    assert row["step"] == 2 and 0 <= row["held_out_median"] <= 180 and len(lines) == 2
+    assert json.loads((folder / "swav-tiny.json").read_text())["steps"] == 2
+
+
+def test_settings_without_a_meaning_are_refused(tmp_path):
+    with pytest.raises(InputError, match="batch=1"):
+        SwavConfig(batch=1)
+    with pytest.raises(InputError, match="steps=0"):
+        PoseContrastConfig(steps=0)
+    with pytest.raises(InputError, match="at least 2"):
+        posecontrast.train(PoseContrastConfig(objects=1), tmp_path)
