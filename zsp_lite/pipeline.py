@@ -17,6 +17,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.frames import Frame
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, match, plain_similarities, similarities
+from zsp_lite.verified import Hypothesis, VerifiedSettings, solve
 from zsp_lite.views import IMAGE_SIZE, View, frame_view, look, object_crop, patch_mask
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class PoseEstimate:
     view_scores: (N,) of all target views, higher is better.  timings: seconds per stage.
     target_camera: of the chosen view.  flags: one line per reason not to trust the estimate.
     reference_view, target_views: crops, features and foregrounds that went in.
+    hypotheses: of the verified solver, best first, each with what speaks for it; the first is the estimate.
     """
 
     sim3: Sim3
@@ -56,6 +58,12 @@ class PoseEstimate:
     reference_view: View
     target_views: tuple[View, ...]
     flags: tuple[str, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+
+    @property
+    def confidence(self) -> float | None:
+        """Chance that the rotation is within 30 degrees of the truth; None where the solver does not say."""
+        return self.hypotheses[0].confidence if self.hypotheses else None
 
     @property
     def reliable(self) -> bool:
@@ -89,6 +97,8 @@ class ZeroShotPose:
     cycle_from: "reference" as in the paper, or "target" as in its published code.
     matcher: "cyclical" as in the paper, or another way to choose matches: see `matchers`.
     binning: compare log-binned descriptors as in the paper, or the bare keys.
+    solver: "paper" trusts RANSAC in the best view; "verified" tests many poses against all views (see `verified`) and
+    adapts its thresholds to the object's size. verified: settings of the latter.
     Raises InputError for a setting out of its range.
     """
 
@@ -104,6 +114,8 @@ class ZeroShotPose:
     cycle_from: Literal["reference", "target"] = "reference"
     matcher: str | Matcher = "cyclical"
     binning: bool = True
+    solver: Literal["paper", "verified"] = "paper"
+    verified: VerifiedSettings = VerifiedSettings()
     seed: int = 0
 
     def __post_init__(self):
@@ -113,6 +125,7 @@ class ZeroShotPose:
             ("view_selector", self.view_selector, tuple(VIEW_SELECTORS)),
             ("foreground", self.foreground, ("saliency", "mask")),
             ("cycle_from", self.cycle_from, ("reference", "target")),
+            ("solver", self.solver, ("paper", "verified")),
         ):
             if value not in allowed:
                 raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
@@ -171,8 +184,10 @@ class ZeroShotPose:
         comparisons: Sequence[Comparison],
         timings: dict[str, float] | None = None,
     ) -> PoseEstimate:
-        """The last two stages: choose the view and align (sec. 4.2 and 4.3)."""
+        """The last two stages: choose the view and align (sec. 4.2 and 4.3), or verify poses in all views."""
         timings = dict(timings or {})
+        if self.solver == "verified":
+            return self._estimate_verified(reference, targets, comparisons, timings)
         with _timed(timings, "view"):
             scores = np.array([VIEW_SELECTORS[self.view_selector](comparison) for comparison in comparisons])
             best = int(scores.argmax())
@@ -193,6 +208,24 @@ class ZeroShotPose:
         return PoseEstimate(
             sim3, best, matches, inliers, points, scores, timings, targets[best].frame.camera,
             reference, tuple(targets), flags,
+        )  # fmt: skip
+
+    def _estimate_verified(
+        self, reference: View, targets: Sequence[View], comparisons: Sequence[Comparison], timings: dict[str, float]
+    ) -> PoseEstimate:
+        """The best hypothesis of the verified solver, in the target view that it sees the object most alike."""
+        found = solve(
+            reference, targets, [one.similarity for one in comparisons], [one.matches for one in comparisons],
+            self.seed, self.verified,
+        )  # fmt: skip
+        best = found.hypotheses[0]
+        matches = comparisons[best.view].matches
+        points = match_points(reference, targets[best.view], matches)
+        residual = np.linalg.norm(best.sim3.apply(points[0]) - points[1], axis=1)
+        return PoseEstimate(
+            best.sim3, best.view, matches, residual < self.threshold * found.target_spread, points, -found.view_angles,
+            timings | found.timings, targets[best.view].frame.camera, reference, tuple(targets), found.flags,
+            found.hypotheses,
         )  # fmt: skip
 
 

@@ -1,0 +1,447 @@
+"""Each stage of the verified solver by itself, against values worked out another way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+
+from zsp_lite.alignment import Sim3, umeyama
+from zsp_lite.cameras import Camera
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.frames import Frame
+from zsp_lite.metrics import rotation_error
+from zsp_lite.verified.maps import look_up, make_maps
+from zsp_lite.verified.poses import Poses, angles, fit_poses, join, suppress
+from zsp_lite.verified.proposals import from_matches, propose, view_rotations
+from zsp_lite.verified.refinement import Search, refine, rotations
+from zsp_lite.verified.scene import contrast, make_scene
+from zsp_lite.verified.soft_icp import soft_icp, spread_indices
+from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, verify
+from zsp_lite.views import View, look, object_crop
+
+ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
+DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2)]
+seeds = st.integers(0, 2**31)
+
+
+def some_rotation(rng: np.random.Generator) -> np.ndarray:
+    matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return matrix * np.sign(np.linalg.det(matrix))
+
+
+def as_poses(*sim3s: Sim3) -> Poses:
+    parts = [[one.scale for one in sim3s], [one.R for one in sim3s], [one.t for one in sim3s]]
+    return Poses(*(torch.tensor(np.array(part), dtype=torch.float32) for part in parts))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    reference = render(look_at((1, 0.6, 0.4)), Sim3.identity(), "reference")
+    cameras = [look_at(direction, distance=4.5) for direction in DIRECTIONS]
+    cameras = [replace(camera, R=camera.R @ ELSEWHERE.R.T) for camera in cameras]
+    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+
+
+@pytest.fixture(scope="module")
+def views(frames):
+    return look(CoordinateBackbone(), [object_crop(frame) for frame in frames])
+
+
+@pytest.fixture(scope="module")
+def scene(views):
+    from zsp_lite.matching import match, similarities
+
+    reference, *targets = views
+    found = similarities(reference.features, [target.features for target in targets])
+    matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
+    return make_scene(reference, targets, found, matches)
+
+
+@pytest.fixture(scope="module")
+def truth(frames, scene):
+    """The true pose in working units."""
+    first = true_pose(frames[0].camera, Sim3.identity(), frames[1].camera, ELSEWHERE)
+    return scene.poses([first], 0)
+
+
+# Poses
+
+
+@given(seeds)
+def test_a_known_similarity_is_fitted(seed):
+    rng = np.random.default_rng(seed)
+    pose = Sim3(rng.uniform(0.5, 2), some_rotation(rng), rng.normal(size=3))
+    source = rng.normal(size=(6, 3))
+    fitted = fit_poses(*(torch.tensor(part, dtype=torch.float32)[None] for part in (source, pose.apply(source))))
+    assert rotation_error(fitted.rotation[0].double().numpy(), pose.R) < 0.1
+    assert float(fitted.scale) == pytest.approx(pose.scale, rel=1e-3)
+    np.testing.assert_allclose(fitted.translation[0], pose.t, atol=1e-3)
+
+
+@given(seeds)
+def test_many_fits_at_once_are_umeyamas_fits(seed):
+    rng = np.random.default_rng(seed)
+    source, target = rng.normal(size=(2, 4, 7, 3))
+    fitted = fit_poses(torch.tensor(source), torch.tensor(target))
+    for i in range(4):
+        alone = umeyama(source[i], target[i])
+        np.testing.assert_allclose(fitted.scale[i] * fitted.rotation[i], alone.scale * alone.R, atol=1e-8)
+        np.testing.assert_allclose(fitted.translation[i], alone.t, atol=1e-8)
+
+
+@given(seeds)
+def test_an_inverse_undoes_its_pose(seed):
+    rng = np.random.default_rng(seed)
+    poses = as_poses(*(Sim3(rng.uniform(0.5, 2), some_rotation(rng), rng.normal(size=3)) for _ in range(3)))
+    points = torch.tensor(rng.normal(size=(5, 3)), dtype=torch.float32)
+    there = poses.apply(points)
+    back = poses.inverse()
+    for i in range(3):
+        np.testing.assert_allclose(back[[i]].apply(there[i])[0], points, atol=1e-4)
+
+
+def test_angles_are_the_rotation_errors():
+    rng = np.random.default_rng(0)
+    one, two = (np.stack([some_rotation(rng) for _ in range(n)]) for n in (3, 4))
+    np.testing.assert_allclose(
+        angles(torch.tensor(one), torch.tensor(two)), rotation_error(one[:, None], two[None]), atol=1e-6
+    )
+
+
+@given(seeds)
+def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
+    rng = np.random.default_rng(seed)
+    rotation = rotations(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
+    score = torch.tensor(rng.normal(size=12))
+    kept = suppress(rotation, score, 25.0, 12)
+    apart = angles(rotation, rotation)
+    assert (score[kept].diff() <= 0).all()
+    assert (apart[kept][:, kept] + 180 * torch.eye(len(kept)) >= 25).all()
+    for dropped in set(range(12)) - set(kept.tolist()):
+        assert any(apart[dropped, k] < 25 and score[k] >= score[dropped] for k in kept)
+    assert suppress(rotation, score, 25.0, 2).tolist() == kept[:2].tolist()
+
+
+# Maps and scene
+
+
+def test_points_are_looked_up_where_the_camera_projects_them(views, scene):
+    target, camera = views[2], views[2].frame.camera
+    rng = np.random.default_rng(0)
+    # In front of the second target, all over its picture.
+    seen = camera.unproject(rng.uniform(5, 219, (200, 2)), rng.uniform(3, 6, 200))
+    working = scene.target_frame.apply(scene.cameras[0].to_camera(seen))
+    identity = as_poses(Sim3.identity())
+    found = look_up(
+        scene.target_maps, identity.linear, identity.translation, torch.tensor(working, dtype=torch.float32)
+    )
+    pixels, depth = camera.project(seen)
+    np.testing.assert_allclose(found.pixels[0, 1] * scene.target_maps.zoom[1], pixels, atol=0.05)
+    np.testing.assert_allclose(found.depth[0, 1] / scene.target_frame.scale, depth, rtol=1e-4)
+    # The map is coarser than the frame: its pixel's depth is that of one of the frame's under it.
+    known = target.frame.depth
+    for (x, y), surface in zip(pixels.astype(int), found.surface[0, 1].numpy() / scene.target_frame.scale):
+        under = known[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+        assert np.abs(under - surface).min() < 1e-3
+
+
+def test_the_distance_off_the_silhouette_is_that_to_its_nearest_pixel(views, scene):
+    rng = np.random.default_rng(1)
+    maps, view = scene.target_maps, 0
+    width, height = (int(side) for side in maps.size[view])
+    off = maps.table[:, 2].numpy()[: width * height].reshape(height, width)
+    inside = np.argwhere(off == 0)
+    for _ in range(30):
+        row, column = rng.integers(height), rng.integers(width)
+        nearest = np.linalg.norm(inside - (row, column), axis=1).min()
+        # Averaged over the levels of the soft mask, and by OpenCV's chamfer.
+        assert off[row, column] == pytest.approx(nearest, abs=2.0 + 0.05 * nearest)
+
+
+def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
+    camera = Camera(np.eye(3), np.zeros(3), np.full(2, 64.0), np.full(2, 32.0), (64, 64))
+    mask = np.zeros((64, 64), np.float32)
+    mask[:, :32] = 1  # reaches the left border, ends in the middle
+    features = FeatureMap(torch.zeros(8, 8, 4), torch.ones(8, 8), torch.ones(4))
+    frame = Frame(np.zeros((64, 64, 3), np.uint8), np.full((64, 64), 2, np.float32), mask, camera)
+    view = View(frame, features, torch.ones(8, 8, dtype=torch.bool), mask)
+    maps = make_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(64)])
+    left, right = (torch.tensor([[x, 0.0, 2.0]]) for x in (-1.6, 1.6))
+    one = torch.eye(3)[None], torch.zeros(1, 3)
+    assert float(look_up(maps, *one, left).off) == 0
+    # 32 pixels to the border and 19.2 beyond are 51.2, at 32 pixels per unit of length.
+    assert float(look_up(maps, *one, right).off) == pytest.approx(51.2 / 32, rel=0.05)
+
+
+def test_working_units_have_mean_zero_and_unit_spread(scene):
+    for points in (scene.reference_points, scene.target_points):
+        np.testing.assert_allclose(points.mean(dim=0), 0, atol=1e-5)
+        assert float(points.square().sum(dim=1).mean() / 3) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_pose_survives_the_way_to_a_camera_and_back(scene):
+    rng = np.random.default_rng(2)
+    pose = Sim3(0.8, some_rotation(rng), rng.normal(size=3))
+    for view in range(3):
+        back = scene.sim3(scene.poses([pose], view), 0, view)
+        np.testing.assert_allclose(back.matrix, pose.matrix, atol=1e-5)
+
+
+def test_contrast_has_no_mean_along_either_side():
+    similarity = torch.tensor(np.random.default_rng(3).random((6, 9)))
+    found = contrast(similarity)
+    np.testing.assert_allclose(found.mean(dim=0), 0, atol=1e-12)
+    np.testing.assert_allclose(found.mean(dim=1), 0, atol=1e-12)
+    assert contrast(torch.zeros(6, 0)).shape == (6, 0)
+
+
+def test_strays_far_behind_the_object_are_left_out(views):
+    reference, *targets = views
+    depth = reference.frame.depth.copy()
+    row, column = (int(i) for i in np.argwhere(depth > 0)[len(np.argwhere(depth > 0)) // 2])
+    row, column = row // 8 * 8, column // 8 * 8
+    depth[row : row + 8, column : column + 8] = 40
+    spoilt = replace(reference, frame=replace(reference.frame, depth=depth))
+    zeros = [torch.zeros(784, 784)] * 3
+    whole, without = (make_scene(view, targets, zeros) for view in (reference, spoilt))
+    assert len(without.reference_points) == len(whole.reference_points) - 1
+    assert float(without.reference_points.abs().max()) < 4
+
+
+# Proposals
+
+
+@given(seeds)
+def test_matches_with_outliers_propose_the_true_pose(seed):
+    rng = np.random.default_rng(seed)
+    pose = Sim3(rng.uniform(0.7, 1.4), some_rotation(rng), rng.normal(0, 0.1, 3))
+    source = rng.normal(size=(30, 3))
+    target = pose.apply(source)
+    target[:12] = rng.normal(size=(12, 3))
+    found = from_matches(*(torch.tensor(part, dtype=torch.float32) for part in (source, target)), seed)
+    assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
+    assert len(found) <= 6 and (angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
+
+
+def test_too_few_matches_propose_nothing():
+    assert len(from_matches(torch.zeros(2, 3), torch.zeros(2, 3))) == 0
+    # All in one place: no scale is plausible.
+    assert len(from_matches(torch.zeros(5, 3), torch.zeros(5, 3))) == 0
+
+
+def test_a_view_rotation_sees_the_reference_from_that_view(scene):
+    found = view_rotations(scene)
+    for view in range(3):
+        np.testing.assert_allclose(scene.sim3(found, view, view).R, np.eye(3), atol=1e-5)
+
+
+def test_without_matches_the_views_still_propose(views):
+    zeros = [torch.zeros(784, 784)] * 3
+    assert len(propose(make_scene(views[0], views[1:], zeros))) == 3
+
+
+# Soft ICP
+
+
+def test_soft_icp_comes_nearer_to_the_truth_and_stays_there(scene, truth):
+    turn = rotations(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
+    start = Poses(truth.scale * 0.8, turn @ truth.rotation, truth.translation + 0.15)
+    aligned = soft_icp(scene, join([start, truth]))
+    errors = angles(aligned.rotation, truth.rotation)[:, 0]
+    assert float(angles(start.rotation, truth.rotation)) > 20
+    assert errors.max() < 10
+    assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
+
+
+def test_features_lead_where_shape_alone_does_not(scene, truth):
+    turn = rotations(torch.deg2rad(torch.tensor([[0.0, 60, 0]])))
+    start = Poses(truth.scale, turn @ truth.rotation, truth.translation)
+    with_features, without = (soft_icp(scene, start, features=weight) for weight in (8.0, 0.0))
+    error = [float(angles(found.rotation, truth.rotation)) for found in (with_features, without)]
+    assert error[0] < 20 and error[0] < error[1]
+
+
+def test_a_pose_is_aligned_by_itself(scene, truth):
+    start = join([truth, view_rotations(scene)])
+    together = soft_icp(scene, start)
+    np.testing.assert_allclose(soft_icp(scene, start[[1]]).rotation, together.rotation[[1]], atol=1e-4)
+
+
+def test_spread_indices_are_spread():
+    assert spread_indices(10, 4).tolist() == [0, 2, 5, 7]
+    assert spread_indices(3, 10).tolist() == [0, 1, 2]
+
+
+# Verification
+
+
+EVERY = (5, 10)  # by hand it takes a while
+
+
+def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
+    """The terms as one would write them down, point by point, with the frames' own cameras."""
+    reference, *targets = views
+    unit = 1 / scene.target_frame.scale  # of the targets' working frame
+    first = scene.cameras[0]
+    sums = dict.fromkeys(TERMS, 0.0)
+    in_reference = scene.reference_frame.inverse().apply(scene.reference_points[:: EVERY[0]].numpy())
+    for i, point in enumerate(in_reference):
+        touched, alike = 0.0, 0.0
+        for view, target in enumerate(targets):
+            camera = target.frame.camera
+            world = first.to_world(pose.apply(point))
+            what = met(target, camera, world, unit)
+            sums["f_off"] += what["off"] / len(targets)
+            sums["f_front"] += what["front"] / len(targets)
+            column = patch_column(scene, targets, view, what["patch"])
+            if column is not None:
+                touched += what["touch"]
+                alike += what["touch"] * float(scene.similarity[i * EVERY[0], column])
+        sums["f_sim"] += alike / (touched + 0.5)
+        sums["f_seen"] += min(touched, 1)
+    for name in TERMS[:4]:
+        sums[name] /= len(in_reference)
+    unit = 1 / scene.reference_frame.scale
+    in_first = scene.target_frame.inverse().apply(scene.target_points[:: EVERY[1]].numpy())
+    for point in in_first:
+        world = reference.frame.camera.to_world(pose.inverse().apply(point))
+        what = met(reference, reference.frame.camera, world, unit)
+        sums["r_off"] += what["off"] / len(in_first)
+        sums["r_front"] += what["front"] / len(in_first)
+    return sums
+
+
+def met(view: View, camera: Camera, world: np.ndarray, unit: float) -> dict:
+    (x, y), depth = camera.project(world)
+    column, row = int(np.clip(x, 0, 223)), int(np.clip(y, 0, 223))
+    surface = view.frame.depth[row, column]
+    mask = view.soft_mask
+    behind = (depth - surface) / unit
+    known = mask[row, column] if surface > 0 else 0.0
+    inside = np.argwhere(mask >= 0.5)
+    # Crops are not isotropic: pixels back to lengths at the point's depth.
+    away = (inside[:, ::-1] + 0.5 - (x, y)) / camera.focal * depth / unit
+    return {
+        "off": min(max(np.linalg.norm(away, axis=1).min() - 0.01, 0) / 0.5, 1),
+        "front": known * np.clip((-behind - 0.25) / 0.5, 0, 1),
+        "touch": known * np.exp(-0.5 * (behind / 0.25) ** 2),
+        "patch": (row // 8, column // 8),
+    }
+
+
+def patch_column(scene, targets, view, patch):
+    if not targets[view].foreground[patch]:
+        return None
+    before = sum(int(target.foreground.sum()) for target in targets[:view])
+    return before + int(targets[view].foreground.flatten()[: patch[0] * 28 + patch[1]].sum())
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (25.0, 10, -15), (0, 180, 0)])
+def test_terms_are_what_one_works_out_point_by_point(scene, views, truth, turn):
+    turned = rotations(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
+    poses = Poses(truth.scale, turned, truth.translation + 0.1)
+    found, expected = verify(scene, poses, EVERY).of(0), by_hand(scene, views, scene.sim3(poses, 0, 0))
+    for name in ("f_sim", "f_seen", "f_off", "f_front", "r_off", "r_front"):
+        assert found[name] == pytest.approx(expected[name], abs=0.02), name
+
+
+def test_the_truth_scores_above_other_poses(scene, truth):
+    turns = rotations(torch.deg2rad(torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]])))
+    others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
+    score = Weights().score(verify(scene, join([truth, others])))
+    assert int(score.argmax()) == 0
+    terms = verify(scene, truth).of(0)
+    assert terms["f_off"] < 0.02 and terms["f_front"] < 0.02 and terms["r_off"] < 0.02 and terms["r_front"] < 0.02
+
+
+def test_points_before_a_seen_surface_offend_and_hidden_ones_do_not(scene, truth):
+    toward = -scene.target_maps.camera_centres[0] / scene.target_maps.camera_centres[0].norm()
+    near, far = (Poses(truth.scale, truth.rotation, truth.translation + move * toward) for move in (-1.0, 1.0))
+    fronts = [float(forward(scene, pose).front[0, 0].mean()) for pose in (near, truth, far)]
+    assert fronts[0] > 0.3 and fronts[1] < 0.02 and fronts[2] < 0.02
+
+
+def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
+    reference, *targets = views
+    zeros = [torch.zeros(784, 784)] * 3
+    scene = make_scene(reference, targets, zeros)
+    table = scene.target_maps.table.clone()
+    table[:, :2] = 0  # as make_maps writes it where no depth is known
+    blind = replace(scene, target_maps=replace(scene.target_maps, table=table))
+    for shift in (-1.0, 0.0, 1.0):
+        pose = Poses(truth.scale, truth.rotation, truth.translation + shift)
+        before, after = verify(scene, pose).of(0), verify(blind, pose).of(0)
+        assert after["f_front"] == after["f_seen"] == after["f_sim"] == 0
+        assert after["f_off"] == before["f_off"]
+
+
+def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
+    poses = join([truth, view_rotations(scene)])
+    many = Poses(*(getattr(poses, name).repeat_interleave(60, 0) for name in ("scale", "rotation", "translation")))
+    alone, together = verify(scene, poses), verify(scene, many)
+    for name in TERMS:
+        np.testing.assert_allclose(getattr(together, name)[::60], getattr(alone, name), atol=1e-5)
+
+
+def test_the_score_is_the_weighted_sum_of_the_terms():
+    rng = np.random.default_rng(4)
+    terms = Terms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERMS))
+    weights = Weights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0)
+    by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERMS)
+    np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
+
+
+def test_reverse_is_forward_with_the_sides_exchanged(views, truth):
+    """With one target, what the targets' points meet in the reference is the forward test of the inverse pose."""
+    zeros = [torch.zeros(784, 784)]
+    one, other = make_scene(views[0], [views[1]], zeros), make_scene(views[1], [views[0]], zeros)
+    pose = one.poses([Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3]))], 0)
+    there, back = reverse(one, pose), forward(other, pose.inverse())
+    np.testing.assert_allclose(there.off, back.off, atol=1e-4)
+    np.testing.assert_allclose(there.front, back.front, atol=1e-4)
+
+
+# Refinement
+
+
+def test_refinement_climbs_and_never_descends():
+    rng = np.random.default_rng(5)
+    goal = as_poses(Sim3(1.1, some_rotation(rng), np.array([0.1, -0.2, 0.05])))
+
+    def score(poses: Poses) -> torch.Tensor:
+        off = (poses.translation - goal.translation).square().sum(dim=1)
+        return -angles(poses.rotation, goal.rotation)[:, 0] / 20 - off - (poses.scale / goal.scale).log().square()
+
+    turn = rotations(torch.deg2rad(torch.tensor([[12.0, 5, -8], [-6, 10, 9]])))
+    start = Poses(torch.tensor([0.9, 1.2]), turn @ goal.rotation, goal.translation.expand(2, 3) + 0.1)
+    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.06, shrink=0.8)
+    found, reached = refine(start, score, search, seed=1)
+    assert (reached >= score(start)).all()
+    np.testing.assert_allclose(reached, score(found), atol=1e-3)
+    assert (angles(found.rotation, goal.rotation)[:, 0] < 4).all()
+    still, same = refine(goal, score, search)
+    assert float(same) == pytest.approx(float(score(goal)), abs=1e-4) and len(still) == 1
+
+
+@given(seeds)
+def test_rotation_vectors_turn_by_their_length_about_themselves(seed):
+    vector = torch.tensor(np.random.default_rng(seed).normal(size=(1, 3)), dtype=torch.float64)
+    matrix = rotations(vector)
+    np.testing.assert_allclose(matrix[0] @ matrix[0].T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(matrix[0] @ vector[0], vector[0], atol=1e-6)
+    expected = np.degrees(float(vector.norm())) % 360
+    assert rotation_error(matrix[0].numpy(), np.eye(3)) == pytest.approx(min(expected, 360 - expected), abs=1e-3)
+
+
+def test_bad_scenes_are_refused_in_one_line(views):
+    reference, *targets = views
+    empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
+    with pytest.raises(InputError, match="reference: 0 foreground patches of known depth, expected at least 8"):
+        make_scene(empty, targets, [torch.zeros(784, 784)] * 3)
+    with pytest.raises(InputError, match="target views: 0 foreground patches"):
+        make_scene(reference, [empty], [torch.zeros(784, 784)])

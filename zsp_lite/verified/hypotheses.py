@@ -1,0 +1,194 @@
+"""From views to ranked hypotheses: the stages of the verified solver, one after the other."""
+
+import hashlib
+import time
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.errors import InputError
+from zsp_lite.matching import Matches
+from zsp_lite.verified.confidence import MODES_APART, Calibration, margins
+from zsp_lite.verified.poses import Poses, angles, suppress
+from zsp_lite.verified.proposals import propose
+from zsp_lite.verified.refinement import COARSE, FINE, refine
+from zsp_lite.verified.scene import Scene, make_scene
+from zsp_lite.verified.soft_icp import soft_icp
+from zsp_lite.verified.verification import Weights, verify
+from zsp_lite.views import View
+
+# Hypotheses that go on after each stage, best first, and how far apart they are (degrees).
+_COARSE_KEPT, _COARSE_APART = 12, 20.0
+_FINE_KEPT, _FINE_APART = 6, 15.0
+# Points that the search looks at; the last verification takes all.
+_SEARCH_EVERY = (2, 4)
+# Two answers whose scores are within this many nats explain the views equally well: see `benchmark.tuning`.
+EQUALLY_GOOD = 0.5
+# Share of the points below which nothing of the pose was confirmed.
+_NOTHING_SEEN = 0.05
+
+
+@dataclass(frozen=True)
+class VerifiedSettings:
+    """What the verified solver does; the defaults are what measured best, the rest is for ablations.
+
+    weights: of the score.  calibration: of the confidences.  features: weight of similarity in the soft ICP.
+    icp, refinement: whether these stages run.
+    """
+
+    weights: Weights = Weights()
+    calibration: Calibration = Calibration()
+    features: float = 8.0
+    icp: bool = True
+    refinement: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One answer: a pose against target view `view`, what speaks for it, and how sure it is.
+
+    sim3: reference-camera points to the view's camera points.  view: the target view that looks at the object most
+    like the reference did, under this pose.  score: in nats, comparable within a pair.  terms: what it is the
+    weighted sum of, by name (see `verification`).  confidence: chance that the rotation is within 30 degrees.
+    """
+
+    sim3: Sim3
+    view: int
+    score: float
+    terms: dict[str, float]
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What the solver found.
+
+    hypotheses: best score first, at least 15 degrees apart, never none.  view_angles: degrees between the reference's
+    line of sight and each target view's (N,), under the best; infinite for views left out.  flags: one line per
+    reason not to trust it.  timings: seconds per stage.  scene: what the poses were tested on, its views in the
+    order `order` of the targets.  poses: the hypotheses in its working units.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    view_angles: Float[np.ndarray, "n"]
+    flags: tuple[str, ...]
+    timings: dict[str, float]
+    scene: Scene
+    order: tuple[int, ...]
+    poses: Poses
+
+    @property
+    def target_spread(self) -> float:
+        """The object's standard deviation as all target views show it, in their unit."""
+        return 1 / self.scene.target_frame.scale
+
+
+def solve(
+    reference: View,
+    targets: Sequence[View],
+    similarities: Sequence[Float[Tensor, "n1 n2"]],
+    matches: Sequence[Matches],
+    seed: int | np.random.Generator = 0,
+    settings: VerifiedSettings = VerifiedSettings(),
+) -> Solution:
+    """Proposals, soft ICP, verification, refinement of what scores best, ranking.
+
+    similarities, matches: of the reference with each target.  The answer does not depend on the order of the targets,
+    and turns with their world. Target views without depth or foreground are left out, with a flag.
+    Raises InputError where the reference or all targets together have too little of both.
+    """
+    rng, timings = np.random.default_rng(seed), {}
+    with _timed(timings, "scene"), torch.no_grad():
+        order, flags = _usable(targets)
+        scene = make_scene(
+            reference, [targets[k] for k in order], [similarities[k] for k in order], [matches[k] for k in order]
+        )
+    with _timed(timings, "proposals"), torch.no_grad():
+        poses = propose(scene, rng)
+    with _timed(timings, "alignment"), torch.no_grad():
+        if settings.icp:
+            poses = soft_icp(scene, poses, features=settings.features)
+    with _timed(timings, "verification"), torch.no_grad():
+        score = settings.weights.score(verify(scene, poses))
+        poses = poses[suppress(poses.rotation, score, _COARSE_APART, _COARSE_KEPT)]
+    with _timed(timings, "refinement"), torch.no_grad():
+        if settings.refinement:
+            poses = _refined(scene, poses, settings.weights, rng)
+    with _timed(timings, "ranking"), torch.no_grad():
+        terms = verify(scene, poses)
+        score = settings.weights.score(terms)
+        best = suppress(poses.rotation, score, _FINE_APART, _FINE_KEPT)
+        poses, score = poses[best], score[best].double().numpy()
+        apart = angles(poses.rotation, poses.rotation).double().numpy()
+        confidence = settings.calibration.confidence(score, margins(score, apart))
+        sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
+        hypotheses = []
+        for i, index in enumerate(best.tolist()):
+            view = int(sight[i].argmin())
+            one = Hypothesis(
+                scene.sim3(poses, i, view), order[view], float(score[i]), terms.of(index), float(confidence[i])
+            )
+            hypotheses.append(one)
+    view_angles = np.full(len(targets), np.inf)
+    view_angles[list(order)] = sight[0]
+    flags += _doubts(hypotheses, apart)
+    return Solution(tuple(hypotheses), view_angles, flags, timings, scene, order, poses)
+
+
+def _refined(scene: Scene, poses: Poses, weights: Weights, rng: np.random.Generator) -> Poses:
+    def score(tried: Poses) -> Float[Tensor, "m"]:
+        return weights.score(verify(scene, tried, _SEARCH_EVERY))
+
+    poses, reached = refine(poses, score, COARSE, rng)
+    poses = poses[suppress(poses.rotation, reached, _FINE_APART, _FINE_KEPT)]
+    return refine(poses, score, FINE, rng)[0]
+
+
+def _doubts(hypotheses: Sequence[Hypothesis], apart: Float[np.ndarray, "m m"]) -> tuple[str, ...]:
+    """Why the best hypothesis may not be the answer."""
+    best, flags = hypotheses[0], []
+    rivals = [
+        one.score
+        for one, angle in zip(hypotheses, apart[0])
+        if angle > MODES_APART and best.score - one.score < EQUALLY_GOOD
+    ]
+    if rivals:
+        scores = ", ".join(f"{score:.2f}" for score in [best.score, *rivals])
+        flags.append(
+            f"{1 + len(rivals)} poses more than 30 degrees apart explain the views equally well (scores {scores})"
+        )
+    if max(best.terms["f_seen"], best.terms["r_seen"]) < _NOTHING_SEEN:
+        flags.append("no view confirms the pose: hardly a point falls on a surface that was seen")
+    return tuple(flags)
+
+
+def _usable(targets: Sequence[View]) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """The targets that can be tested against, in an order that is theirs alone; a flag for each of the others."""
+    keys, flags = {}, []
+    for index, target in enumerate(targets):
+        depth = target.frame.depth
+        name = target.frame.name or f"target view {index}"
+        if depth is None or not (depth > 0).any():
+            flags.append(f"{name} left out: no known depth")
+        elif not target.foreground.any():
+            flags.append(f"{name} left out: no foreground")
+        else:
+            camera = target.frame.camera
+            content = depth.tobytes() + camera.K.tobytes() + np.packbits(target.foreground.cpu().numpy()).tobytes()
+            keys[index] = hashlib.blake2b(content, digest_size=16).digest()
+    if not keys:
+        raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
+    return tuple(sorted(keys, key=keys.get)), tuple(flags)
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str):
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
