@@ -15,7 +15,7 @@ from zsp_lite.doctor import sample_data
 from zsp_lite.pipeline import object_crop, patch_mask
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.training.train import TrainingConfig
+from zsp_lite.training.train import CONTINUATION
 from zsp_lite.vit import VisionTransformer
 
 
@@ -33,11 +33,15 @@ def test_it_loads_strictly_into_a_plain_dino_transformer():
     model.load_state_dict({name: value.float() for name, value in weights.items()}, strict=True)
 
 
-def test_its_configuration_is_the_trainers_default_and_its_log_is_complete():
-    config = json.loads((TINY.parent / "config.json").read_text())
-    assert config == json.loads(json.dumps(asdict(TrainingConfig())))
-    rows = [json.loads(line) for line in (TINY.parent / "log.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
+def test_its_configuration_is_the_recipes_and_its_logs_are_complete():
+    first, second = (json.loads((TINY.parent / f"config-{run}.json").read_text()) for run in (1, 2))
+    assert second == json.loads(json.dumps(asdict(CONTINUATION)))
+    shape = ("embed_dim", "depth", "num_heads", "key_block")
+    assert [first[name] for name in shape] == [second[name] for name in shape]
+    for run, config in ((1, first), (2, second)):
+        rows = [json.loads(line) for line in (TINY.parent / f"log-{run}.jsonl").read_text().splitlines()]
+        assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
+        assert rows[-1]["held_out_accuracy"] > rows[9]["held_out_accuracy"] > 0
 
 
 def test_it_was_trained_on_none_of_the_evaluated_categories():

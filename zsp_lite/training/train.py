@@ -89,10 +89,10 @@ class TrainingConfig:
 CONTINUATION = TrainingConfig(
     learning_rate=5e-4,
     stages=(
-        Stage(2800, 96, 3, 8, (0.4, 1.0), view=1.0),
-        Stage(1300, 128, 3, 8, (0.6, 1.0), view=1.0),
-        Stage(300, 184, 2, 8, (0.8, 1.0), radius=0.12, view=1.0),
-        Stage(350, 224, 1, 8, (0.9, 1.0), radius=0.12, view=1.0),
+        Stage(1800, 96, 3, 8, (0.4, 1.0), view=1.0),
+        Stage(1500, 128, 3, 8, (0.6, 1.0), view=1.0),
+        Stage(400, 184, 2, 8, (0.8, 1.0), radius=0.12, view=1.0),
+        Stage(250, 224, 1, 8, (0.9, 1.0), radius=0.12, view=1.0),
     ),
 )
 
