@@ -133,7 +133,7 @@ def add_tables(commands) -> None:
         commands, "tables", _tables, "tables and figures of a finished benchmark run",
         ["tables outputs/benchmark", "tables results.json.gz --out outputs/tables"],
     )  # fmt: skip
-    parser.add_argument("run", type=Path, help="a run's folder, or its results.json.gz")
+    parser.add_argument("source", type=Path, help="a run's folder, or its results.json.gz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: where the run is")
 
 
@@ -147,7 +147,7 @@ def _tables(arguments: argparse.Namespace) -> None:
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.tables import all_rows, paper_tables
 
-    results = write_reports(arguments.run, arguments.out)
+    results = write_reports(arguments.source, arguments.out)
     console = Console()
     for table in [all_rows(results.summary), *paper_tables(results.summary)]:
         console.print(as_rich(table))
