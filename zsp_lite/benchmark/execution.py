@@ -24,6 +24,7 @@ from zsp_lite.benchmark.storage import PartReader, RunFolder
 from zsp_lite.errors import InputError
 
 _POLL = 0.3  # seconds between looks at what workers have finished
+_PATIENCE = 15  # seconds to wait for a scheduler
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ def _dask(address: str) -> Iterator[Crew]:
     except ImportError as error:
         raise InputError("executor dask://: needs Dask; pip install 'zsp-lite[cluster]'") from error
     try:
-        client = Client(f"tcp://{address}" if "://" not in address else address, timeout=20)
+        client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_PATIENCE)
     except (OSError, ValueError) as error:
         raise InputError(f"executor dask://{address}: no scheduler answers there ({error})") from error
     with client:

@@ -52,12 +52,14 @@ def split(work: Work, pieces: int) -> list[list[tuple[Pair, Sequence[str]]]]:
     that differ in the number of target views alone follow each other.
     """
     order = sorted(work, key=lambda item: _place(item[0]))
-    chunks: list[list] = [[]]
+    chunks: dict[int, list] = {}
+    before = 0
     for _, group in groupby(order, key=lambda item: item[0].target_sequence):
-        if chunks[-1] and len(chunks) < pieces and len(chunks[-1]) * pieces >= len(order):
-            chunks.append([])
-        chunks[-1] += group
-    return [chunk for chunk in chunks if chunk]
+        items = list(group)
+        # By where its middle lies: sequences of uneven numbers of pairs still give chunks of about one size.
+        chunks.setdefault(int(pieces * (before + len(items) / 2) / len(order)), []).extend(items)
+        before += len(items)
+    return list(chunks.values())
 
 
 def records_of(job: Job, extractors: Mapping[str, Any]) -> Iterator[dict]:
