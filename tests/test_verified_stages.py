@@ -19,7 +19,7 @@ from zsp_lite.verified.maps import look_up, make_maps
 from zsp_lite.verified.poses import Poses, angles, fit_poses, join, suppress
 from zsp_lite.verified.proposals import from_matches, propose, view_rotations
 from zsp_lite.verified.refinement import Search, refine, rotations
-from zsp_lite.verified.scene import contrast, make_scene
+from zsp_lite.verified.scene import contrast, make_scene, surface_shares
 from zsp_lite.verified.soft_icp import soft_icp, spread_indices
 from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, verify
 from zsp_lite.views import View, look, object_crop
@@ -308,11 +308,12 @@ def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
         sums[name] /= len(in_reference)
     unit = 1 / scene.reference_frame.scale
     in_first = scene.target_frame.inverse().apply(scene.target_points[:: EVERY[1]].numpy())
-    for point in in_first:
+    shares = scene.target_share[:: EVERY[1]]
+    for point, share in zip(in_first, (shares / shares.sum()).tolist()):
         world = reference.frame.camera.to_world(pose.inverse().apply(point))
         what = met(reference, reference.frame.camera, world, unit)
-        sums["r_off"] += what["off"] / len(in_first)
-        sums["r_front"] += what["front"] / len(in_first)
+        sums["r_off"] += what["off"] * share
+        sums["r_front"] += what["front"] * share
     return sums
 
 
@@ -445,3 +446,12 @@ def test_bad_scenes_are_refused_in_one_line(views):
         make_scene(empty, targets, [torch.zeros(784, 784)] * 3)
     with pytest.raises(InputError, match="target views: 0 foreground patches"):
         make_scene(reference, [empty], [torch.zeros(784, 784)])
+
+
+def test_points_share_the_surface_evenly_however_densely_it_was_seen():
+    rng = np.random.default_rng(6)
+    angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
+    ring = torch.tensor(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32)
+    share = surface_shares(ring)
+    assert float(share.sum()) == pytest.approx(1, abs=1e-5)
+    assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)

@@ -93,6 +93,8 @@ class ZeroShotPose:
     k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 4.1).
     view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in
     scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
+    adaptive_threshold: take the threshold as a share of what the chosen view shows of the object (its points' standard
+    deviation), as the supplement suggests: for scenes in other units.
     foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
     cycle_from: "reference" as in the paper, or "target" as in its published code.
     matcher: "cyclical" as in the paper, or another way to choose matches: see `matchers`.
@@ -108,6 +110,7 @@ class ZeroShotPose:
     view_selector: str = "correspond"
     trials: int = 1000
     threshold: float = 0.2
+    adaptive_threshold: bool = False
     sample_size: int = 4
     saliency_threshold: float = 0.05
     foreground: Literal["saliency", "mask"] = "saliency"
@@ -194,10 +197,11 @@ class ZeroShotPose:
             matches = comparisons[best].matches
         with _timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
+            unit = _spread(_foreground_points(targets[best])) if self.adaptive_threshold else 1.0
             flags: tuple[str, ...] = ()
             try:
                 sim3, inliers = ransac(
-                    *points, threshold=self.threshold, trials=self.trials, sample_size=self.sample_size,
+                    *points, threshold=unit * self.threshold, trials=self.trials, sample_size=self.sample_size,
                     seed=self.seed, scale_range=SCALE_RANGE,
                 )  # fmt: skip
                 if (agreeing := int(inliers.sum())) < self.sample_size:
@@ -245,6 +249,11 @@ def view_alignment(reference: View, target: View) -> Sim3:
     target_spread = np.sqrt(np.square(second - second.mean(axis=0)).sum(axis=1).mean())
     scale = float(target_spread / spread) if spread > 0 and target_spread > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
+
+
+def _spread(points: Float[np.ndarray, "n 3"]) -> float:
+    """Standard deviation, averaged over the axes."""
+    return float(np.sqrt(points.var(axis=0).mean())) or 1.0
 
 
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:

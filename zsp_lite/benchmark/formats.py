@@ -9,20 +9,23 @@ from pathlib import Path
 
 from rich.table import Table as RichTable
 
-from zsp_lite.benchmark.tables import Cell, Table
+from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, Cell, Table
 from zsp_lite.files import write_atomic
 
 _NOTHING = "–"
 
 
 def as_rich(table: Table) -> RichTable:
-    """For a terminal."""
+    """For a terminal: an interval below its figure, published figures dim and headed as such."""
     made = RichTable(title=table.title, caption=table.note or None, caption_justify="left")
-    made.add_column("", justify="left", no_wrap=True)
-    for title in _flat_titles(table, "\n"):
-        made.add_column(title, justify="right")
+    made.add_column("", justify="left")
+    for column in table.columns:
+        group = column.group.removeprefix(THIS_RUN).removeprefix(": ")
+        title = column.title.replace(" (", "\n(")
+        style = "dim" if column.group == OTHER_DATA else None
+        made.add_column(f"{group}\n{title}" if group else title, justify="right", style=style, header_style=style)
     for label, cells in table.rows:
-        made.add_row(label, *map(_text, cells))
+        made.add_row(label, *(_text(cell).replace(" [", "\n[") for cell in cells))
     return made
 
 

@@ -12,7 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
+from zsp_lite.benchmark.robustness import DAMAGES, Damaged
 from zsp_lite.errors import InputError
+from zsp_lite.verified import VerifiedSettings
+from zsp_lite.verified.verification import Weights
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,35 @@ def _numbers_of_views() -> dict[str, Method]:
 
 _MASK = {"foreground": "mask"}
 _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
+
+_VERIFIED = {"solver": "verified"}
+
+
+def _verified_rows() -> dict[str, Method]:
+    """The solver beyond the paper: with less to see, and with parts of it taken away."""
+    rows = {"verified": Method(settings=_VERIFIED), "verified-mask": Method(settings=_VERIFIED | _MASK)}
+    rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 20)}
+    less = {
+        "nosilhouette": VerifiedSettings(weights=Weights(f_off=0, r_off=0)),
+        "nofreespace": VerifiedSettings(weights=Weights(f_front=0, r_front=0)),
+        "simonly": VerifiedSettings(weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0)),
+        "forward": VerifiedSettings(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0)),
+        "nofeatures": VerifiedSettings(weights=Weights(f_sim=0, r_sim=0), features=0),
+        "noicp": VerifiedSettings(icp=False),
+        "norefinement": VerifiedSettings(refinement=False),
+    }
+    return rows | {f"verified-{name}": Method(settings=_VERIFIED | {"verified": one}) for name, one in less.items()}
+
+
+def _damaged_rows() -> dict[str, Method]:
+    """The paper's solver and the verified one on data that were spoilt; wrong masks only harm those who use them."""
+    rows = {}
+    for name in ("clean", *DAMAGES):
+        mask = _MASK if name.startswith("mask") else {}
+        rows[f"ours-{name}"] = Method(solve=Damaged(name, mask))
+        rows[f"verified-{name}"] = Method(solve=Damaged(name, _VERIFIED | mask))
+    return rows
+
 
 METHODS: dict[str, Method] = {
     "ours": Method(),
@@ -81,6 +113,10 @@ METHODS: dict[str, Method] = {
     "posecontrast-tiny": Method("posecontrast-tiny", solve=baseline_rows.posecontrast_tiny),
     # Table 2 and supplement, "Number of target views".
     **_numbers_of_views(),
+    # Beyond the paper.
+    "ours-adaptive": Method(settings={"adaptive_threshold": True}),
+    **_verified_rows(),
+    **_damaged_rows(),
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -96,6 +132,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
+    "verified-ablations": ("ours", "verified", *(f"verified-{name}" for name in (
+        "mask", "n1", "nosilhouette", "nofreespace", "simonly", "forward", "nofeatures", "noicp", "norefinement",
+    ))),
+    "robustness": tuple(f"{row}{damage}" for damage in ("", "-mask", "-clean", *(f"-{name}" for name in DAMAGES))
+                        for row in ("ours", "verified")),
 }  # fmt: skip
 
 

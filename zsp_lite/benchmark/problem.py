@@ -44,8 +44,8 @@ def as_answer(found: Any) -> Answer:
         return found
     if isinstance(found, PoseEstimate):
         details = {"matches": len(found.matches), "inliers": int(found.inliers.sum()), "timings": found.timings}
-        if (confidence := getattr(found, "confidence", None)) is not None:
-            details["confidence"] = float(confidence)
+        if found.confidence is not None:
+            details["confidence"] = round(found.confidence, 4)
         return Answer(found.sim3.R, found.view, found.sim3.t, found.sim3.scale, found.note, details)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):

@@ -12,7 +12,7 @@ from zsp_lite.benchmark import published
 from zsp_lite.benchmark.published import Printed
 
 THIS_RUN = "this run"
-OTHER_DATA = "published, on CO3D (other data)"
+OTHER_DATA = "published on CO3D (other data)"
 NOTE = (
     "Intervals: 95 %, bootstrap over pairs. Published figures are the paper's, on CO3D with DINO ViT-S/8: other data, "
     "and another backbone unless the run says otherwise."

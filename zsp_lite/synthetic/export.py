@@ -15,7 +15,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 from zsp_lite.labels import PoseLabel, write_label
 from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
-from zsp_lite.synthetic.assembly import make_shape
+from zsp_lite.synthetic.assembly import Shape, make_shape
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.sensor import observe
 from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
@@ -102,8 +102,7 @@ def export_categories(
         raise InputError(f"layout is {layout!r}, expected one of {', '.join(LAYOUTS)}")
     if min(sequences, frames) < 1 or image_size < 32:
         raise InputError(
-            f"export has {sequences} sequences of {frames} frames of {image_size} pixels, "
-            "expected at least 1, 1 and 32"
+            f"export has {sequences} sequences of {frames} frames of {image_size} pixels, expected at least 1, 1 and 32"
         )
     out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout}
@@ -129,9 +128,24 @@ def make_sequence(
 ) -> tuple[SequenceData, RenderedSequence]:
     """Sequence number `index` of a category, as CO3D would hold it, and its exact twin."""
     key = _stable_hash(seed, category, index)
-    shape = make_shape((TRAINING | EVALUATION)[category], [key, 0])
+    shape = _make_object(category, key)
     rendered = render_sequence(shape, np.random.default_rng([key, 1]), frames, image_size)
     return observe(rendered, sequence_name(seed, category, index), np.random.default_rng([key, 2]))
+
+
+def make_object(category: str, sequence: str, seed: int) -> Shape:
+    """The object of an exported sequence, given its name and the export's seed, in canonical coordinates.
+
+    Raises InputError where no such sequence is exported with that seed.
+    """
+    index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
+    if category not in TRAINING | EVALUATION or index < 0 or sequence != sequence_name(seed, category, index):
+        raise InputError(f"sequence {category}/{sequence} is none of an export with seed {seed}")
+    return _make_object(category, _stable_hash(seed, category, index))
+
+
+def _make_object(category: str, key: int) -> Shape:
+    return make_shape((TRAINING | EVALUATION)[category], [key, 0])
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:

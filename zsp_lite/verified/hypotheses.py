@@ -179,8 +179,8 @@ def _usable(targets: Sequence[View]) -> tuple[tuple[int, ...], tuple[str, ...]]:
         elif not target.foreground.any():
             flags.append(f"{name} left out: no foreground")
         else:
-            camera = target.frame.camera
-            content = depth.tobytes() + camera.K.tobytes() + np.packbits(target.foreground.cpu().numpy()).tobytes()
+            # What neither the order of the views nor the world's axes and unit change.
+            content = target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes()
             keys[index] = hashlib.blake2b(content, digest_size=16).digest()
     if not keys:
         raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")

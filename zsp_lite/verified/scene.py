@@ -23,6 +23,7 @@ from zsp_lite.views import View
 
 # Patches at a silhouette may lie on the background behind: points this many median distances off are dropped.
 _STRAY = 3.0
+_DENSITY_WIDTH = 0.25
 # Fewer points than this have no shape to align.
 MIN_POINTS = 8
 
@@ -33,6 +34,7 @@ class Scene:
 
     reference_points, target_points: foreground patches with a known depth, in working units; the targets' of all
     views.  target_view, target_column: of each target point, its view and its column in `similarity`.
+    target_share: of each target point, the share of the surface that it stands for; their sum is 1.
     similarity: of each reference point to each foreground patch of all targets, less what either has in common with
     all of the other view (see `contrast`).
     reference_maps, target_maps: what the views say about their pixels.
@@ -44,6 +46,7 @@ class Scene:
     target_points: Float[Tensor, "m 3"]
     target_view: Int[Tensor, "m"]
     target_column: Int[Tensor, "m"]
+    target_share: Float[Tensor, "m"]
     similarity: Float[Tensor, "n columns"]
     reference_maps: ViewMaps
     target_maps: ViewMaps
@@ -104,11 +107,13 @@ def make_scene(
         v = np.ravel_multi_index(tuple(match.target.T), targets[0].features.grid)
         both = reference.patch_points[1].ravel()[u] & known[v]
         pairs.append((_tensor(reference_frame.apply(source[u[both]])), _tensor(target_frame.apply(cloud[v[both]]))))
+    target_points = _tensor(target_frame.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, on)])))
     return Scene(
         _tensor(reference_frame.apply(source[source_on])),
-        _tensor(target_frame.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, on)]))),
+        target_points,
         torch.from_numpy(np.repeat(np.arange(len(targets)), [chosen.sum() for chosen in on])),
         torch.from_numpy(np.concatenate([column[chosen] for column, chosen in zip(columns, on)])),
+        surface_shares(target_points),
         torch.cat(blocks, dim=1).contiguous(),
         make_maps([reference], [(np.eye(3), np.zeros(3))], reference_frame, [row]),
         make_maps(targets, to_camera, target_frame, columns),
@@ -129,6 +134,15 @@ def contrast(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
         return similarity
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
+
+
+def surface_shares(points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+    """The share of the surface that each point stands for, by the density around it; their sum is 1.
+
+    What three views saw has three times as many points as what one saw, and shall not count three times.
+    """
+    density = torch.cdist(points, points).square_().mul_(-0.5 / _DENSITY_WIDTH**2).exp_().sum(dim=1)
+    return (1 / density) / (1 / density).sum()
 
 
 def _relative(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:

@@ -1,7 +1,7 @@
 """A pose put to the test of everything that was seen: does it predict what each view shows, and only that?
 
 Forward (f_), the reference's points are projected into every target view; in reverse (r_), the targets' points into
-the reference. Four terms each, kept apart, averaged over the points:
+the reference. Four terms each, kept apart, averaged over the points, the targets' by the surface they stand for:
 sim    how alike in features a point is to what the views show where it lies on a surface that they saw
 seen   the share of points that lie on a seen surface
 off    how far points fall outside the silhouettes
@@ -86,14 +86,15 @@ class Evidence:
     front: Float[Tensor, "m v n"]
     alike: Float[Tensor, "m v n"]
 
-    def terms(self) -> Iterator[Float[Tensor, "m"]]:
-        """sim, seen, off and front: averages over points and views."""
+    def terms(self, share: Float[Tensor, "n"]) -> Iterator[Float[Tensor, "m"]]:
+        """sim, seen, off and front: averages over views, then over points that count by their shares."""
+        share = share / share.sum()
         touch = torch.where(self.seen.patch < 0, 0, self.touch)
         total = touch.sum(dim=1)
-        yield ((touch * self.alike).sum(dim=1) / (total + _GLIMPSE)).mean(dim=1)
-        yield total.clamp_max(1).mean(dim=1)
-        yield self.off.mean(dim=(1, 2))
-        yield self.front.mean(dim=(1, 2))
+        yield ((touch * self.alike).sum(dim=1) / (total + _GLIMPSE)) @ share
+        yield total.clamp_max(1) @ share
+        yield self.off.mean(dim=1) @ share
+        yield self.front.mean(dim=1) @ share
 
 
 def forward(scene: Scene, poses: Poses, rows: Int[Tensor, "n"] | None = None) -> Evidence:
@@ -116,10 +117,11 @@ def verify(scene: Scene, poses: Poses, every: tuple[int, int] = (1, 1)) -> Terms
     rows = torch.arange(0, len(scene.reference_points), every[0])
     chosen = torch.arange(0, len(scene.target_points), every[1])
     size = max(_CHUNK // (len(rows) * len(scene.target_maps) + len(chosen)), 1)
+    even, shares = torch.ones(len(rows)), scene.target_share[chosen]
     parts = []
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
-        parts.append((*forward(scene, some, rows).terms(), *reverse(scene, some, chosen).terms()))
+        parts.append((*forward(scene, some, rows).terms(even), *reverse(scene, some, chosen).terms(shares)))
     return Terms(*(torch.cat(term) for term in zip(*parts)))
 
 
