@@ -121,3 +121,27 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
     with pytest.raises(InputError, match="posecontrast"):
         evaluate(small_folder(), BACKBONE, ["posecontrast"], 1, 2, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_fingerprint_tells_apart_whatever_changes_the_features():
+    from zsp_lite.backbones import Backbone
+    from zsp_lite.vit import VisionTransformer
+
+    torch.manual_seed(0)
+    vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)
+
+    def of(**options):
+        return extractors.fingerprint(Backbone(vit, "same name", device="cpu", **options))
+
+    plain = of()
+    assert plain == of(key_block=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
+    changes = [
+        dict(key_block=1), dict(facet="query"), dict(saliency_heads=[1]), dict(image_size=64), dict(mean=(0, 0, 0)),
+        dict(std=(1, 1, 1)), dict(precision="bfloat16"),
+    ]  # fmt: skip
+    assert len({plain, *(of(**change) for change in changes)}) == 1 + len(changes)
+    with torch.no_grad():
+        vit.cls_token += 1
+    assert of() != plain
+    facet = extractors.random_backbone(Backbone(vit, "same name", device="cpu", facet="value", image_size=64))
+    assert (facet.facet, facet.image_size) == ("value", 64)

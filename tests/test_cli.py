@@ -8,6 +8,7 @@ import pytest
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import cli, errors
+from zsp_lite.backbones import BackboneChoice
 from zsp_lite.co3d import Co3D
 
 COMMANDS = (
@@ -44,6 +45,7 @@ def test_help_imports_nothing_heavy():
         ["fly"],
         ["demo", "--speed", "3"],
         ["benchmark", "--pairs", "0"],
+        ["demo", "--image-size", "small"],
         ["benchmark", "--methods", ","],
         ["train", "--shorten", "nan"],
         ["train", "--seed", "-1"],
@@ -64,6 +66,10 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, capsys):
     [
         (["demo", "--data", "no/such/folder"], "no/such/folder"),
         (["demo", "--backbone", "resnet"], "resnet"),
+        (["demo", "--layer", "block12"], "'block0' to 'block11'"),
+        (["demo", "--facet", "keys"], "key, query, value, token"),
+        (["benchmark", "--layer", "-13"], "'-13'"),
+        (["benchmark", "--facet", "keys"], "key, query, value, token"),
         (["benchmark", "--data", "no/such/folder"], "no/such/folder"),
         (["benchmark", "--methods", "magic"], "magic"),
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
@@ -130,6 +136,38 @@ def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellip
     assert all(name in text and row["n"] == 2 for name, row in summary["methods"].items())
 
 
+def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypatch, capsys):
+    """What the command line asks for is what the summary names, and what another folder is needed for."""
+    monkeypatch.setenv("COLUMNS", "200")
+    ask = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "1", "--targets", "1", "--methods", "ours-bv"]
+    ask += ["--out", str(tmp_path)]
+    chosen = ["--layer", "-1", "--facet", "token", "--image-size", "60"]
+    assert cli.main([*ask, *chosen, "--workers", "2"]) == 0
+    assert "zsp-tiny (block11, token, 60 px)" in capsys.readouterr().out
+    assert json.loads((tmp_path / "summary.json").read_text())["backbone"] == "zsp-tiny (block11, token, 60 px)"
+    assert cli.main([*ask, *chosen, "--quiet"]) == 0 and capsys.readouterr().out == ""
+    assert cli.main([*ask, *chosen[:-1], "120"]) == 2
+    assert str(tmp_path) in assert_one_line(capsys)
+
+
+def test_the_demo_takes_layer_facet_and_size_too(ellipsoids, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    loaded = []
+
+    def load(choice):
+        loaded.append(choice)
+        return CoordinateBackbone()
+
+    monkeypatch.setattr("zsp_lite.backbones.load_backbone", load)
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone: iter(()))
+    monkeypatch.setattr("zsp_lite.report.write_report", lambda path, *others: path)
+    monkeypatch.setattr("zsp_lite.report.write_overview", lambda *others: None)
+    demo = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
+    assert cli.main([*demo, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
+    assert cli.main([*demo, "--backbone", "dino_vits8"]) == 0
+    assert loaded == [BackboneChoice("zsp-tiny", "block3", "value", 96), "dino_vits8"]
+
+
 def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):
     arguments = ["--category", "mouse", "--sequences", "1", "--frames", "2", "--seed", "3", "--out", str(tmp_path)]
     assert cli.main(["synth", *arguments]) == 0
@@ -141,9 +179,7 @@ def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):
 def test_the_weights_list_has_every_name(capsys):
     assert cli.main(["weights", "list"]) == 0
     text = capsys.readouterr().out
-    assert all(
-        name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16")
-    )
+    assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
 
 
 def assert_one_line(capsys) -> str:

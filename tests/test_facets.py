@@ -57,7 +57,7 @@ def test_backbones_take_layer_facet_and_size():
     images = [np.random.default_rng(0).integers(0, 256, (50, 60, 3), dtype=np.uint8)]
     backbone = load_backbone("zsp-tiny", "cpu", layer="last", facet="value", image_size=60)
     assert (backbone.key_block, backbone.facet, backbone.image_size) == (backbone.model.depth - 1, "value", 64)
-    assert backbone.name == "zsp-tiny (value, 60 px)"
+    assert backbone.name == "zsp-tiny (block11, value, 60 px)"
     assert backbone(images)[0].grid == (8, 8)
     assert load_backbone("zsp-tiny", "cpu").key_block == load_backbone("zsp-tiny", "cpu", layer=None).key_block
     for options in ({"facet": "keys"}, {"layer": "block99"}, {"layer": 1, "key_block": 1}, {"image_size": -8}):

@@ -7,7 +7,7 @@ model, part of the package. Any checkpoint in the DINO layout works by its path;
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,23 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # $ZSP_LITE_DINO_URL overrides it
 TINY = Path(__file__).parent / "weights" / "zsp-tiny.safetensors"
+
+
+@dataclass(frozen=True)
+class BackboneChoice:
+    """A backbone by name, with the options that decide what it says of a picture; not loaded yet.
+
+    Small enough to be sent to other machines, and as good as a name for `load_backbone`, which explains the options.
+    Raises InputError for a facet that there is not.
+    """
+
+    name: str
+    layer: int | str | None = None
+    facet: str = "key"
+    image_size: int | None = None
+
+    def __post_init__(self):
+        check_facet(self.facet, self.name)
 
 
 @dataclass(frozen=True)
@@ -133,7 +150,7 @@ class Backbone:
 
 
 def load_backbone(
-    name_or_path: str | Path = "zsp-tiny",
+    name_or_path: str | Path | BackboneChoice = "zsp-tiny",
     device: str | torch.device | None = None,
     *,
     num_heads: int | None = None,
@@ -157,8 +174,12 @@ def load_backbone(
     the paper's depth (three quarters of the blocks) and all heads.
     device: None takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises
     InputError for unknown names, layers and facets, downloads that fail (saying what to do) and files that are not
-    such a checkpoint.
+    such a checkpoint. A `BackboneChoice` has layer, facet and image_size of its own; others beside it are not used.
     """
+    if isinstance(name_or_path, BackboneChoice):
+        own = asdict(name_or_path)
+        others = dict(num_heads=num_heads, saliency_heads=saliency_heads, precision=precision, batch_size=batch_size)
+        return load_backbone(own.pop("name"), device, **own, **others)
     name = str(name_or_path)
     path = Path(name).expanduser()
     if layer is not None and key_block is not None:
@@ -166,21 +187,25 @@ def load_backbone(
     layer = key_block if layer is None else layer
     check_facet(facet, name)
     options = {"device": device, "precision": precision, "batch_size": batch_size, "facet": facet}
-    # Benchmark runs are told apart by name.
-    chosen = [] if facet == "key" else [facet]
-    chosen += [] if image_size is None else [f"{image_size} px"]
-    suffix = f" ({', '.join(chosen)})" if chosen else ""
+
+    def named(label: str, depth: int) -> str:
+        """With what was asked for: benchmark runs are told apart by name."""
+        asked = [] if layer is None else [f"block{block_index(layer, depth, name)}"]
+        asked += [] if facet == "key" else [facet]
+        asked += [] if image_size is None else [f"{image_size} px"]
+        return f"{label} ({', '.join(asked)})" if asked else label
+
     if name.startswith(PREFIX):
         if num_heads is not None:
             raise InputError(f"{name}: num_heads is {num_heads}, expected none: the model's configuration has it")
         model = load_huggingface(name, image_size)
-        layer = 3 * model.depth // 4 if layer is None else layer
+        block = 3 * model.depth // 4 if layer is None else layer
         heads = range(model.num_heads) if saliency_heads is None else saliency_heads
         if model.mean is not None:
             options |= {"mean": model.mean, "std": model.std}
         folder = Path(name.removeprefix(PREFIX)).expanduser()
         label = PREFIX + folder.resolve().name if folder.is_dir() else name
-        return Backbone(model, label + suffix, layer, heads, **options)
+        return Backbone(model, named(label, model.depth), block, heads, **options)
     if name in available_backbones():
         path, label = download(name), name
     elif path.is_file():
@@ -191,11 +216,10 @@ def load_backbone(
         )
     weights, metadata = read_checkpoint(path)
     model = build_vit(weights, num_heads or _metadata_int(metadata, "num_heads", path), path.name)
-    if layer is None:
-        layer = _metadata_int(metadata, "key_block", path)
+    block = _metadata_int(metadata, "key_block", path) if layer is None else layer
     if saliency_heads is None and "saliency_heads" in metadata:
         saliency_heads = _metadata_ints(metadata, "saliency_heads", path)
-    return Backbone(model, label + suffix, layer, saliency_heads, image_size=image_size, **options)
+    return Backbone(model, named(label, model.depth), block, saliency_heads, image_size=image_size, **options)
 
 
 def available_backbones() -> dict[str, Path | None]:

@@ -111,12 +111,37 @@ def _add_backbone(parser: Parser) -> None:
         help="zsp-tiny (default), dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, a checkpoint file, or hf:NAME: "
         "a vision transformer of the Hugging Face hub or a folder in its format",
     )  # fmt: skip
+    parser.add_argument(
+        "--layer", metavar="L",
+        help="the block that describes patches: block0, block1, ..., last, or a number (default: the backbone's own; "
+        "the paper's is block9)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--facet", default="key", metavar="F", help="what of it: key (default, the paper's), query, value, token"
+    )
+    parser.add_argument(
+        "--image-size", type=_count, metavar="PX",
+        help="pictures are resized to so many pixels, or the nearest multiple of the patch size (default: the "
+        "checkpoint's, as a rule 224)",
+    )  # fmt: skip
+
+
+def _backbone(arguments: argparse.Namespace):
+    """What `load_backbone` takes for the options of `_add_backbone`: a name alone where nothing else was asked for."""
+    from zsp_lite.backbones import BackboneChoice
+
+    choice = BackboneChoice(arguments.backbone, arguments.layer, arguments.facet, arguments.image_size)
+    return arguments.backbone if choice == BackboneChoice(arguments.backbone) else choice
 
 
 def _add_demo(commands) -> None:
     parser = _command(
         commands, "demo", _demo, "one pair of each category, end to end: a table and a report of every stage",
-        ["demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"],
+        [
+            "demo",
+            "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d",
+            "demo --layer last --facet token --out outputs/tokens",
+        ],
     )  # fmt: skip
     parser.add_argument("--data", type=Path, metavar="DIR", help="a folder in CO3D's layout (default: data_samples)")
     _add_backbone(parser)
@@ -141,17 +166,19 @@ def _demo(arguments: argparse.Namespace) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     folder = arguments.data or sample_data()
     note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
-    table = Table(title=f"One pair of each category in {folder}, backbone {arguments.backbone}")
+    dataset, backbone = Co3D(folder), load_backbone(_backbone(arguments))
+    name = getattr(backbone, "name", arguments.backbone)
+    table = Table(title=f"One pair of each category in {folder}, backbone {name}")
     for column in ("category", "chosen view", "inliers", "rotation error", "time"):
         table.add_column(column, justify="left" if column == "category" else "right")
     results = []
     with console.status("estimating"):
-        for result in run_demo(Co3D(folder), load_backbone(arguments.backbone)):
+        for result in run_demo(dataset, backbone):
             results.append(result)
             table.add_row(*table_row(result))
     console.print(table)
     with console.status("writing the report"):
-        path = write_report(arguments.out / "report.html", results, str(folder), note, arguments.backbone)
+        path = write_report(arguments.out / "report.html", results, str(folder), note, name)
         write_overview(arguments.out / "overview.jpg", results)
     console.print(f"Data: {note}", highlight=False)
     console.print(f"Every stage in pictures: {path}", soft_wrap=True)

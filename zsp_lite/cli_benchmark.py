@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from zsp_lite.cli import _add_backbone, _add_data, _command, _count, _names, _seed
+from zsp_lite.cli import _add_backbone, _add_data, _backbone, _command, _count, _names, _seed
 from zsp_lite.errors import InputError
 
 
@@ -13,6 +13,7 @@ def add_benchmark(commands) -> None:
         [
             "benchmark",
             "benchmark --data outputs/eval --pairs 30 --methods ours,rootsift --out outputs/compared",
+            "benchmark --data outputs/eval --layer last --facet token --out outputs/tokens",
             "benchmark --data outputs/paper --methods paper --pairs 100 --workers 2 --plan",
             "benchmark --list",
         ],
@@ -79,7 +80,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
             bar.update(done - bar.n)
 
         summary = evaluate(
-            root, arguments.backbone, arguments.methods, arguments.pairs, arguments.targets, arguments.seed,
+            root, _backbone(arguments), arguments.methods, arguments.pairs, arguments.targets, arguments.seed,
             arguments.out, arguments.categories, progress, executor=arguments.executor, workers=arguments.workers,
             threads=arguments.threads, cache=arguments.cache,
         )  # fmt: skip
@@ -87,7 +88,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     if arguments.quiet:
         return None
     console = Console()
-    title = f"{root}, backbone {arguments.backbone}, {arguments.targets} target views"
+    title = f"{root}, backbone {summary['backbone']}, {arguments.targets} target views"
     console.print(title, soft_wrap=True, highlight=False)
     tables = paper_tables(summary)
     for table in [all_rows(summary), *(tables if len(summary["methods"]) > 3 else [])]:
@@ -106,8 +107,8 @@ def _plan(arguments: argparse.Namespace, root: Path) -> None:
     from zsp_lite.benchmark.run import plan_run
 
     made = plan_run(
-        root, arguments.backbone, arguments.methods, arguments.pairs, arguments.targets, arguments.seed, arguments.out,
-        arguments.categories,
+        root, _backbone(arguments), arguments.methods, arguments.pairs, arguments.targets, arguments.seed,
+        arguments.out, arguments.categories,
     )  # fmt: skip
     for line in made.lines(arguments.workers):
         print(line)

@@ -49,19 +49,25 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
-    return Backbone(fresh, f"random like {like.name}", like.key_block, like.saliency_heads, like.device)
+    same = dict(facet=like.facet, image_size=like.image_size, mean=like.mean, std=like.std)
+    return Backbone(fresh, f"random like {like.name}", like.key_block, like.saliency_heads, like.device, **same)
 
 
 def fingerprint(extractor: Any) -> str:
-    """An extractor's name and a hash of its weights: retrained weights of the same name are another extractor."""
+    """An extractor's name and a hash of its weights and of what it does with them.
+
+    Retrained weights of the same name are another extractor, and so are another block or facet, another size of the
+    input and another mean or standard deviation to normalise it by.
+    """
     name = getattr(extractor, "name", type(extractor).__name__)
     if not isinstance(extractor, Backbone):
         weights = extractor.state_dict() if hasattr(extractor, "state_dict") else {}
         return f"{name} {_digest('', weights)}" if weights else name
-    chosen = f"{extractor.key_block} {extractor.saliency_heads} {extractor.precision}"
-    if (facet := getattr(extractor, "facet", "key")) != "key":
-        chosen += f" {facet} {extractor.mean} {extractor.std}"
-    return f"{name} {_digest(chosen, extractor.model.state_dict())}"
+    chosen = (
+        extractor.key_block, extractor.facet, extractor.saliency_heads, extractor.image_size, extractor.mean,
+        extractor.std, extractor.precision,
+    )  # fmt: skip
+    return f"{name} {_digest(repr(chosen), extractor.model.state_dict())}"
 
 
 def _digest(text: str, weights: Mapping[str, torch.Tensor]) -> str:

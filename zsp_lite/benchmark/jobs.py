@@ -13,7 +13,7 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from zsp_lite.backbones import load_backbone
+from zsp_lite.backbones import BackboneChoice, load_backbone
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.extractors import fingerprint, make_extractors
@@ -101,7 +101,7 @@ def run_job(job: Job) -> list[dict]:
 def worker_extractors(job: Job) -> dict[str, Any]:
     """The extractors of a job's rows; loaded once in a process where the backbone goes by its name."""
     names = tuple(dict.fromkeys(method.features for method in job.methods.values()))
-    if not isinstance(job.backbone, str):
+    if not isinstance(job.backbone, str | BackboneChoice):
         return make_extractors(job.backbone, names)
     with _loading:
         if (job.backbone, names) not in _loaded:

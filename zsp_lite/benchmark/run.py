@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.backbones import Backbone, load_backbone
+from zsp_lite.backbones import Backbone, BackboneChoice, load_backbone
 from zsp_lite.benchmark.execution import default_threads, execute, open_crew
 from zsp_lite.benchmark.extractors import Extractor, fingerprint, make_extractors, random_backbone
 from zsp_lite.benchmark.jobs import Job, split
@@ -30,7 +30,7 @@ __all__ = ["GROUPS", "METHODS", "Method", "category_pairs", "evaluate", "random_
 
 def evaluate(
     root: str | Path,
-    backbone: Backbone | Extractor | str,
+    backbone: Backbone | Extractor | str | BackboneChoice,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int = 100,
     targets: int = 5,
@@ -59,7 +59,7 @@ def evaluate(
     rows = resolve(methods)
     row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
     work = work_of_categories(row_pairs)
-    named = isinstance(backbone, str)
+    named = isinstance(backbone, str | BackboneChoice)
     name, backbone = backbone, load_backbone(backbone) if named else backbone
     made: dict[str, Any] = make_extractors(backbone, [row.features for row in rows.values()])
     settings = {
@@ -112,7 +112,7 @@ def evaluate(
 
 def plan_run(
     root: str | Path,
-    backbone: Backbone | Extractor | str,
+    backbone: Backbone | Extractor | str | BackboneChoice,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int = 100,
     targets: int = 5,
@@ -123,7 +123,7 @@ def plan_run(
     """What `evaluate` with these arguments would take from here on; writes nothing. Raises what it would."""
     rows = resolve(methods)
     work = work_of_categories(pairs_of_rows(root, rows, pairs, targets, seed, categories))
-    backbone = load_backbone(backbone) if isinstance(backbone, str) else backbone
+    backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneChoice) else backbone
     extractors = make_extractors(backbone, [row.features for row in rows.values()])
     path = Path(out) / "pairs.jsonl"
     known = {key: record["methods"] for key, record in read_records(path, mend=False).items()}
