@@ -2,6 +2,7 @@
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from zsp_lite import doctor
 from zsp_lite.doctor import BAD, NOTE, OK, Check
@@ -70,3 +71,29 @@ def test_a_folder_that_is_not_there_is_bad_where_it_was_asked_for(tmp_path, monk
     found = {check.name: check for check in doctor.examine()}
     assert found[f"data: {doctor.DATA_VARIABLE}"].state == BAD
     assert all(check.remedy for check in found.values() if check.state != OK)
+
+
+def test_an_extra_is_named_with_what_it_gives_and_how_to_get_it(monkeypatch):
+    versions = {"transformers": "5.0", "huggingface_hub": "1.0", "dask": "2025.1", "distributed": None}
+    monkeypatch.setattr(doctor, "_version", versions.get)
+    found = {check.name: check for check in doctor._extras()}
+    there, missing = found["extra transformers"], found["extra cluster"]
+    assert there.state == OK and "transformers 5.0" in there.found and "hf:NAME" in there.found
+    assert missing.state == NOTE and "distributed not installed" in missing.found and "Dask" in missing.found
+    assert missing.remedy.endswith("install 'zsp-lite[cluster]'")
+
+
+def test_an_extra_that_is_too_old_will_not_do(monkeypatch):
+    monkeypatch.setattr(doctor, "_version", lambda module: "4.0")
+    monkeypatch.setattr(doctor, "_requirements_of_extras", lambda: {"transformers": SpecifierSet(">=4.56")})
+    old = next(doctor._extras())
+    assert old.state == NOTE and "transformers 4.0, expected >=4.56" in old.found and old.remedy
+
+
+def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
+    import tomllib
+
+    project = tomllib.loads((doctor.REPOSITORY / "pyproject.toml").read_text())["project"]
+    for extra, (modules, _) in doctor.EXTRAS.items():
+        names = {Requirement(one).name for one in project["optional-dependencies"][extra]}
+        assert names == {module.replace("_", "-") for module in modules}

@@ -10,12 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from packaging.requirements import InvalidRequirement, Requirement
+from packaging.specifiers import SpecifierSet
 
 from zsp_lite.errors import InputError
 
 DATA_VARIABLE = "ZSP_LITE_DATA"  # one's own CO3D folder
 REPOSITORY = Path(__file__).resolve().parent.parent
 OK, NOTE, BAD = "ok", "note", "bad"
+# What works without: extra to the modules that it stands for and what they give.
+EXTRAS = {
+    "transformers": (
+        ("transformers", "huggingface_hub"),
+        "backbones hf:NAME, vision transformers in Hugging Face's format (DINOv2, DINOv3, CLIP, ...)",
+    ),
+    "cluster": (("dask", "distributed"), "the benchmark on a Dask cluster (--executor dask://HOST:PORT)"),
+}
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,7 @@ class Check:
 
 def examine(data: Path | None = None) -> list[Check]:
     """All checks, in the order in which one would mend them. `data`: a CO3D folder besides the usual ones."""
-    return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_data(data), _jupyter()]
+    return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_extras(), *_data(data), _jupyter()]
 
 
 def healthy(checks: list[Check]) -> bool:
@@ -110,11 +119,7 @@ def _packages() -> Iterator[Check]:
     for requirement in map(Requirement, requirements):
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        try:
-            installed = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
-            installed = None
-        yield compare(requirement, installed, pins.get(requirement.name.lower()))
+        yield compare(requirement, _version(requirement.name), pins.get(requirement.name.lower()))
 
 
 def _torch() -> Iterator[Check]:
@@ -128,11 +133,7 @@ def _torch() -> Iterator[Check]:
             f"{_pip()} install --force-reinstall torch",
         )
         return
-    cuda = (
-        f", CUDA on {torch.cuda.get_device_name(0)}"
-        if torch.cuda.is_available()
-        else ", no CUDA (not needed)"
-    )
+    cuda = f", CUDA on {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else ", no CUDA (not needed)"
     yield Check("torch runs", OK, f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs{cuda}")
 
 
@@ -152,9 +153,7 @@ def _backbones() -> Iterator[Check]:
     try:
         from zsp_lite.backbones import available_backbones
     except (ImportError, OSError) as error:
-        yield Check(
-            "backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first"
-        )
+        yield Check("backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
         return
     for name, path in available_backbones().items():
         if path is not None:
@@ -170,6 +169,51 @@ def _backbones() -> Iterator[Check]:
             yield Check(f"backbone {name}", NOTE, "not downloaded", f"zsp-lite weights fetch {name}")
 
 
+def _extras() -> Iterator[Check]:
+    """Whether each optional extra is there, in a version that will do, and what it gives."""
+    requirements = _requirements_of_extras()
+    for extra, (modules, gives) in EXTRAS.items():
+        remedy = f"{_pip()} install 'zsp-lite[{extra}]'"
+        installed = {module: _version(module) for module in modules}
+        missing = [module for module, version in installed.items() if version is None]
+        old = [
+            f"{module} {version}, expected {requirements[module]}"
+            for module, version in installed.items()
+            if version and not requirements.get(module, SpecifierSet()).contains(version, prereleases=True)
+        ]
+        if missing:
+            found = f"{', '.join(missing)} not installed (only for {gives})"
+            yield Check(f"extra {extra}", NOTE, found, remedy)
+        elif old:
+            yield Check(f"extra {extra}", NOTE, f"{'; '.join(old)} (only for {gives})", remedy)
+        else:
+            there = ", ".join(f"{module} {version}" for module, version in installed.items())
+            yield Check(f"extra {extra}", OK, f"{there}: {gives}")
+
+
+def _version(module: str) -> str | None:
+    """The installed version of a module's distribution, None where it is not there."""
+    try:
+        return importlib.metadata.version(module)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _requirements_of_extras() -> dict[str, SpecifierSet]:
+    """Module to the versions that this package's extras ask for; empty where the package is not installed."""
+    try:
+        requirements = map(Requirement, importlib.metadata.requires("zsp-lite") or [])
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    own = [requirement for requirement in requirements if requirement.marker is not None]
+    return {
+        requirement.name.replace("-", "_"): requirement.specifier
+        for requirement in own
+        if any(requirement.marker.evaluate({"extra": extra}) for extra in EXTRAS)
+        and not requirement.marker.evaluate({"extra": ""})
+    }
+
+
 def _data(data: Path | None) -> Iterator[Check]:
     try:
         from zsp_lite.co3d import Co3D
@@ -178,11 +222,7 @@ def _data(data: Path | None) -> Iterator[Check]:
         return
     for name, folder in data_folders(data):
         sample = name == "data_samples"
-        remedy = (
-            "zsp-lite synth --preset samples --out data_samples"
-            if sample
-            else f"point {name} at a CO3D folder"
-        )
+        remedy = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"
         try:
             categories = Co3D(folder).categories()
         except InputError as error:
@@ -200,9 +240,7 @@ def _data(data: Path | None) -> Iterator[Check]:
 
 
 def _jupyter() -> Check:
-    missing = [
-        name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None
-    ]
+    missing = [name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None]
     if missing:
         remedy = f"{_pip()} install {' '.join(missing)}"
         return Check("Jupyter", NOTE, f"{', '.join(missing)} not installed (only for the notebooks)", remedy)
