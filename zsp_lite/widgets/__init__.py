@@ -4,4 +4,11 @@
 so that this module needs no ipywidgets. `python -m zsp_lite.widgets` measures how fast each of them answers.
 """
 
-WIDGETS: dict[str, str] = {}
+WIDGETS: dict[str, str] = {
+    "best_view": "views:example_best_view",
+    "ransac_settings": "alignment:example_ransac_settings",
+    "one_outlier": "alignment:example_one_outlier",
+    "measured_accuracy": "metrics:example_measured_accuracy",
+    "symmetry_turn": "metrics:example_symmetry_turn",
+    "ranked hypotheses": "verified:example_ranked_hypotheses",
+}

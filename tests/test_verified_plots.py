@@ -1,0 +1,119 @@
+"""Pictures of the evidence: points lie where they project, their marks say what the terms say."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from zsp_lite import plots, verified_plots
+from zsp_lite.errors import InputError
+from zsp_lite.verified.confidence import reliability
+from zsp_lite.verified.maps import Seen, ViewMaps
+from zsp_lite.verified.verification import FULL, TERMS, TOUCH, Evidence, Weights
+
+IMAGE = np.zeros((60, 80, 3), np.uint8)
+# One view; points: on the surface, far behind it, far before it, outside the silhouette, over a hole in the depth.
+BEHIND = torch.tensor([0.0, 1.0, -1.0, 0.0, 0.0])
+WEIGHT = torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0])
+OFF = torch.tensor([0.0, 0.0, 0.0, 0.4, 0.0])
+PIXELS = torch.tensor([[10.0, 5.0], [20, 5], [30, 5], [55, 5], [20, 20]])
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture
+def maps():
+    """Maps of half the image's size: what they call pixel 10 is pixel 20 of the image."""
+    return ViewMaps(
+        torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1), torch.zeros(1, 2), torch.tensor([[40.0, 30.0]]),
+        torch.zeros(1, dtype=torch.long), torch.zeros(1200, 4), torch.tensor([[2.0, 2.0]]),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def evidence():
+    touch = WEIGHT * torch.exp(-(BEHIND**2) / (2 * TOUCH**2))
+    front = WEIGHT * (-(BEHIND + TOUCH) / FULL).clamp(0, 1)
+    seen = Seen(*(x[None, None] for x in (3 + BEHIND, torch.full((5,), 3.0), WEIGHT, OFF, torch.arange(5), PIXELS)))
+    parts = (touch, OFF / FULL, front, torch.linspace(-0.2, 0.2, 5))
+    return Evidence(seen, *(part[None, None] for part in parts))
+
+
+def test_each_kind_of_point_is_told_from_the_others(evidence):
+    assert verified_plots.point_kinds(evidence).tolist() == [[0, 1, 2, 3, 4]]
+    assert list(verified_plots.KINDS)[2] == "floating before it"
+
+
+def test_points_are_drawn_where_they_project_in_the_image_itself(evidence, maps):
+    figure, axes = plots.show_images([IMAGE])
+    counts = verified_plots.draw_kinds(axes, evidence, maps)
+    assert counts.tolist() == [[1, 1, 1, 1, 1]]
+    drawn = np.concatenate([collection.get_offsets() for collection in axes[0].collections])
+    # Twice the map's pixels; the one beyond the border (110) stands at it (80).
+    np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
+    assert len({marker for _, marker in verified_plots.KINDS.values()}) == len(verified_plots.KINDS)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(verified_plots.KINDS)
+
+
+@pytest.mark.parametrize("term", ["off", "front", "touch", "alike"])
+def test_a_terms_values_are_the_colours(evidence, maps, term):
+    _, axes = plots.show_images([IMAGE])
+    verified_plots.draw_term(axes, evidence, maps, term)
+    drawn = axes[0].collections[0].get_array()
+    np.testing.assert_allclose(sorted(drawn), sorted(getattr(evidence, term)[0, 0].tolist()), atol=1e-6)
+
+
+def test_the_worst_offence_is_the_largest_point(evidence, maps):
+    _, axes = plots.show_images([IMAGE])
+    verified_plots.draw_term(axes, evidence, maps, "front")
+    drawn = axes[0].collections[0]
+    np.testing.assert_allclose(drawn.get_offsets()[np.argmax(drawn.get_sizes())], [60, 10])
+
+
+def test_unknown_terms_and_too_few_axes_are_refused(evidence, maps):
+    _, axes = plots.show_images([IMAGE] * 2)
+    with pytest.raises(InputError, match="expected one of off, front"):
+        verified_plots.draw_term(axes[:1], evidence, maps, "colour")
+    for draw in (lambda: verified_plots.draw_kinds(axes, evidence, maps),
+                 lambda: verified_plots.draw_term(axes, evidence, maps, "off")):  # fmt: skip
+        with pytest.raises(InputError, match="2 axes, expected one for each of the 1 views"):
+            draw()
+
+
+def test_contributions_add_up_to_the_score():
+    rng = np.random.default_rng(0)
+    terms, weights = dict(zip(TERMS, rng.random(len(TERMS)))), Weights(*rng.normal(size=len(TERMS)))
+    parts = verified_plots.contributions(terms, weights)
+    assert sum(parts.values()) == pytest.approx(sum(getattr(weights, name) * terms[name] for name in TERMS))
+    _, axis = plt.subplots()
+    verified_plots.draw_contributions(axis, {"first": terms, "second": dict.fromkeys(TERMS, 0.0)}, weights)
+    bars, flat = axis.containers
+    np.testing.assert_allclose([bar.get_width() for bar in bars], list(parts.values()))
+    assert all(bar.get_width() == 0 for bar in flat)
+    assert {bar.get_hatch() for bar in bars} != {bar.get_hatch() for bar in flat}
+
+
+def test_a_term_without_weight_has_no_bar_and_five_hypotheses_are_too_many():
+    terms = dict.fromkeys(TERMS, 1.0)
+    weights = Weights(**(dict.fromkeys(TERMS, 0.0) | {"f_sim": 2.0}))
+    _, axis = plt.subplots()
+    verified_plots.draw_contributions(axis, {"one": terms}, weights)
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["f_sim"]
+    with pytest.raises(InputError, match="5 hypotheses to draw, expected 1 to 4"):
+        verified_plots.draw_contributions(axis, {str(i): terms for i in range(5)}, weights)
+
+
+def test_reliability_points_lie_at_confidence_and_frequency():
+    confidence = np.repeat([0.2, 0.9], 10)
+    right = np.tile(np.arange(10) < 3, 2)
+    _, axis = plt.subplots()
+    verified_plots.draw_reliability(axis, reliability(confidence, right, bins=2))
+    points = axis.containers[0][0].get_xydata()
+    np.testing.assert_allclose(points, [[0.2, 0.3], [0.9, 0.3]])
+    # Wilson's interval for 3 of 10, from a table: 10.8 % to 60.3 %.
+    low, high = axis.containers[0][2][0].get_segments()[0][:, 1]
+    assert (low, high) == pytest.approx((0.108, 0.603), abs=1e-3)
