@@ -76,16 +76,20 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     """
     labels = {}
     for path in sorted(label_folder(root, category).glob("*.json")):
-        label = decode(read_bytes(path, "label"), _LabelFile, path)
+        label = parse_label(read_bytes(path, "label"), str(path))
         if label.seq != path.stem:
-            raise InputError(
-                f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as its name says"
-            )
-        try:
-            labels[label.seq] = PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise InputError(f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as its name says")
+        labels[label.seq] = label
     return labels
+
+
+def parse_label(data: bytes, where: str) -> PoseLabel:
+    """A label file's content. Raises InputError, naming `where` it came from, on what `read_labels` refuses."""
+    label = decode(data, _LabelFile, where)
+    try:
+        return PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:

@@ -111,37 +111,45 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     Nothing in the file is executed. Raises InputError on a file that holds more than plain data, has another
     form, or does not fit the data set.
     """
-    data = read_bytes(path, "evaluation pairs")
-    try:
-        items = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever its unpickler stumbles over
-        raise InputError(f"evaluation pairs {path} are not a torch file of plain data") from error
-    if not isinstance(items, list):
-        raise InputError(f"evaluation pairs {path} hold a {type(items).__name__}, expected a list of dicts")
+    where = f"evaluation pairs {path}"
     pairs = []
-    for number, item in enumerate(items):
-        where = f"evaluation pairs {path}, pair {number}"
-        missing = [name for name in _FIELDS if not isinstance(item, dict) or name not in item]
-        if missing:
-            raise InputError(
-                f"{where}: missing {', '.join(missing)}, expected a dict of {', '.join(_FIELDS)}"
-            )
+    for number, item in enumerate(check_upstream_pairs(read_bytes(path, "evaluation pairs"), where)):
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)
-        target_ids = target_ids.tolist() if isinstance(target_ids, torch.Tensor) else target_ids
-        if not isinstance(target_ids, (list, tuple)) or not target_ids:
-            raise InputError(
-                f"{where}: all_target_id is {target_ids!r}, expected positions in the frame list"
-            )
+        place = f"{where}, pair {number}"
         pairs.append(
             Pair(
                 category,
                 reference,
-                _frame_number(dataset, category, reference, reference_id, where),
+                _frame_number(dataset, category, reference, reference_id, place),
                 target,
-                tuple(_frame_number(dataset, category, target, position, where) for position in target_ids),
+                tuple(_frame_number(dataset, category, target, position, place) for position in target_ids),
             )
         )
     return pairs
+
+
+def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
+    """The content of an upstream evaluation file, as it stands there.
+
+    Nothing in it is executed. Raises InputError, naming `where` it came from, on more than plain data and another form.
+    """
+    try:
+        items = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever its unpickler stumbles over
+        raise InputError(f"{where} are not a torch file of plain data") from error
+    if not isinstance(items, list):
+        raise InputError(f"{where} hold a {type(items).__name__}, expected a list of dicts")
+    for number, item in enumerate(items):
+        missing = [name for name in _FIELDS if not isinstance(item, dict) or name not in item]
+        if missing:
+            raise InputError(
+                f"{where}, pair {number}: missing {', '.join(missing)}, expected a dict of {', '.join(_FIELDS)}"
+            )
+        ids = item["all_target_id"]
+        item["all_target_id"] = ids = ids.tolist() if isinstance(ids, torch.Tensor) else ids
+        if not isinstance(ids, (list, tuple)) or not ids:
+            raise InputError(f"{where}, pair {number}: all_target_id is {ids!r}, expected positions in the frame list")
+    return items
 
 
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:

@@ -1,0 +1,86 @@
+"""The check of a data folder: counts what is there, names what is not."""
+
+import numpy as np
+import pytest
+from co3d_folders import edit_json, sequence_data
+
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.data_check import check_folder
+from zsp_lite.errors import InputError
+from zsp_lite.labels import PoseLabel, write_label
+from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_co3d(tmp_path, "chair", [sequence_data("a"), sequence_data("b")])
+    for name in "ab":
+        write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
+    return tmp_path
+
+
+def frame_file(root, part, sequence="a"):
+    return sorted((root / "chair" / sequence / part).iterdir())[0]
+
+
+def test_a_whole_folder_has_no_problems(root):
+    dataset = Co3D(root)
+    write_upstream_pairs(upstream_pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
+    (check,) = check_folder(root, deep=True)
+    assert not check.problems
+    assert (check.category, check.layout, check.sequences, check.frames) == ("chair", "v1", 2, 8)
+    assert (check.complete, check.labelled, check.usable, check.pairs) == (2, 2, 2, 1)
+    files = [path for path in (root / "chair").rglob("*") if path.is_file() and path.suffix != ".jgz"]
+    assert check.size == sum(path.stat().st_size for path in files)
+
+
+def test_v2_is_recognised(tmp_path):
+    write_co3d(tmp_path, "chair", [sequence_data("a")], intrinsics_format="ndc_isotropic")
+    assert check_folder(tmp_path)[0].layout == "v2"
+
+
+@pytest.mark.parametrize("part", ["images", "masks", "depths", "depth_masks"])
+def test_a_missing_and_an_empty_file_are_named(root, part):
+    gone, empty = frame_file(root, part), frame_file(root, part, "b")
+    gone.unlink()
+    empty.write_bytes(b"")
+    (check,) = check_folder(root)
+    assert check.problems == [f"{gone.relative_to(root)} is missing", f"{empty.relative_to(root)} is empty"]
+    assert check.complete == 0 and check.usable == 2, "three whole frames are enough to be evaluated"
+
+
+def test_a_broken_file_is_found_by_a_deep_check_alone(root):
+    for path in (frame_file(root, "images"), root / "chair" / "b" / "pointcloud.ply"):
+        path.write_bytes(path.read_bytes()[:60])
+    assert not check_folder(root)[0].problems
+    problems = check_folder(root, deep=True)[0].problems
+    assert len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
+
+
+def test_a_camera_that_is_none_is_named(root):
+    edit_json(root / "chair" / "frame_annotations.jgz", lambda frames: frames[1]["viewpoint"].update(T=[0, None, 1]))
+    (check,) = check_folder(root)
+    assert len(check.problems) == 1 and "viewpoint" in check.problems[0]
+
+
+def test_labels_of_nothing_and_of_two_references_are_named(root):
+    write_label(root, "chair", PoseLabel(np.eye(4), "z", "q"))
+    (check,) = check_folder(root)
+    assert check.labelled == 3 and check.usable == 2
+    assert any("z.json is of a sequence that the annotations lack" in line for line in check.problems)
+    assert any("references a, q, expected one" in line for line in check.problems)
+
+
+def test_what_is_no_data_folder_is_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no category"):
+        check_folder(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        check_folder(tmp_path / "none")
+
+
+def test_annotations_that_cannot_be_read_are_a_problem_of_their_category(root):
+    write_co3d(root, "stool", [sequence_data("c")])
+    (root / "chair" / "frame_annotations.jgz").write_bytes(b"no gzip")
+    chair, stool = check_folder(root)
+    assert len(chair.problems) == 1 and chair.frames == 0
+    assert not stool.problems and stool.frames == 4

@@ -1,0 +1,215 @@
+"""Upstream's labels brought in, checked before anything is written; labels carried to another reconstruction."""
+
+import functools
+import hashlib
+import http.server
+import json
+import shutil
+import tarfile
+import threading
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from co3d_folders import sequence_data
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.data_labels import align_worlds, bring_labels, carry_labels
+from zsp_lite.errors import InputError
+from zsp_lite.labels import PoseLabel, read_labels, write_label
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pairs import sample_pairs, shipped_pairs, write_upstream_pairs
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "data"
+    write_co3d(folder, "chair", [sequence_data("a"), sequence_data("b")])
+    return folder
+
+
+@pytest.fixture
+def clone(tmp_path, root):
+    """As upstream's repository lies on disk."""
+    folder = tmp_path / "clone"
+    for name in "ab":
+        write_label(folder / "data", "chair", PoseLabel(np.eye(4), name, "a"))
+    shutil.copytree(folder / "data" / "class_labels", root / "class_labels")
+    dataset = Co3D(root)
+    path = folder / "data" / "determ_eval" / "200samples_5tgt" / "chair.pt"
+    write_upstream_pairs(path, sample_pairs(dataset, "chair", 3, 2), dataset)
+    shutil.rmtree(root / "class_labels")
+    (folder / "README.md").write_text("code")
+    return folder
+
+
+def everything(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def packed(clone, kind):
+    path = clone.parent / f"labels.{kind}"
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            for file in sorted(clone.rglob("*")):
+                archive.write(file, f"code-main/{file.relative_to(clone)}")
+    else:
+        with tarfile.open(path, "w:gz") as archive:
+            archive.add(clone, "code-main")
+    return path, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def check_arrived(root):
+    assert list(read_labels(root, "chair")) == ["a", "b"]
+    assert len(shipped_pairs(Co3D(root), "chair", 5)) == 3
+
+
+def test_labels_and_pairs_come_from_a_clone(clone, root):
+    assert bring_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
+    check_arrived(root)
+    assert not (root / "README.md").exists()
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
+def test_and_from_an_archive_with_its_checksum(clone, root, kind):
+    path, digest = packed(clone, kind)
+    with pytest.raises(InputError, match=f"has SHA-256 {digest}, expected 00"):
+        bring_labels(path, root, "00" * 32)
+    assert not (root / "class_labels").exists()
+    bring_labels(path, root, digest.upper())
+    check_arrived(root)
+
+
+def test_and_from_a_url_with_its_checksum(clone, root, monkeypatch, tmp_path):
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    path, digest = packed(clone, "zip")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *args):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=path.parent))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}/{path.name}"
+    try:
+        with pytest.raises(InputError, match="needs its SHA-256"):
+            bring_labels(url, root)
+        with pytest.raises(InputError, match="expected 00"):
+            bring_labels(url, root, "00" * 32)
+        assert not list((tmp_path / "cache").iterdir()), "a wrong file is not kept"
+        bring_labels(url, root, digest)
+    finally:
+        server.shutdown()
+        server.server_close()
+    check_arrived(root)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("data/class_labels/chair/b.json", b"{", "not valid JSON"),
+        ("data/class_labels/chair/b.json", json.dumps({"trans": np.diag([2.0, 2, 2, 1]).tolist(), "seq": "b",
+                                                       "reference_seq": "a"}).encode(), "unit scale"),
+        ("data/class_labels/chair/c.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "b",
+                                                       "reference_seq": "a"}).encode(), "expected that of its name"),
+        ("data/determ_eval/200samples_5tgt/chair.pt", b"pickle", "not a torch file of plain data"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_stops_everything_before_a_file_is_written(clone, root, file, content, message):
+    (clone / file).write_bytes(content)
+    before = everything(root)
+    with pytest.raises(InputError, match=message):
+        bring_labels(clone, root)
+    assert everything(root) == before
+
+
+def test_code_in_pairs_is_not_run(clone, root, tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "ran"), "w"))
+
+    torch.save([Evil()], clone / "data" / "determ_eval" / "200samples_5tgt" / "chair.pt")
+    with pytest.raises(InputError, match="plain data"):
+        bring_labels(clone, root)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_sources_without_labels_are_refused(root, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.zip").write_bytes(b"text")
+    for source, message in (
+        (tmp_path / "empty", "holds no class_labels"),
+        (tmp_path / "none.zip", "cannot be read"),
+        (tmp_path / "text.zip", "of 4 bytes is broken or none, expected .zip or .tar.gz"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bring_labels(source, root)
+    with pytest.raises(InputError, match="is not there"):
+        bring_labels(tmp_path / "empty", tmp_path / "nowhere")
+
+
+def moved(sequence, world: Sim3, noise: float = 0.0):
+    """The same sequence in another world."""
+    rng, frames = np.random.default_rng(0), []
+    for frame in sequence.frames:
+        rotation = frame.camera.R @ world.R.T
+        centre = world.apply(frame.camera.centre) + noise * rng.normal(size=3)
+        frames.append(replace(frame, camera=replace(frame.camera, R=rotation, t=-rotation @ centre)))
+    return replace(sequence, frames=frames, points=world.apply(sequence.points))
+
+
+def two_layouts(tmp_path, noise=0.0):
+    """A v1 folder with labels, and v2 with each sequence in a world of its own; the worlds."""
+    sequences = {name: sequence_data(name, frames=6) for name in "ab"}
+    worlds = {
+        name: Sim3(0.5 + seed, Rotation.random(random_state=seed).as_matrix(), np.full(3, float(seed)))
+        for seed, name in enumerate("ab", 1)
+    }
+    write_co3d(tmp_path / "v1", "chair", sequences.values())
+    made = [moved(sequences[name], worlds[name], noise) for name in "ab"]
+    write_co3d(tmp_path / "v2", "chair", made, intrinsics_format="ndc_isotropic")
+    trans = np.eye(4)
+    trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
+    write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
+    write_label(tmp_path / "v1", "chair", PoseLabel(trans, "b", "a"))
+    return worlds, trans
+
+
+def test_labels_are_carried_to_another_reconstruction(tmp_path):
+    worlds, trans = two_layouts(tmp_path)
+    residuals = carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+    assert max(residuals.values()) < 1e-6
+    labels = read_labels(tmp_path / "v2", "chair")
+    np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
+    expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
+    assert rotation_error(labels["b"].trans[:3, :3], expected) < 1e-4
+    # The reference cloud's centre comes to lie where it lay on the other object.
+    centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
+    landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
+    np.testing.assert_allclose(
+        landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-4
+    )
+
+
+def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
+    two_layouts(tmp_path, noise=0.5)
+    old, new = Co3D(tmp_path / "v1"), Co3D(tmp_path / "v2")
+    residual = align_worlds(old, new, "chair", "a")[1]
+    assert 0.02 < residual < 0.5
+    with pytest.raises(InputError, match="camera centres differ by .* nothing was written"):
+        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=0.01)
+    assert read_labels(tmp_path / "v2", "chair") == {}
+    assert carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=1.0)["a"] == residual
+
+
+def test_what_cannot_be_carried_is_refused(tmp_path):
+    two_layouts(tmp_path)
+    with pytest.raises(InputError, match="has no labels of category stool"):
+        carry_labels(tmp_path / "v1", tmp_path / "v2", "stool")
+    write_co3d(tmp_path / "v2b", "chair", [sequence_data("a")])
+    with pytest.raises(InputError, match="no frames of a sequence 'b'"):
+        carry_labels(tmp_path / "v1", tmp_path / "v2b", "chair", max_residual=10)

@@ -1,0 +1,233 @@
+"""Labels from picks: what is known comes back, nothing is lost, and bad picks are refused in one line."""
+
+import json
+
+import numpy as np
+import pytest
+from co3d_folders import seeds, sequence_data
+from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.errors import InputError
+from zsp_lite.labelling import Labelling, align_picks, rigid_label
+from zsp_lite.labelling.candidates import contact_sheet
+from zsp_lite.labelling.desktop import label_category
+from zsp_lite.labels import PoseLabel, read_labels, write_label
+from zsp_lite.metrics import rotation_error
+from zsp_lite.synthetic.export import POSES_FILE, export_categories
+
+# Where a person would click on a chair: corners of the seat, ends of the back and of legs, in canonical coordinates.
+KEYPOINTS = np.array(
+    [(0.4, 0, 0.4), (-0.4, 0, 0.4), (0.4, 0, -0.4), (-0.4, 0.8, -0.4), (0.4, 0.8, -0.4), (0.4, -0.7, 0.4)]
+)
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    """Three chairs, and their keypoints in each one's world."""
+    root = tmp_path_factory.mktemp("synthetic")
+    export_categories(["chair"], root, 3, 3, 11, image_size=64)
+    poses = json.loads((root / "chair" / POSES_FILE).read_text())
+    picks = {}
+    for name, pose in poses.items():
+        trans = np.array(pose["trans"])
+        picks[name] = pose["scale"] * KEYPOINTS @ trans[:3, :3].T + trans[:3, 3]
+    return root, picks
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_co3d(tmp_path, "chair", [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")])
+    return tmp_path
+
+
+def pick_all(labelling, sequence, points):
+    for point in points:
+        labelling.pick(sequence, point)
+
+
+def corners(sequence="best"):
+    return np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0.5)]) + len(sequence)
+
+
+def test_picks_at_known_points_give_the_known_label(synthetic):
+    root, picks = synthetic
+    known = read_labels(root, "chair")
+    reference = next(iter(known.values())).reference_seq
+    for name, label in known.items():
+        made = rigid_label(align_picks(picks[reference], picks[name]).sim3, np.zeros(3), name, reference)
+        assert rotation_error(made.trans[:3, :3], label.trans[:3, :3]) < 1
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_picks_with_noise_give_it_to_five_degrees(synthetic, seed):
+    root, picks = synthetic
+    known, rng = read_labels(root, "chair"), np.random.default_rng(seed)
+    reference, name = list(known)[0], list(known)[1]
+    size = np.ptp(picks[name], axis=0).max()
+    noisy = [
+        points + rng.normal(0, 0.03 * size / np.sqrt(3), points.shape) for points in (picks[reference], picks[name])
+    ]
+    alignment = align_picks(*noisy)
+    wanted = known[name].trans[:3, :3] @ known[reference].trans[:3, :3].T
+    assert rotation_error(alignment.sim3.R, wanted) < 5
+    assert 0 < alignment.rms < 0.2
+
+
+def test_residuals_are_shares_of_the_keypoints_spread():
+    moved = Sim3(7.0, Rotation.random(random_state=1).as_matrix(), np.ones(3))
+    points = corners().astype(float)
+    target = moved.apply(points)
+    assert align_picks(points, target).residuals == pytest.approx(np.zeros(5), abs=1e-12)
+    target[4] += 7 * np.array([0.3, 0, 0])
+    small, large = (align_picks(points, scale * target).residuals for scale in (1, 100))
+    np.testing.assert_allclose(small, large)
+    assert small.argmax() == 4
+
+
+def test_a_label_is_rigid_and_lays_centre_on_centre():
+    sim3 = Sim3(1.4, Rotation.random(random_state=3).as_matrix(), np.array([0.3, 2, 1]))
+    centre = np.array([5.0, -2, 4])
+    trans = rigid_label(sim3, centre, "a", "b").trans
+    np.testing.assert_allclose(trans[:3, :3] @ centre + trans[:3, 3], sim3.apply(centre))
+    np.testing.assert_allclose(trans[:3, :3], sim3.R)
+
+
+@pytest.mark.parametrize(
+    ("reference", "picks", "message"),
+    [
+        (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
+        (corners(), corners()[:4], "4 keypoints picked and 5"),
+        (corners(), corners()[[0, 1, 2, 3, 3]], "keypoints leg and number 5 of the sequence are one point"),
+        (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
+        (corners()[:4] * np.nan, corners()[:4], "reference are not finite"),
+    ],
+)
+def test_bad_picks_are_refused_in_one_line(reference, picks, message):
+    with pytest.raises(InputError, match=message) as caught:
+        align_picks(reference, picks, ["a", "b", "c", "leg"])
+    assert "\n" not in str(caught.value)
+
+
+def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
+    labelling = Labelling(root, "chair")
+    assert labelling.reference == "best" == labelling.sequences[0]
+    pick_all(labelling, "best", corners())
+    labelling.rename(1, "left arm")
+    pick_all(labelling, "a", corners()[:2])
+    again = Labelling(root, "chair")
+    assert again.names == ("keypoint 1", "left arm", "keypoint 3", "keypoint 4", "keypoint 5")
+    np.testing.assert_array_equal(again.picks("a"), corners()[:2])
+    assert [(row.sequence, row.state, row.picks) for row in again.progress()] == [
+        ("best", "reference", 5), ("a", "open", 2), ("b", "open", 0),
+    ]  # fmt: skip
+
+
+def test_accepting_writes_the_upstream_form_and_the_references_identity(root):
+    labelling = Labelling(root, "chair")
+    pick_all(labelling, "best", corners())
+    turn = Rotation.random(random_state=5).as_matrix()
+    pick_all(labelling, "a", 1.3 * corners() @ turn.T + 2)
+    assert labelling.alignment("b") is None
+    path = labelling.accept("a")
+    assert json.loads(path.read_text()).keys() == {"trans", "seq", "reference_seq"}
+    labels = read_labels(root, "chair")
+    np.testing.assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
+    np.testing.assert_array_equal(labels["best"].trans, np.eye(4))
+    states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
+    assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9)) and states["b"] == ("open", None)
+
+
+def test_undo_skip_clear_and_move(root):
+    labelling = Labelling(root, "chair")
+    pick_all(labelling, "best", corners())
+    pick_all(labelling, "a", corners())
+    with pytest.raises(InputError, match="all 5 keypoints are picked"):
+        labelling.pick("a", (0, 0, 0))
+    labelling.undo("a")
+    assert len(labelling.picks("a")) == 4
+    labelling.move("a", 0, (9, 9, 9))
+    np.testing.assert_array_equal(labelling.picks("a")[0], (9, 9, 9))
+    with pytest.raises(InputError, match="keypoints of the reference best are in use on a; clear those first"):
+        labelling.undo("best")
+    labelling.clear("a")
+    labelling.undo("a")
+    labelling.undo("best")
+    assert len(labelling.names) == 4
+    labelling.skip("b")
+    assert Labelling(root, "chair").progress()[-1].state == "skipped"
+    labelling.pick("b", (0, 0, 0))
+    assert labelling.progress()[-1].state == "open"
+
+
+def test_a_guess_puts_the_picks_on_the_cloud(root):
+    labelling = Labelling(root, "chair")
+    with pytest.raises(InputError, match="needs 4 keypoints on the reference first"):
+        labelling.guess("a", Sim3.identity())
+    cloud = labelling.cloud("a")[0]
+    pick_all(labelling, "best", cloud[:5] + 1e-4)
+    labelling.guess("a", Sim3.identity())
+    np.testing.assert_array_equal(labelling.picks("a"), cloud[:5])
+
+
+def test_what_cannot_be_labelled_is_refused(root):
+    labelling = Labelling(root, "chair")
+    pick_all(labelling, "best", corners())
+    pick_all(labelling, "a", corners()[:3])
+    for call, message in (
+        (lambda: labelling.accept("a"), "3 of 5 keypoints picked"),
+        (lambda: labelling.accept("best"), "is the reference"),
+        (lambda: labelling.pick("none", (0, 0, 0)), "sequence is 'none', expected one of best, a, b"),
+        (lambda: labelling.pick("a", (0, np.nan, 0)), "expected a finite point"),
+        (lambda: labelling.rename(9, "x"), "expected 0 to 4"),
+        (lambda: Labelling(root, "chair", reference="a"), "expected one reference sequence"),
+        (lambda: Labelling(root, "chair", ["c"]), "has no point cloud"),
+        (lambda: Labelling(root, "stool"), "category 'stool' is not in"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
+    assert read_labels(root, "chair") == {}
+
+
+def test_labels_that_are_there_decide_the_reference(root):
+    write_label(root, "chair", PoseLabel(np.eye(4), "b", "b"))
+    assert Labelling(root, "chair").reference == "b"
+
+
+def test_broken_picks_are_named(root):
+    labelling = Labelling(root, "chair")
+    labelling.pick("best", (0, 0, 0))
+    labelling.path.write_text("{")
+    with pytest.raises(InputError, match="label_picks/chair.json"):
+        Labelling(root, "chair")
+
+
+def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
+    labelling = Labelling(root, "chair")
+    target = {"a": labelling.cloud("a")[0], "b": labelling.cloud("b")[0], "best": labelling.cloud("best")[0]}
+    picked, shown, said = [], [], []
+
+    def pick(cloud, title):
+        picked.append(title.split(":")[0])
+        assert any(cloud[0] is points for points in target.values())
+        return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
+
+    answers = iter(["seat", "", "back", "arm", "a", "r", "a", "q"])
+    label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x[2]))
+    assert labelling.names == ("seat", "keypoint 2", "back", "arm")
+    assert picked == ["best", "a", "a", "a", "b"] and len(shown) == 3
+    assert list(read_labels(root, "chair")) == ["a", "best"]
+    assert "0 picked, 4 expected." in said
+    assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
+
+
+def test_the_contact_sheet_has_a_row_for_every_candidate(root):
+    dataset = Co3D(root)
+    figure = contact_sheet(dataset, "chair", dataset.select("chair"), views=3)
+    assert len(figure.axes) == 9
+    assert figure.axes[0].get_ylabel() == "best\ncloud 3.00\nviews 2.00"
+    with pytest.raises(InputError, match="no candidate sequences"):
+        contact_sheet(dataset, "chair", [])

@@ -1,0 +1,148 @@
+"""What a CO3D folder holds, what is missing or broken in it, how much of it can be evaluated, and the disk it takes."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from zsp_lite.annotations import SEQUENCES_FILE, FrameAnnotation
+from zsp_lite.cameras import NDC_ISOTROPIC
+from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.files import path_inside
+from zsp_lite.labels import label_folder, read_labels
+from zsp_lite.pairs import read_upstream_pairs
+
+_FEWEST_FRAMES = 2  # a reference and something to choose a view from
+
+
+@dataclass
+class CategoryCheck:
+    """What a category holds.
+
+    layout: "v1", "v2" or "mixed".  sequences, frames: annotated.  complete: sequences whose every annotated file is
+    there and can be read as far as asked.  labelled: sequences with a label; usable: those of them that are complete
+    enough to be evaluated: at least two frames with image, mask, depth and camera.  pairs: files of evaluation pairs
+    that fit the data.  size: bytes of all annotated files.  problems: one line each.
+    """
+
+    category: str
+    layout: str = "v1"
+    sequences: int = 0
+    frames: int = 0
+    complete: int = 0
+    labelled: int = 0
+    usable: int = 0
+    pairs: int = 0
+    size: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def check_folder(
+    root: str | Path, deep: bool = False, progress: Callable[[Iterable], Iterable] | None = None
+) -> list[CategoryCheck]:
+    """Every category of a data folder, by name.
+
+    deep: also decode every image, mask, depth map and point cloud (an hour per hundred thousand frames); otherwise
+    look only whether the files are there and not empty. Raises InputError where `root` is not a folder or holds no
+    category; everything else that is wrong is a line in `problems`.
+    """
+    dataset = Co3D(root)
+    categories = dataset.categories()
+    if not categories:
+        raise InputError(f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz")
+    return [_check_category(dataset, category, deep) for category in (progress or iter)(categories)]
+
+
+def _check_category(dataset: Co3D, category: str, deep: bool) -> CategoryCheck:
+    check = CategoryCheck(category)
+    try:
+        sequences = {one.sequence_name: one for one in dataset.sequences(category)}
+        keys = dataset.frame_list(category)
+    except InputError as error:
+        check.problems.append(str(error))
+        return check
+    names = list(dict.fromkeys(key.sequence_name for key in keys))
+    check.sequences, check.frames = len(names), len(keys)
+    for name in sorted(set(sequences) - set(names)):
+        check.problems.append(f"sequence {name} has no frames in the annotations")
+    layouts, usable = set(), set()
+    for name in names:
+        problems, good = [], 0
+        try:
+            annotations = dataset.frames(category, name)
+        except InputError as error:
+            check.problems.append(str(error))
+            continue
+        for annotation in annotations:
+            wrong = _wrong_with_frame(dataset, annotation, deep, check)
+            whole = None not in (annotation.viewpoint, annotation.depth, annotation.mask)
+            good += whole and not wrong
+            problems += wrong
+            if annotation.viewpoint is not None:
+                layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
+        if name not in sequences:
+            problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
+        elif (cloud := sequences[name].point_cloud) is not None:
+            wrong = _wrong_with_file(dataset, cloud.path, check)
+            if not wrong and deep:
+                wrong = _tried(lambda: dataset.point_cloud(category, name))
+            problems += wrong
+        check.complete += not problems
+        check.problems += problems
+        if good >= _FEWEST_FRAMES:
+            usable.add(name)
+    check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
+    _check_labels(dataset, check, set(names), usable)
+    return check
+
+
+def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usable: set[str]) -> None:
+    try:
+        labels = read_labels(dataset.root, check.category)
+    except InputError as error:
+        check.problems.append(str(error))
+        labels = {}
+    check.labelled, check.usable = len(labels), len(set(labels) & usable)
+    folder = label_folder(dataset.root, check.category)
+    for name in sorted(set(labels) - annotated):
+        check.problems.append(f"label {folder / name}.json is of a sequence that the annotations lack")
+    references = {label.reference_seq for label in labels.values()}
+    if len(references) > 1:
+        check.problems.append(f"labels in {folder} have references {', '.join(sorted(references))}, expected one")
+    for path in sorted(dataset.root.glob(f"**/determ_eval/*/{check.category}.pt")):
+        try:
+            read_upstream_pairs(path, dataset)
+            check.pairs += 1
+        except InputError as error:
+            check.problems.append(str(error))
+
+
+def _wrong_with_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> list[str]:
+    paths = [annotation.image.path]
+    paths += [annotation.mask.path] if annotation.mask else []
+    if annotation.depth:
+        paths += [path for path in (annotation.depth.path, annotation.depth.mask_path) if path]
+    wrong = [problem for path in paths for problem in _wrong_with_file(dataset, path, check)]
+    if wrong or annotation.viewpoint is None:
+        return wrong
+    return _tried(lambda: dataset.load(annotation) if deep else dataset.camera(annotation))
+
+
+def _wrong_with_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
+    try:
+        path = path_inside(dataset.root, relative)
+        size = path.stat().st_size
+    except InputError as error:
+        return [str(error)]
+    except OSError:
+        return [f"{relative} is missing"]
+    check.size += size
+    return [] if size else [f"{relative} is empty"]
+
+
+def _tried(read: Callable[[], object]) -> list[str]:
+    try:
+        read()
+    except InputError as error:
+        return [str(error)]
+    return []

@@ -1,0 +1,42 @@
+"""Which sequences are worth labelling: their scores, and a contact sheet to look at before one begins."""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from zsp_lite.annotations import SequenceAnnotation
+from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.frames import crop_to_object, resize_frame
+
+_SIDE = 128  # pixels of a thumbnail
+
+
+def contact_sheet(dataset: Co3D, category: str, sequences: Sequence[SequenceAnnotation], views: int = 4) -> Figure:
+    """One row per candidate, best cloud first as given: `views` frames around the object, and the quality scores.
+
+    Raises InputError for no sequences and as `Co3D.load`.
+    """
+    if not sequences:
+        raise InputError(f"category {category} has no candidate sequences, expected at least one")
+    figure, axes = plt.subplots(
+        len(sequences), views, figsize=(1.5 * views + 2.4, 1.5 * len(sequences)), squeeze=False, layout="constrained"
+    )
+    for row, sequence in zip(axes, sequences):
+        frames = dataset.frames(category, sequence.sequence_name)
+        chosen = np.linspace(0, len(frames), views, endpoint=False).astype(int)
+        for axis, index in zip(row, chosen):
+            frame = dataset.load(frames[index])
+            crop = crop_to_object(frame) if frame.mask is not None and frame.mask.any() else frame
+            axis.imshow(resize_frame(crop, (_SIDE, _SIDE)).rgb)
+            axis.set(xticks=[], yticks=[])
+        row[0].set_ylabel(_scores(sequence), rotation=0, ha="right", va="center", fontsize=8)
+    return figure
+
+
+def _scores(sequence: SequenceAnnotation) -> str:
+    cloud = None if sequence.point_cloud is None else sequence.point_cloud.quality_score
+    numbers = ["–" if score is None else f"{score:.2f}" for score in (cloud, sequence.viewpoint_quality_score)]
+    return f"{sequence.sequence_name}\ncloud {numbers[0]}\nviews {numbers[1]}"
