@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from zsp_lite.baselines.rootsift import RootSift
+from zsp_lite.baselines.rootsift import RootSift, dense_sift
 from zsp_lite.errors import InputError
 from zsp_lite.matching import match
 
@@ -45,3 +45,13 @@ def test_a_shifted_picture_matches_at_the_shift(picture):
 def test_bad_images_are_refused():
     with pytest.raises(InputError, match="image 1"):
         RootSift()([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.uint8)])
+
+
+def test_all_descriptors_at_once_are_those_that_opencv_makes_one_by_one():
+    rng = np.random.default_rng(0)
+    grey = cv2.resize(rng.integers(0, 256, (28, 28)).astype(np.uint8), (224, 224), interpolation=cv2.INTER_CUBIC)
+    for size, centres in ((24.0, np.arange(3.5, 224, 32)), (7.0, np.array([0.5, 100.3, 223.0]))):
+        keypoints = [cv2.KeyPoint(float(x), float(y), size, 0.0) for y in centres for x in centres]
+        _, expected = cv2.SIFT_create().compute(grey, keypoints)
+        found = dense_sift(grey, centres, size).reshape(expected.shape)
+        assert np.abs(found - expected).max() <= 1 and (found != expected).mean() < 1e-3
