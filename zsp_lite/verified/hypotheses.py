@@ -15,18 +15,19 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.verified.confidence import MODES_APART, Calibration, margins
-from zsp_lite.verified.poses import Poses, angles, suppress
+from zsp_lite.verified.poses import Poses, angles, join, suppress
 from zsp_lite.verified.proposals import propose
-from zsp_lite.verified.refinement import COARSE, FINE, refine
+from zsp_lite.verified.refinement import COARSE, FINE, POLISH, refine
 from zsp_lite.verified.scene import Scene, make_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import Weights, verify
+from zsp_lite.verified.verification import Terms, Weights, verify
 from zsp_lite.views import View
 
 # Hypotheses that go on after each stage, best first, and how far apart they are (degrees).
 _COARSE_KEPT, _COARSE_APART = 12, 20.0
 _FINE_KEPT, _FINE_APART = 6, 15.0
-# Points that the search looks at; the last verification takes all.
+_POLISHED = 3
+# Points that the search looks at; the last one, and the last verification, take all.
 _SEARCH_EVERY = (2, 4)
 # Two answers whose scores are within this many nats explain the views equally well: see `benchmark.tuning`.
 EQUALLY_GOOD = 0.5
@@ -103,12 +104,40 @@ def solve(
     and turns with their world. Target views without depth or foreground are left out, with a flag.
     Raises InputError where the reference or all targets together have too little of both.
     """
-    rng, timings = np.random.default_rng(seed), {}
+    timings: dict[str, float] = {}
     with _timed(timings, "scene"), torch.no_grad():
         order, flags = _usable(targets)
         scene = make_scene(
             reference, [targets[k] for k in order], [similarities[k] for k in order], [matches[k] for k in order]
         )
+    poses, terms = search(scene, seed, settings, timings)
+    with _timed(timings, "ranking"), torch.no_grad():
+        score = settings.weights.score(terms).double().numpy()
+        apart = angles(poses.rotation, poses.rotation).double().numpy()
+        confidence = settings.calibration.confidence(score, margins(score, apart))
+        sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
+        hypotheses = []
+        for i in range(len(poses)):
+            view = int(sight[i].argmin())
+            pose = scene.sim3(poses, i, view)
+            hypotheses.append(Hypothesis(pose, order[view], float(score[i]), terms.of(i), float(confidence[i])))
+    view_angles = np.full(len(targets), np.inf)
+    view_angles[list(order)] = sight[0]
+    flags += _doubts(hypotheses, poses)
+    return Solution(tuple(hypotheses), view_angles, flags, timings, scene, order, poses)
+
+
+def search(
+    scene: Scene,
+    seed: int | np.random.Generator = 0,
+    settings: VerifiedSettings = VerifiedSettings(),
+    timings: dict[str, float] | None = None,
+) -> tuple[Poses, Terms]:
+    """The poses that explain a scene best, best first, at least 15 degrees apart, and their terms.
+
+    timings: is given the seconds of each stage.
+    """
+    rng, timings = np.random.default_rng(seed), {} if timings is None else timings
     with _timed(timings, "proposals"), torch.no_grad():
         poses = propose(scene, rng)
     with _timed(timings, "alignment"), torch.no_grad():
@@ -120,48 +149,38 @@ def solve(
     with _timed(timings, "refinement"), torch.no_grad():
         if settings.refinement:
             poses = _refined(scene, poses, settings.weights, rng)
-    with _timed(timings, "ranking"), torch.no_grad():
         terms = verify(scene, poses)
-        score = settings.weights.score(terms)
-        best = suppress(poses.rotation, score, _FINE_APART, _FINE_KEPT)
-        poses, score = poses[best], score[best].double().numpy()
-        apart = angles(poses.rotation, poses.rotation).double().numpy()
-        confidence = settings.calibration.confidence(score, margins(score, apart))
-        sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
-        hypotheses = []
-        for i, index in enumerate(best.tolist()):
-            view = int(sight[i].argmin())
-            one = Hypothesis(
-                scene.sim3(poses, i, view), order[view], float(score[i]), terms.of(index), float(confidence[i])
-            )
-            hypotheses.append(one)
-    view_angles = np.full(len(targets), np.inf)
-    view_angles[list(order)] = sight[0]
-    flags += _doubts(hypotheses, apart)
-    return Solution(tuple(hypotheses), view_angles, flags, timings, scene, order, poses)
+        best = suppress(poses.rotation, settings.weights.score(terms), _FINE_APART, _FINE_KEPT)
+        return poses[best], terms[best]
 
 
 def _refined(scene: Scene, poses: Poses, weights: Weights, rng: np.random.Generator) -> Poses:
-    def score(tried: Poses) -> Float[Tensor, "m"]:
-        return weights.score(verify(scene, tried, _SEARCH_EVERY))
+    def score(tried: Poses, every: tuple[int, int] = _SEARCH_EVERY) -> Float[Tensor, "m"]:
+        return weights.score(verify(scene, tried, every))
 
     poses, reached = refine(poses, score, COARSE, rng)
     poses = poses[suppress(poses.rotation, reached, _FINE_APART, _FINE_KEPT)]
-    return refine(poses, score, FINE, rng)[0]
+    poses, reached = refine(poses, score, FINE, rng)
+    order = suppress(poses.rotation, reached, _FINE_APART, _FINE_KEPT)
+    polished, _ = refine(poses[order[:_POLISHED]], lambda tried: score(tried, (1, 1)), POLISH, rng)
+    return join([polished, poses[order[_POLISHED:]]])
 
 
-def _doubts(hypotheses: Sequence[Hypothesis], apart: Float[np.ndarray, "m m"]) -> tuple[str, ...]:
+def equally_good(score: Float[Tensor, "m"], rotation: Float[Tensor, "m 3 3"]) -> list[int]:
+    """The best hypothesis and all that are as good as it, within EQUALLY_GOOD nats and 30 degrees from one another."""
+    modes = suppress(rotation, score, MODES_APART, len(score))
+    return [int(i) for i in modes if score[modes[0]] - score[i] < EQUALLY_GOOD]
+
+
+def _doubts(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[str, ...]:
     """Why the best hypothesis may not be the answer."""
     best, flags = hypotheses[0], []
-    rivals = [
-        one.score
-        for one, angle in zip(hypotheses, apart[0])
-        if angle > MODES_APART and best.score - one.score < EQUALLY_GOOD
-    ]
-    if rivals:
-        scores = ", ".join(f"{score:.2f}" for score in [best.score, *rivals])
+    alike = equally_good(torch.tensor([one.score for one in hypotheses]), poses.rotation)
+    if len(alike) > 1:
+        scores = ", ".join(f"{hypotheses[i].score:.1f}" for i in alike)
         flags.append(
-            f"{1 + len(rivals)} poses more than 30 degrees apart explain the views equally well (scores {scores})"
+            f"{len(alike)} poses more than 30 degrees apart explain the views equally well (scores {scores}): "
+            "the object may be symmetric"
         )
     if max(best.terms["f_seen"], best.terms["r_seen"]) < _NOTHING_SEEN:
         flags.append("no view confirms the pose: hardly a point falls on a surface that was seen")

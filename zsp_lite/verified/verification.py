@@ -43,6 +43,14 @@ class Terms:
     r_off: Float[Tensor, "m"]
     r_front: Float[Tensor, "m"]
 
+    def __getitem__(self, index) -> "Terms":
+        """The terms of the poses at an index array, slice or mask."""
+        return Terms(*(getattr(self, name)[index] for name in TERMS))
+
+    def table(self) -> Float[Tensor, "m 8"]:
+        """One column per term, in the order of `TERMS`."""
+        return torch.stack([getattr(self, name) for name in TERMS], dim=1)
+
     def of(self, index: int) -> dict[str, float]:
         """The terms of one pose by name."""
         return {name: float(getattr(self, name)[index]) for name in TERMS}
@@ -69,7 +77,7 @@ class Weights:
 
     def score(self, terms: Terms) -> Float[Tensor, "m"]:
         """The weighted sum of the terms, the higher the better."""
-        return torch.stack([getattr(terms, name) for name in TERMS], dim=1) @ torch.tensor(astuple(self))
+        return terms.table() @ torch.tensor(astuple(self))
 
 
 @dataclass(frozen=True, eq=False)

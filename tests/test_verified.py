@@ -1,0 +1,254 @@
+"""The verified solver as a whole, with perfect features: what it finds, what it does not depend on, when it doubts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.cameras import Camera
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.verified import VerifiedSettings
+from zsp_lite.verified.verification import TERMS, Weights
+from zsp_lite.views import look, object_crop
+
+AT_HOME = Sim3.identity()
+ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
+DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
+
+
+def turned(camera: Camera, turn: np.ndarray) -> Camera:
+    """The same camera in a world that was turned about its origin."""
+    return replace(camera, R=camera.R @ turn.T)
+
+
+@pytest.fixture(scope="module")
+def method():
+    return ZeroShotPose(CoordinateBackbone(), solver="verified")
+
+
+@pytest.fixture(scope="module")
+def frames():
+    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS]
+    reference = render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
+    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+
+
+@pytest.fixture(scope="module")
+def views(method, frames):
+    return look(method.backbone, [object_crop(frame) for frame in frames])
+
+
+@pytest.fixture(scope="module")
+def estimate(method, views):
+    return method.estimate_from_features(views[0], views[1:])
+
+
+def error(estimate, frames) -> float:
+    return rotation_error(estimate.sim3.R, truth(estimate, frames).R)
+
+
+def truth(estimate, frames) -> Sim3:
+    return true_pose(frames[0].camera, AT_HOME, estimate.target_camera, ELSEWHERE)
+
+
+def changed(view, **parts):
+    """The view with parts of its frame exchanged; its features stay."""
+    return replace(view, frame=replace(view.frame, **parts))
+
+
+def test_perfect_features_give_the_true_pose(estimate, frames):
+    assert error(estimate, frames) < 4
+    assert estimate.sim3.scale == pytest.approx(1.15, rel=0.08)
+    centre = frames[0].camera.to_camera(np.zeros(3))
+    np.testing.assert_allclose(estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12)
+    assert estimate.confidence > 0.5 and estimate.reliable
+
+
+def test_hypotheses_are_ranked_and_apart_and_each_says_what_speaks_for_it(estimate):
+    found = estimate.hypotheses
+    assert 1 < len(found) <= 6
+    assert found[0].sim3 is estimate.sim3 and found[0].view == estimate.view
+    scores = [one.score for one in found]
+    assert scores == sorted(scores, reverse=True)
+    for one in found:
+        assert one.terms.keys() == set(TERMS)
+        assert one.score == pytest.approx(sum(getattr(Weights(), name) * one.terms[name] for name in TERMS), abs=1e-2)
+        assert 0 <= one.confidence <= 1
+    assert max(one.confidence for one in found) == found[0].confidence
+    cameras = [view.frame.camera for view in estimate.target_views]
+    rotations = [one.sim3.R.T @ cameras[one.view].R for one in found]  # all from the targets' world
+    apart = rotation_error(np.stack(rotations)[:, None], np.stack(rotations)[None])
+    assert (apart + 180 * np.eye(len(found)) > 14.9).all()
+
+
+def test_the_answer_is_for_the_view_most_like_the_reference(estimate):
+    angles = []
+    for camera in (view.frame.camera for view in estimate.target_views):
+        (pose,) = estimate.propagate([camera])
+        angles.append(rotation_error(pose.R, np.eye(3)))
+    assert estimate.view == np.argmin(angles) == np.argmax(estimate.view_scores)
+    np.testing.assert_allclose(-estimate.view_scores, angles, atol=0.1)
+
+
+def test_inliers_agree_with_the_pose_within_a_share_of_the_objects_size(estimate):
+    source, target = estimate.points
+    residual = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1)
+    spread = residual[estimate.inliers].max() / residual[~estimate.inliers].min() if not estimate.inliers.all() else 0
+    assert estimate.inliers.sum() > 20 and spread <= 1
+
+
+def test_every_stage_is_timed(estimate):
+    stages = ["matching", "scene", "proposals", "alignment", "verification", "refinement", "ranking"]
+    assert list(estimate.timings) == stages
+
+
+def test_a_second_run_gives_the_same_numbers(method, estimate, views):
+    again = method.estimate_from_features(views[0], views[1:])
+    assert (again.sim3.matrix == estimate.sim3.matrix).all()
+    assert [one.score for one in again.hypotheses] == [one.score for one in estimate.hypotheses]
+
+
+def test_the_order_of_the_views_does_not_matter(method, estimate, views):
+    order = [3, 0, 4, 2, 1]
+    other = method.estimate_from_features(views[0], [views[1 + index] for index in order])
+    assert order[other.view] == estimate.view
+    assert (other.sim3.matrix == estimate.sim3.matrix).all()
+    np.testing.assert_array_equal(other.view_scores, estimate.view_scores[order])
+
+
+def test_turning_the_target_world_turns_the_answer(method, estimate, views):
+    turn = look_at((0.2, 0.5, -1)).R
+    moved = [changed(view, camera=turned(view.frame.camera, turn)) for view in views[1:]]
+    other = method.estimate_from_features(views[0], moved)
+    # Against a camera the pose is the same, in the world it has turned.
+    assert other.view == estimate.view
+    assert rotation_error(other.sim3.R, estimate.sim3.R) < 0.5
+    in_world = [one.target_camera.R.T @ one.sim3.R for one in (estimate, other)]
+    assert rotation_error(turn @ in_world[0], in_world[1]) < 0.5
+
+
+def test_a_larger_scene_has_a_larger_scale_and_the_same_rotation(method, estimate, views):
+    def larger(view):
+        camera = replace(view.frame.camera, t=7 * view.frame.camera.t)
+        return changed(view, camera=camera, depth=7 * view.frame.depth)
+
+    other = method.estimate_from_features(views[0], [larger(view) for view in views[1:]])
+    assert rotation_error(other.sim3.R, estimate.sim3.R) < 1
+    assert other.sim3.scale == pytest.approx(7 * estimate.sim3.scale, rel=0.02)
+
+
+def test_one_target_view_is_enough(method, views, frames):
+    alone = method.estimate_from_features(views[0], views[1:2])
+    assert alone.view == 0 and error(alone, frames) < 10
+
+
+def test_the_papers_solver_is_the_default_and_has_no_hypotheses(method, views):
+    paper = replace(method, solver="paper").estimate_from_features(views[0], views[1:])
+    default = ZeroShotPose(method.backbone).estimate_from_features(views[0], views[1:])
+    assert (paper.sim3.matrix == default.sim3.matrix).all()
+    assert default.hypotheses == () and default.confidence is None
+
+
+def test_a_given_mask_takes_the_place_of_saliency(method, frames):
+    masked = replace(method, foreground="mask").estimate(frames[0], frames[1:4])
+    assert error(masked, frames) < 8
+    assert masked.reference_view.object_mask is masked.reference_view.frame.mask
+
+
+def test_without_refinement_it_is_still_near(method, views, frames):
+    plain = replace(method, verified=VerifiedSettings(refinement=False))
+    assert error(plain.estimate_from_features(views[0], views[1:]), frames) < 15
+
+
+def holes(depth: np.ndarray, seed: int) -> np.ndarray:
+    unknown = np.kron(np.random.default_rng(seed).random((14, 14)) < 0.4, np.ones((16, 16))) > 0
+    return np.where(unknown, 0, depth).astype(np.float32)
+
+
+def test_holes_in_the_depth_do_not_break_it(method, views, frames):
+    pierced = [changed(view, depth=holes(view.frame.depth, seed)) for seed, view in enumerate(views)]
+    assert error(method.estimate_from_features(pierced[0], pierced[1:]), frames) < 10
+
+
+def test_noisy_cameras_and_depth_do_not_break_it(method, views, frames):
+    rng = np.random.default_rng(0)
+
+    def noisy(view):
+        axis = rng.normal(size=3)
+        x, y, z = np.radians(1) * axis / np.linalg.norm(axis)
+        tilt, _, other = np.linalg.svd(np.array([[1, -z, y], [z, 1, -x], [-y, x, 1]]))
+        camera = replace(view.frame.camera, R=tilt @ other @ view.frame.camera.R, t=view.frame.camera.t * 1.01)
+        depth = view.frame.depth * rng.normal(1, 0.02, view.frame.depth.shape)
+        return changed(view, camera=camera, depth=depth.astype(np.float32))
+
+    shaken = method.estimate_from_features(noisy(views[0]), [noisy(view) for view in views[1:]])
+    assert error(shaken, frames) < 10
+
+
+def test_a_view_without_depth_is_left_out_and_said_so(method, views, frames):
+    blind = changed(views[2], depth=np.zeros_like(views[2].frame.depth))
+    found = method.estimate_from_features(views[0], [views[1], blind, views[3]])
+    assert found.flags == ("target 1 left out: no known depth",)
+    assert np.isneginf(found.view_scores[1]) and found.view != 1
+    assert error(found, frames) < 10
+
+
+def test_where_nothing_can_be_known_one_line_says_so(method, views, frames):
+    blind = [changed(view, depth=np.zeros_like(view.frame.depth)) for view in views]
+    with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no known depth"):
+        method.estimate_from_features(views[0], blind[1:3])
+    with pytest.raises(InputError, match="reference"):
+        method.estimate_from_features(blind[0], views[1:])
+    without = replace(views[0], frame=replace(views[0].frame, depth=None))
+    with pytest.raises(InputError, match="reference: no depth map"):
+        method.estimate_from_features(without, views[1:])
+    empty = replace(frames[0], mask=np.zeros_like(frames[0].mask))
+    with pytest.raises(InputError, match="mask"):
+        method.estimate(empty, frames[1:])
+    with pytest.raises(InputError, match="solver is 'best'"):
+        replace(method, solver="best")
+
+
+def test_features_that_say_nothing_leave_it_unsure(method, views):
+    rng = torch.Generator().manual_seed(0)
+
+    def meaningless(view):
+        keys = torch.randn(28, 28, 16, generator=rng)
+        return replace(view, features=FeatureMap(keys, view.features.saliency, keys[0, 0]))
+
+    found = method.estimate_from_features(meaningless(views[0]), [meaningless(view) for view in views[1:]])
+    sure = method.estimate_from_features(views[0], views[1:])
+    assert found.confidence < sure.confidence
+    assert not found.reliable
+
+
+def test_a_symmetric_object_is_called_ambiguous(method):
+    """A plain ellipsoid looks the same after half a turn about each of its axes."""
+
+    def egg(direction, name):
+        camera = look_at(direction)
+        y, x = np.mgrid[:140, :180] + 0.5
+        rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((140, 180))) @ camera.R
+        axes = np.array([1.3, 0.9, 0.6])
+        a, b, c = (rays / axes) ** 2, 2 * rays * camera.centre / axes**2, (camera.centre / axes) ** 2
+        a, b, c = a.sum(-1), b.sum(-1), c.sum() - 1
+        root = b * b - 4 * a * c
+        depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / (2 * a), 0).astype(np.float32)
+        # The backbone paints coordinates; of these only what the symmetry leaves alone.
+        points = np.abs(camera.centre + rays * depth[..., None])
+        rgb = np.where(root[..., None] > 0, np.rint((points / 1.6 + 1) * 127).clip(1, 254), 0).astype(np.uint8)
+        from zsp_lite.frames import Frame
+
+        return Frame(rgb, depth, (root > 0).astype(np.float32), camera, name)
+
+    frames = [egg(direction, f"egg {i}") for i, direction in enumerate([(1, 0.6, 0.4), *DIRECTIONS])]
+    found = method.estimate(frames[0], frames[1:])
+    assert "explain the views equally well" in found.note
+    apart = [rotation_error(found.sim3.R, one.sim3.R) for one in found.hypotheses if one.view == found.view]
+    assert found.confidence < 0.9 and not found.reliable or max(apart) > 30
