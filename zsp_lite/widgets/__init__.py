@@ -5,6 +5,12 @@ so that this module needs no ipywidgets. `python -m zsp_lite.widgets` measures h
 """
 
 WIDGETS: dict[str, str] = {
+    "attention": "features:example_attention",
+    "facets": "features:example_facets",
+    "context": "features:example_context",
+    "saliency": "features:example_saliency",
+    "cycle": "matching:example_cycle",
+    "matches": "matching:example_matches",
     "best_view": "views:example_best_view",
     "ransac_settings": "alignment:example_ransac_settings",
     "one_outlier": "alignment:example_one_outlier",

@@ -21,14 +21,19 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import Normal, Stroke
 
 from zsp_lite.errors import InputError
 
 if TYPE_CHECKING:
     from ipywidgets import ValueWidget, VBox
 
+    from zsp_lite.synthetic.truth import TruePair
     from zsp_lite.views import View
 
 _LABEL = {"description_width": "initial"}
@@ -76,7 +81,8 @@ def explorer(figure: Figure, controls: Mapping[str, "ValueWidget"], update: Call
     sentence = widgets.HTML()
     # A layout engine would arrange everything again at each move, and make the picture jump.
     update(**{name: control.value for name, control in controls.items()})
-    canvas.draw()
+    for _ in range(2):  # the first one settles the layout of images with colour bars only roughly
+        canvas.draw()
     figure.set_layout_engine("none")
 
     def redraw(change=None) -> None:
@@ -91,6 +97,54 @@ def explorer(figure: Figure, controls: Mapping[str, "ValueWidget"], update: Call
     box = widgets.VBox([row, picture, sentence])
     box.redraw, box.controls, box.figure, box.picture, box.sentence = redraw, dict(controls), figure, picture, sentence
     return box
+
+
+def patch_slider(label: str, cells: int, value: int) -> "ValueWidget":
+    """A slider over the rows or columns of a patch grid, counted from 0 as in the code."""
+    return slider(label, 0, cells - 1, value)
+
+
+def patch_box(
+    axis: Axes, grid: tuple[int, int], size: tuple[int, int], label: str, before: bool = False
+) -> Callable[[int, int], None]:
+    """A frame around one patch of a (rows, cols) grid over an image of (H, W) pixels; call the result to move it.
+
+    White on black, so that it is seen on any picture; its label stands on the right, or on the left (`before`).
+    """
+    height, width = size[0] / grid[0], size[1] / grid[1]
+    frames = [
+        axis.add_patch(Rectangle((0, 0), width, height, fill=False, edgecolor=colour, linewidth=line, zorder=8))
+        for colour, line in (("black", 4.5), ("white", 2))
+    ]
+    text = axis.text(0, 0, label, fontsize=11, weight="bold", zorder=9, va="center", clip_on=True,
+                     path_effects=[Stroke(linewidth=3, foreground="white"), Normal()])  # fmt: skip
+
+    def move(row: int, col: int) -> None:
+        for frame in frames:
+            frame.set_xy((col * width, row * height))
+        right = col < 4 or (not before and col < grid[1] - 4)
+        text.set(x=(col + (1.5 if right else -0.5)) * width, y=(row + 0.5) * height, ha="left" if right else "right")
+
+    return move
+
+
+def patch_map(
+    axis: Axes, grid: tuple[int, int], size: tuple[int, int], limits: tuple[float, float] = (0, 1), alpha: float = 0.65,
+    label: str | None = None,
+) -> AxesImage:  # fmt: skip
+    """An empty map over the patches of an image of (H, W) pixels; fill it with `set_data` (masked patches are clear).
+
+    label: of the colour bar below it, none without.
+    """
+    drawn = axis.imshow(
+        np.zeros(grid), cmap="viridis", alpha=alpha, extent=(0, size[1], size[0], 0), vmin=limits[0], vmax=limits[1],
+        interpolation="nearest",
+    )  # fmt: skip
+    if label is not None:
+        bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
+        bar.set_label(label, fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+    return drawn
 
 
 def png(figure: Figure) -> bytes:
@@ -110,17 +164,23 @@ def show(figure: Figure, alt: str) -> None:
 
 
 @cache
-def example_pair() -> tuple["View", "View"]:
-    """Two views of different sample objects of one category, from about the same side; for trying widgets out."""
-    from zsp_lite.backbones import load_backbone
+def example_truth() -> "TruePair":
+    """The true correspondences of a sample pair; for trying widgets out."""
     from zsp_lite.co3d import Co3D
     from zsp_lite.demo import demo_pairs
     from zsp_lite.doctor import sample_data
-    from zsp_lite.views import look, object_crop
+    from zsp_lite.synthetic.truth import true_pair
 
     dataset = Co3D(sample_data())
-    pair = demo_pairs(dataset)[-1]
-    names = [(pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[-1])]
-    frames = [dataset.load(dataset.frame(pair.category, *name)) for name in names]
-    first, second = look(load_backbone("zsp-tiny", "cpu"), [object_crop(frame) for frame in frames])
+    return true_pair(dataset, demo_pairs(dataset)[-1])
+
+
+@cache
+def example_pair() -> tuple["View", "View"]:
+    """The views of `example_truth`: different objects of one category from about the same side."""
+    from zsp_lite.backbones import load_backbone
+    from zsp_lite.views import look
+
+    truth = example_truth()
+    first, second = look(load_backbone("zsp-tiny", "cpu"), [truth.reference, truth.target])
     return first, second
