@@ -1,22 +1,29 @@
 """Self-distillation: its loss, its two averages, and what happens without centring or sharpening."""
 
 import copy
+import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
+from zsp_lite.backbones import load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.training.distillation import (
     Distillation,
     DistillationConfig,
     Head,
+    as_trainee,
     cosine,
+    distil,
     distillation_loss,
     multi_crop,
 )
+from zsp_lite.training.renders import training_and_held_out
+from zsp_lite.training.train import Trainee, TrainingConfig, held_out_accuracy, initialise
 from zsp_lite.vit import VisionTransformer
 
 TINY = DistillationConfig(
@@ -176,6 +183,51 @@ def test_the_given_backbone_is_left_as_it_was(pictures, backbone):
     for _ in range(3):
         run.step(pictures)
     assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())
+
+
+SHAPE = TrainingConfig(objects=8, embed_dim=24, depth=2, num_heads=2, key_block=1)
+
+
+def test_a_killed_run_resumes_to_the_same_weights_and_log(tmp_path):
+    """The log has the loss, the teacher's entropy and what is found on objects that no step has seen."""
+
+    class Killed(Exception):
+        pass
+
+    def kill_at_four(line):
+        if line.startswith("step 4"):
+            raise Killed
+
+    config = replace(TINY, steps=5, images=4)
+    options = dict(renders=tmp_path / "renders", checkpoint_every=2, log_every=1)
+    whole = distil(config, SHAPE, tmp_path / "whole", log=lambda line: None, **options)
+    with pytest.raises(Killed):
+        distil(config, SHAPE, tmp_path / "killed", log=kill_at_four, **options)
+    resumed = distil(config, SHAPE, tmp_path / "killed", log=lambda line: None, **options)
+    expected, got = load_file(whole), load_file(resumed)
+    assert all(torch.equal(expected[name], got[name]) for name in expected | got)
+    logs = [(tmp_path / run / "log.jsonl").read_text() for run in ("whole", "killed")]
+    assert logs[0] == logs[1]
+    rows = [json.loads(line) for line in logs[0].splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4, 5]
+    assert {"loss", "teacher_entropy", "kl", "information"} <= rows[0].keys()
+    assert {"held_out_accuracy", "held_out_view_accuracy", "held_out_iou"} <= rows[-1].keys()
+    grid = load_backbone(whole, "cpu")([np.zeros((40, 40, 3), np.uint8)])[0].grid
+    assert grid == (28, 28)
+    with pytest.raises(InputError, match="another shape"):
+        distil(config, replace(SHAPE, depth=3), tmp_path / "killed", log=lambda line: None, **options)
+
+
+def test_both_trainers_are_measured_alike(tmp_path):
+    """A trainee's own backbone, put in another trainee's place, is the same one to `held_out_accuracy`."""
+    training, held_out = training_and_held_out(tmp_path, SHAPE.objects)
+    assert (len(training), len(held_out)) == (7, 1)
+    model = Trainee(SHAPE)
+    initialise(model, training, 0)
+    model.key_mean.copy_(as_trainee(model.backbone, SHAPE, training).key_mean)
+    assert model.key_mean.abs().sum() > 0
+    again = as_trainee(model.backbone, SHAPE, training)
+    assert held_out_accuracy(model, held_out, 48) == held_out_accuracy(again, held_out, 48)
 
 
 def test_bad_settings_and_foreign_checkpoints_are_refused_in_one_line(backbone, tmp_path):

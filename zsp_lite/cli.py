@@ -254,7 +254,8 @@ def _add_train(commands) -> None:
     parser = _command(
         commands, "train", _train, "train the embedded backbone, or resume; hours on a CPU",
         ["train --out outputs/first", "train --out outputs/second --start-from outputs/first/checkpoint.pt",
-         "train --out outputs/try --shorten 0.02 --objects 60"],
+         "train --out outputs/try --shorten 0.02 --objects 60",
+         "train --self-distillation --out outputs/dino --renders outputs/first/renders"],
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, default=Path("outputs/train"), metavar="DIR",
@@ -264,6 +265,10 @@ def _add_train(commands) -> None:
     parser.add_argument(
         "--start-from", type=Path, metavar="CKPT",
         help="the second run of the recipe, from this checkpoint of the first one",
+    )  # fmt: skip
+    parser.add_argument(
+        "--self-distillation", action="store_true",
+        help="DINO instead, which sees pixels alone: what it learns in as many steps, for comparison",
     )  # fmt: skip
     parser.add_argument("--objects", type=_count, metavar="N", help="training objects (default: the configuration's)")
     parser.add_argument("--shorten", type=_positive, default=1.0, metavar="F", help="multiply every stage's steps by F")
@@ -285,6 +290,15 @@ def _train(arguments: argparse.Namespace) -> None:
     def bar(shards, total):
         return tqdm(shards, "rendering", total, unit="shard", disable=None)
 
+    if arguments.self_distillation:
+        if arguments.start_from is not None:
+            raise InputError("--start-from continues the other recipe; expected --self-distillation without it")
+        from zsp_lite.training.distillation import LONG_RUN, distil
+
+        steps = max(1, round(LONG_RUN.steps * arguments.shorten))
+        run = replace(LONG_RUN, seed=arguments.seed, steps=steps)
+        print(f"Written: {distil(run, config, arguments.out, arguments.renders, progress=bar)}")
+        return
     start = dict(start_from=arguments.start_from)
     print(f"Written: {train(config, arguments.out, arguments.renders, progress=bar, **start)}")
 

@@ -4,11 +4,14 @@ Only pixels go in: no label, no mask, no depth, no second view. Every picture is
 crops; student and teacher describe each by a distribution over K outputs that mean nothing beforehand, and the student
 is asked to agree, on all crops, with the teacher on the *other* global crop. Two answers would agree without seeing
 anything: always the same output, and all outputs alike. Centring prevents the first and invites the second,
-sharpening the other way round; `DistillationConfig` can switch each off.
+sharpening the other way round; `DistillationConfig` can switch each off. `Distillation` takes single steps, `distil`
+is the whole run with its log.
 """
 
 import copy
+import json
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +24,16 @@ from torch import Tensor, nn
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import _crop_grids as crop_grids
 from zsp_lite.training.batches import _recolour as recolour
+from zsp_lite.training.batches import sample_batch
+from zsp_lite.training.renders import VIEWS, RenderSet, training_and_held_out
+from zsp_lite.training.train import (
+    Trainee,
+    TrainingConfig,
+    _log_until,
+    export_checkpoint,
+    held_out_accuracy,
+    initialise,
+)
 from zsp_lite.vit import VisionTransformer
 
 
@@ -63,6 +76,12 @@ class DistillationConfig:
             raise InputError(f"DistillationConfig: local_crops is {self.local_crops}, expected 0 or more")
         if min(self.student_temperature, self.teacher_temperature) <= 0:
             raise InputError("DistillationConfig: temperatures must be positive")
+
+
+# Nearer to DINO's own settings: hours on a CPU.
+LONG_RUN = DistillationConfig(
+    steps=7000, images=32, outputs=4096, hidden=1024, bottleneck=256, teacher_momentum=(0.996, 1.0), learning_rate=5e-4
+)  # fmt: skip
 
 
 class Head(nn.Module):
@@ -212,6 +231,68 @@ class Distillation:
             raise InputError(f"{path}: no checkpoint of a distillation") from error
         if not same:
             raise InputError(f"{path}: a run of another configuration, expected one of {self.config}")
-        for name in ("student", "teacher", "optimiser"):
-            getattr(self, name).load_state_dict(state[name])
+        try:
+            for name in ("student", "teacher", "optimiser"):
+                getattr(self, name).load_state_dict(state[name])
+        except (RuntimeError, ValueError) as error:
+            raise InputError(f"{path}: a run with a backbone of another shape, expected one like this") from error
         self.centre, self.steps_done = state["centre"], state["steps_done"]
+
+
+def as_trainee(backbone: VisionTransformer, shape: TrainingConfig, renders: RenderSet, side: int = 96) -> Trainee:
+    """The backbone as the other trainer sees one, so that both are measured and exported by the same code.
+
+    The mean key, which that trainer follows from step to step, is taken from crops of `side` pixels of `renders`.
+    """
+    device = next(backbone.parameters()).device
+    trainee = Trainee(shape).to(device)
+    trainee.backbone = backbone
+    crops = sample_batch(renders, np.random.default_rng(7), min(6, len(renders)), VIEWS, side, (0.85, 1.0)).images
+    with torch.no_grad():
+        trainee.descriptors(trainee(crops.to(device)).keys, update_mean=True)
+    return trainee
+
+
+def distil(
+    config: DistillationConfig, shape: TrainingConfig, folder: Path, renders: Path | None = None,
+    log: Callable[[str], None] = print, progress=lambda iterable, total: iterable, checkpoint_every: int = 250,
+    log_every: int = 50,
+) -> Path:  # fmt: skip
+    """Run DINO from random weights, or resume from `folder`/checkpoint.pt, and export `folder`/dino-tiny.safetensors.
+
+    Of `shape` the backbone's size and key block, the number of objects and their seed count. folder receives
+    log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line before, and in every
+    tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees. `renders` is where the
+    training set is kept or made (default `folder`/renders); `progress` wraps the rendering of its shards.
+    Raises InputError where `folder` holds a run of another configuration or a damaged one.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, progress)
+    start = Trainee(shape)
+    initialise(start, training, shape.seed)
+    run = Distillation(config, start.backbone)
+    if (checkpoint := folder / "checkpoint.pt").exists():
+        run.restore(checkpoint)
+    earlier = _log_until(folder / "log.jsonl", run.steps_done)
+    rows: list[dict[str, float]] = []
+    with (folder / "log.jsonl").open("w") as log_file:
+        log_file.writelines(earlier)
+        while run.steps_done < config.steps:
+            rows.append(run.step(training.rgb))
+            step = run.steps_done
+            last = step == config.steps
+            if step % log_every == 0 or last:
+                row = dict(step=step)
+                row |= {name: round(float(np.mean([r[name] for r in rows])), 4) for name in rows[0] if name != "step"}
+                if step % (10 * log_every) == 0 or last:
+                    measured = held_out_accuracy(as_trainee(run.teacher.backbone, shape, training), held_out)
+                    row |= {name: round(value, 4) for name, value in measured.items()}
+                rows = []
+                log_file.write(json.dumps(row) + "\n")
+                log_file.flush()
+                log("  ".join(f"{name} {value}" for name, value in row.items()))
+            if step % checkpoint_every == 0 or last:
+                run.save(checkpoint)
+    trainee = as_trainee(run.teacher.backbone.cpu(), shape, training)
+    return export_checkpoint(trainee, held_out, shape, folder / "dino-tiny.safetensors")

@@ -122,3 +122,11 @@ def load_render_set(paths: list[Path]) -> RenderSet:
         for whole, part in zip(joined, shard, strict=True):
             whole[index * count : (index + 1) * count] = part
     return RenderSet(*joined)
+
+
+def training_and_held_out(
+    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable
+) -> tuple[RenderSet, RenderSet]:
+    """All shards but the last to train on, and the last one, an eighth of few objects, which no step sees."""
+    shards = render_set(folder, objects, seed, min(SHARD, max(1, objects // 8)), progress=progress)
+    return load_render_set(shards[:-1]), load_render_set(shards[-1:])

@@ -26,7 +26,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
-from zsp_lite.training.renders import SHARD, VIEWS, RenderSet, load_render_set, render_set
+from zsp_lite.training.renders import VIEWS, RenderSet, training_and_held_out
 from zsp_lite.vit import TrainingTokens, VisionTransformer
 
 
@@ -51,7 +51,10 @@ class Stage:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything that decides the result; `seed` fixes objects, crops and initial weights."""
+    """Everything that decides the result; `seed` fixes objects, crops and initial weights.
+
+    InputError for fewer than 2 objects: the last ones are held out.
+    """
 
     seed: int = 0
     objects: int = 5600
@@ -73,6 +76,10 @@ class TrainingConfig:
         Stage(500, 184, 2, 8, (0.75, 1.0), radius=0.12),
         Stage(250, 224, 1, 8, (0.85, 1.0), radius=0.12),
     )
+
+    def __post_init__(self):
+        if self.objects < 2:
+            raise InputError(f"training has {self.objects} objects, expected at least 2: the last ones are held out")
 
     @property
     def steps(self) -> int:
@@ -231,11 +238,8 @@ def train(
     `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
     its shards. The checkpoint holds model, average, optimiser and step; batches depend only on (seed, step), so a
     resumed run continues as if nothing had happened.
-    Raises InputError for fewer than 2 objects (one is held out), and where `folder` holds a run of another
-    configuration or a damaged one.
+    Raises InputError where `folder` holds a run of another configuration or a damaged one.
     """
-    if config.objects < 2:
-        raise InputError(f"training has {config.objects} objects, expected at least 2: the last ones are held out")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     settings = json.loads(json.dumps(asdict(config)))
@@ -243,9 +247,7 @@ def train(
     if config_file.exists() and decode(read_bytes(config_file, "configuration"), dict, config_file) != settings:
         raise InputError(f"{config_file}: holds a run of another configuration; expected a new folder for this one")
     config_file.write_text(json.dumps(settings, indent=1) + "\n")
-    shard = min(SHARD, max(1, config.objects // 8))
-    shards = render_set(renders or folder / "renders", config.objects, config.seed, shard, progress=progress)
-    training, held_out = load_render_set(shards[:-1]), load_render_set(shards[-1:])
+    training, held_out = training_and_held_out(renders or folder / "renders", config.objects, config.seed, progress)
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     torch.manual_seed(config.seed)
