@@ -26,6 +26,7 @@ from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, resolve
 from zsp_lite.benchmark.plan import Plan, duration, frames_at_once, size
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, plan_run, read_records, work_of_categories
 from zsp_lite.benchmark.storage import PartReader, RunFolder, part_writer
+from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
 from zsp_lite.pairs import sample_pairs
@@ -265,6 +266,16 @@ def test_frames_are_described_once_for_all_rows_and_the_run_says_what_that_saves
     )
 
 
+def test_the_points_behind_a_frames_patches_are_worked_out_once():
+    keys = [("100_a", 0)]
+    store = FrameStore(Co3D(small_folder()), "lump", {"backbone": BACKBONE, "other": BACKBONE})
+    first = store.view("backbone", keys[0], "saliency", 0.05)
+    points = first.patch_points
+    for features, foreground in (("backbone", "mask"), ("other", "mask")):
+        assert store.view(features, keys[0], foreground, 0.05).patch_points is points
+    assert store.view("other", ("100_a", 1), "mask", 0.05).patch_points is not points
+
+
 def test_frames_are_forgotten_after_their_last_pair():
     root, rows = small_folder(), resolve(["ours"])
     work = list(work_of_categories(pairs_of_rows(root, rows, 6, 2, categories=["lump"]))["lump"])
@@ -379,4 +390,7 @@ def test_groups_are_made_of_rows_and_rows_of_known_features():
     assert all(name in METHODS for names in GROUPS.values() for name in names)
     assert all(method.features in EXTRACTORS for method in METHODS.values())
     assert list(resolve(["table3", "ours"])) == list(GROUPS["table3"])
+    assert not GROUPS.keys() & METHODS.keys()  # a name is a row or a group, never both
+    assert set(GROUPS["paper"]) | set(GROUPS["verified-views"]) <= set(GROUPS["all"])
+    assert {METHODS[name].targets for name in GROUPS["verified-views"]} == {None, 1, 3, 10}
     assert run_module.GROUPS["default"] == ("ours", "ours-bv", "rootsift")

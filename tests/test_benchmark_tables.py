@@ -101,6 +101,19 @@ def test_a_run_of_three_rows_has_no_table_of_what_it_lacks(tmp_path):
     assert summary["against_ours"]["rootsift"] == paired_test(*errors)
 
 
+def test_the_verified_solver_stands_beside_the_papers_by_number_of_views(tmp_path):
+    rows = ["ours", "ours-n1", *GROUPS["verified-views"]]
+    summary = made_up_run(tmp_path, rows)
+    table = next(table for table in paper_tables(summary) if table.name == "verified_targets")
+    assert [label for label, _ in table.rows] == [f"views = {n}" for n in (1, 3, 5, 10)]
+    for n, name in ((1, "verified-mask-n1"), (5, "verified-mask"), (10, "verified-mask-n10")):
+        found = cell(table, f"views = {n}", "Acc30 (%)", f"{THIS_RUN}: verified, true mask")
+        assert found.value == summary["methods"][name]["acc30"]
+    assert cell(table, "views = 3", "Acc30 (%)", f"{THIS_RUN}: the paper's") is None
+    left, _ = accuracy_against_views(read_results(tmp_path)).axes
+    assert list(left.get_lines()[-1].get_xdata()) == [1, 3, 5, 10]
+
+
 def test_every_category_has_its_figure_for_every_row(run):
     for table, figure in zip(category_tables(run[1]), ("median", "acc30", "acc15"), strict=True):
         assert [column.title for column in table.columns] == [*CATEGORIES, "all"]

@@ -43,22 +43,30 @@ def error_distribution(results: Results, row: str = "ours") -> Figure:
 def accuracy_against_views(results: Results) -> Figure:
     """Acc30 and Acc15 over the number of target views, best view only and full, with 95 % intervals.
 
-    What the paper printed, for CO3D, is dotted grey. Raises InputError where the run has fewer than two numbers.
+    What the paper printed, for CO3D, is dotted grey; the verified solver, where the run has it, is dashed.
+    Raises InputError where the run has fewer than two numbers.
     """
     methods, views = results.summary["methods"], results.summary["data"]["targets"]
     lines = {}
-    for label, row, printed in (("full method", "ours", "full"), ("best view only", "ours-bv", "bv")):
+    for label, row, printed in (
+        ("full method", "ours", "full"), ("best view only", "ours-bv", "bv"), ("verified solver", "verified", None),
+    ):  # fmt: skip
         found = {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in _VIEWS}
         lines[label] = {n: one for n, one in found.items() if one is not None}, printed
-    if max(len(found) for found, _ in lines.values()) < 2:
+    if max(len(found) for found, printed in lines.values() if printed) < 2:
         raise InputError("accuracy against views: the run has fewer than two numbers of target views")
+    if len(lines["verified solver"][0]) < 2:
+        del lines["verified solver"]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
     for axis, name, title in zip(axes, ("acc30", "acc15"), ("Acc30 (%)", "Acc15 (%)"), strict=True):
-        for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN), strict=True):
+        for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN, VERMILLION)):
             numbers = list(found)
             low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
             axis.fill_between(numbers, low, high, color=colour, alpha=0.18, lw=0)
-            axis.plot(numbers, [found[n][name] for n in numbers], "o-", color=colour, label=label)
+            style = "o-" if printed else "D--"
+            axis.plot(numbers, [found[n][name] for n in numbers], style, color=colour, label=label)
+            if printed is None:
+                continue
             column = published.TARGETS.columns.index(f"{printed}_{name}")
             values = [published.TARGETS.rows[str(n)][column] for n in _VIEWS]
             axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=f"{label}, published on CO3D")

@@ -53,7 +53,8 @@ _VERIFIED = {"solver": "verified"}
 def _verified_rows() -> dict[str, Method]:
     """The solver beyond the paper: with less to see, and with parts of it taken away."""
     rows = {"verified": Method(settings=_VERIFIED), "verified-mask": Method(settings=_VERIFIED | _MASK)}
-    rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 20)}
+    rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 10, 20)}
+    rows |= {f"verified-mask-n{n}": Method(settings=_VERIFIED | _MASK, targets=n) for n in (1, 3, 5, 10)}
     less = {
         "nosilhouette": VerifiedSettings(weights=Weights(f_off=0, r_off=0)),
         "nofreespace": VerifiedSettings(weights=Weights(f_front=0, r_front=0)),
@@ -132,6 +133,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
+    "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
     "verified-ablations": ("ours", "verified", *(f"verified-{name}" for name in (
         "mask", "n1", "nosilhouette", "nofreespace", "simonly", "forward", "nofeatures", "noicp", "norefinement",
     ))),
@@ -148,6 +150,8 @@ def _union(*names: str) -> tuple[str, ...]:
 # Every switch of the paper at one number of views; then all its tables, with what stands in for the large networks.
 GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
 GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
+# The paper's tables and what goes beyond them, on data as they are.
+GROUPS["all"] = _union("paper", "verified-views", "oracle-view", "ours-adaptive")
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:

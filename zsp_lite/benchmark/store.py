@@ -107,7 +107,12 @@ class FrameStore:
         if name not in views:
             feature_map = self.describe(features, key)
             views[name] = frame_view(self.frame(key), feature_map, foreground, saliency_threshold)
-        return views[name]
+        view = views[name]
+        # The points depend on the frame and the grid alone: what one row has worked out, others need not.
+        for other in views.values():
+            if "patch_points" in vars(other) and other.features.grid == view.features.grid:
+                vars(view).setdefault("patch_points", other.patch_points)
+        return view
 
     def similarity(
         self, features: str, reference: FrameKey, target: FrameKey, solver: ZeroShotPose, first: View, second: View
