@@ -155,6 +155,24 @@ class Camera:
         )
 
 
+def rotation_from_quaternion(
+    quaternion: Real[np.ndarray, "4"] | Sequence, what: str = "quaternion"
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation matrix of (x, y, z, w), normalised. Raises InputError for one without length."""
+    x, y, z, w = _finite(quaternion, (4,), what)
+    length = float(np.sqrt(x * x + y * y + z * z + w * w))
+    if length < 1e-6:
+        raise InputError(f"{what} is {list(quaternion)}, expected a quaternion (x, y, z, w) of length 1")
+    x, y, z, w = np.array([x, y, z, w]) / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
     """Pixels per NDC unit and the NDC origin's pixel, each (2,) as (x, y)."""
     height, width = size

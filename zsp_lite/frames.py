@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Real, UInt8
+from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
 from zsp_lite.cameras import Box, Camera
 from zsp_lite.depth import decode_depth, encode_depth
@@ -155,10 +155,15 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
 
     Raises InputError where the file is missing, corrupt or not 16-bit grey.
     """
+    return decode_depth(read_grey16(path), scale_adjustment)
+
+
+def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
+    """A 16-bit grey PNG as stored. Raises InputError where it is missing, corrupt or of another kind."""
     bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit grey PNG")
-    return decode_depth(bits, scale_adjustment)
+    return bits
 
 
 def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:

@@ -1,0 +1,307 @@
+"""Captures in other formats, written here from rendered views: what comes in projects and measures as it did."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.cameras import rotation_from_quaternion
+from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.frames import Frame, write_image, write_mask
+from zsp_lite.importers import READERS, import_capture
+from zsp_lite.importers.fusion import fuse
+from zsp_lite.importers.masks import grab_cut, masks_from_box
+from zsp_lite.synthetic.export import make_object, sequence_name
+from zsp_lite.synthetic.sequences import render_sequence
+
+METRES = 0.13  # of a unit of the rendered world: the object is about 30 cm wide
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Eight views once around a teapot, in metres."""
+    shape = make_object("teapot", sequence_name(4, "teapot", 0), 4)
+    rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
+    frames = []
+    for view in rendered.views:
+        camera = replace(view.camera, t=view.camera.t * METRES)
+        depth = (view.depth * METRES).astype(np.float32)
+        frames.append(Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}"))
+    return frames
+
+
+def to_world(frame):
+    return np.linalg.inv(frame.camera.matrix)
+
+
+def write_depth16(path, depth, unit):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.rint(depth / unit).clip(0, 65535).astype(np.uint16))
+
+
+def write_tum(folder, frames):
+    lines = {"rgb.txt": ["# colour images"], "depth.txt": [], "groundtruth.txt": ["# tx ty tz qx qy qz qw"]}
+    for number, frame in enumerate(frames):
+        time = 1305031102.1 + 0.1 * number
+        write_image(folder / f"rgb/{time:.6f}.jpg", frame.rgb, 95)
+        write_depth16(folder / f"depth/{time + 0.01:.6f}.png", frame.depth, 1 / 5000)
+        pose = to_world(frame)
+        values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        lines["rgb.txt"].append(f"{time:.6f} rgb/{time:.6f}.jpg")
+        lines["depth.txt"].append(f"{time + 0.01:.6f} depth/{time + 0.01:.6f}.png")
+        lines["groundtruth.txt"].append(f"{time - 0.008:.4f} " + " ".join(f"{value:.6f}" for value in values))
+    # A picture whose depth was dropped is left out.
+    lines["rgb.txt"].append("1305031199.0 rgb/none.jpg")
+    for name, rows in lines.items():
+        (folder / name).write_text("\n".join(rows) + "\n")
+    (fx, fy), (cx, cy) = frames[0].camera.focal, frames[0].camera.principal_point
+    return {"intrinsics": (fx, fy, cx - 0.5, cy - 0.5)}
+
+
+def write_nerfstudio(folder, frames):
+    (fx, fy), (cx, cy), (h, w) = frames[0].camera.focal, frames[0].camera.principal_point, frames[0].camera.size
+    listed = []
+    for frame in frames:
+        write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
+        write_depth16(folder / f"depths/{frame.name}.png", frame.depth, 0.001)
+        write_mask(folder / f"masks/{frame.name}.png", frame.mask)
+        pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL's camera: up is +y, it looks along -z
+        listed.append({"file_path": f"images/{frame.name}.jpg", "depth_file_path": f"depths/{frame.name}.png",
+                       "mask_path": f"masks/{frame.name}.png", "transform_matrix": pose.tolist()})  # fmt: skip
+    content = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": w, "h": h, "frames": listed}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return {}
+
+
+def write_open3d(folder, frames):
+    rows = []
+    for number, frame in enumerate(frames):
+        write_image(folder / f"color/{frame.name}.jpg", frame.rgb, 95)
+        write_depth16(folder / f"depth/{frame.name}.png", frame.depth, 0.001)
+        rows.append(f"{number} {number} {number + 1}")
+        rows += [" ".join(f"{value:.8f}" for value in row) for row in to_world(frame)]
+    (folder / "trajectory.log").write_text("\n".join(rows) + "\n")
+    matrix = frames[0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    height, width = frames[0].camera.size
+    content = {"width": width, "height": height, "intrinsic_matrix": matrix.T.ravel().tolist()}
+    (folder / "camera_intrinsic.json").write_text(json.dumps(content))
+    return {}
+
+
+def write_lists(folder, frames):
+    names, depths, poses = [], [], []
+    for frame in frames:
+        names.append(f"pictures/{frame.name}.jpg")
+        depths.append(f"z/{frame.name}.npy")
+        poses.append(" ".join(f"{value:.9f}" for value in to_world(frame)[:3].ravel()))
+        write_image(folder / names[-1], frame.rgb, 95)
+        (folder / "z").mkdir(exist_ok=True)
+        np.save(folder / depths[-1], np.rint(frame.depth * 1000).astype(np.uint16))
+    for name, rows in (("rgb.txt", names), ("depth.txt", depths), ("poses.txt", poses)):
+        (folder / name).write_text("\n".join(rows) + "\n")
+    np.savetxt(folder / "intrinsics.txt", frames[0].camera.K)
+    return {}
+
+
+WRITERS = {"tum": write_tum, "nerfstudio": write_nerfstudio, "open3d": write_open3d, "lists": write_lists}
+
+
+@pytest.fixture(params=WRITERS)
+def capture(request, tmp_path, views):
+    folder = tmp_path / request.param
+    folder.mkdir()
+    options = WRITERS[request.param](folder, views)
+    return READERS[request.param](folder, **options)
+
+
+def test_every_format_gives_the_cameras_back_by_reprojection(capture, views):
+    assert len(capture.shots) == len(views)
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.1 + views[0].camera.to_world(np.array([0, 0, 1.0]))
+    for shot, view in zip(capture.shots, views):
+        (pixels, depth), (expected, expected_depth) = shot.camera.project(points), view.camera.project(points)
+        np.testing.assert_allclose(pixels, expected, atol=2e-3)
+        np.testing.assert_allclose(depth, expected_depth, atol=1e-5)
+
+
+def test_every_format_gives_depth_in_metres_where_the_surface_is(capture, views):
+    for shot, view in zip(capture.shots, views):
+        frame = shot.load()
+        known = view.depth > 0
+        np.testing.assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+        assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 6
+        # The pixel's point, seen again by the true camera, is that pixel.
+        y, x = np.argwhere(view.mask > 0)[::97].T
+        world = shot.camera.unproject(np.stack([x, y], -1) + 0.5, frame.depth[y, x])
+        np.testing.assert_allclose(view.camera.project(world)[0], np.stack([x, y], -1) + 0.5, atol=5e-3)
+
+
+def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, views):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, views)
+    done = import_capture(READERS["nerfstudio"](folder), tmp_path / "data", "teapot", "mine", max_frames=6)
+    dataset = Co3D(tmp_path / "data")
+    points, _ = dataset.point_cloud("teapot", "mine")
+    assert done.frames == 6 and done.points == len(points) > 500
+    assert points.std(axis=0).mean() == pytest.approx(1, rel=1e-3)
+    chosen = [views[index] for index in (0, 1, 3, 4, 6, 7)]
+    for annotation, view in zip(dataset.frames("teapot", "mine"), chosen, strict=True):
+        frame = dataset.load(annotation)
+        inside = (frame.mask > 0.9) & (frame.depth > 0)
+        np.testing.assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
+        # The cloud lies in the object's mask in every view, and on its depth.
+        pixels, depth = frame.camera.project(points)
+        column, row = np.floor(pixels).astype(int).clip(0, np.array(frame.camera.size[::-1]) - 1).T
+        assert (cv2.dilate(frame.mask, np.ones((5, 5)))[row, column] > 0.5).mean() > 0.97
+        np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
+
+
+def test_an_imported_capture_is_complete_in_the_check(tmp_path, views):
+    from zsp_lite.data_check import check_folder
+
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, views)
+    import_capture(READERS["nerfstudio"](folder), tmp_path / "data", "teapot", "mine")
+    (check,) = check_folder(tmp_path / "data", deep=True)
+    assert not check.problems and check.complete == 1
+
+
+def test_distortion_is_taken_out(tmp_path, views):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, views[:1])
+    content = json.loads((folder / "transforms.json").read_text()) | {
+        "k1": 0.12,
+        "k2": -0.03,
+        "p1": 0.002,
+        "p2": -0.001,
+    }
+    (folder / "transforms.json").write_text(json.dumps(content))
+    # A picture as the distorting lens would take it: a grid of dots, each where OpenCV projects its ray.
+    view, camera = views[0], views[0].camera
+    height, width = camera.size
+    wanted = (
+        np.stack(np.meshgrid(np.arange(20, width - 20, 12), np.arange(20, height - 20, 12)), -1).reshape(-1, 2) + 0.5
+    )
+    rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
+    coefficients = np.array([0.12, -0.03, 0.002, -0.001])
+    matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    stored, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
+    picture = np.zeros((height, width, 3), np.float32)
+    for x, y in stored[:, 0]:
+        grid_y, grid_x = np.mgrid[:height, :width]
+        picture += 255 * np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / 4)[..., None]
+    write_image(folder / f"images/{view.name}.jpg", picture.clip(0, 255).astype(np.uint8), 98)
+    loaded = READERS["nerfstudio"](folder).shots[0].load().rgb[..., 0].astype(float)
+    for x, y in wanted:
+        top, left = int(y) - 4, int(x) - 4
+        patch = loaded[top : top + 9, left : left + 9]
+        rows, columns = np.mgrid[top : top + 9, left : left + 9] + 0.5
+        assert np.hypot((patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y) < 0.35
+
+
+def test_a_box_in_the_first_picture_finds_the_object_in_all(views):
+    top, left = np.argwhere(views[0].mask > 0).min(0)
+    bottom, right = np.argwhere(views[0].mask > 0).max(0) + 1
+    box = int(top) - 2, int(left) - 2, int(bottom - top) + 4, int(right - left) + 4
+    found = masks_from_box([replace(view, mask=None) for view in views], box)
+    overlaps = [
+        ((one.mask > 0.5) & (view.mask > 0.5)).sum() / ((one.mask > 0.5) | (view.mask > 0.5)).sum()
+        for one, view in zip(found, views)
+    ]
+    assert np.median(overlaps) > 0.75 and min(overlaps) > 0.4, overlaps
+
+
+def test_masks_come_from_files_by_name(tmp_path, views):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_open3d(folder, views)
+    capture = READERS["open3d"](folder)
+    with pytest.raises(InputError, match="no masks of its own"):
+        import_capture(capture, tmp_path / "data", "teapot", "mine")
+    for view in views[1:]:
+        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
+    with pytest.raises(InputError, match="has no mask 0000.png for the picture 0000.jpg"):
+        import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
+    assert not (tmp_path / "data").exists(), "nothing is half-written"
+    write_mask(tmp_path / "masks/0000.png", views[0].mask)
+    import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
+    assert Co3D(tmp_path / "data").categories() == ["teapot"]
+
+
+def test_the_fused_cloud_lies_on_the_surface(views):
+    points, colours, normals = fuse(views)
+    seen = np.concatenate([
+        view.camera.unproject(np.argwhere(view.mask > 0)[:, ::-1] + 0.5, view.depth[view.mask > 0]) for view in views
+    ])  # fmt: skip
+    from scipy.spatial import cKDTree
+
+    spread = seen.std(axis=0).mean()
+    assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
+    assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
+    assert colours.shape == points.shape
+
+
+def test_quaternions_are_rotations():
+    for seed in range(5):
+        rotation = Rotation.random(random_state=seed)
+        np.testing.assert_allclose(rotation_from_quaternion(2 * rotation.as_quat()), rotation.as_matrix(), atol=1e-12)
+    with pytest.raises(InputError, match="expected a quaternion"):
+        rotation_from_quaternion([0, 0, 0, 0])
+
+
+def break_file(name, content):
+    return lambda folder: (folder / name).write_text(content)
+
+
+def edited(change):
+    def apply(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        change(content)
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage", "message"),
+    [
+        ("tum", lambda folder: (folder / "depth.txt").unlink(), "list .*depth.txt cannot be read"),
+        ("tum", break_file("groundtruth.txt", "1 2 3\n"), "groundtruth.txt, line 1: '1 2 3', expected 8 columns"),
+        ("tum", break_file("groundtruth.txt", "9 0 0 0 0 0 0 1\n"), "no picture has depth and a pose"),
+        ("tum", break_file("rgb.txt", "1305031102.1 ../../etc/passwd\n"), "leaves the data folder"),
+        ("nerfstudio", break_file("transforms.json", "{}"), "missing required field `frames`"),
+        ("nerfstudio", edited(lambda c: c.update(camera_model="OPENCV_FISHEYE")), "camera_model is 'OPENCV_FISHEYE'"),
+        ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no fl_x, expected intrinsics"),
+        ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
+        ("nerfstudio", edited(lambda c: c["frames"][2].update(file_path="gone.jpg")), "frame 2: file gone.jpg is not"),
+        ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)), "frame 1: pose is"),
+        ("open3d", lambda folder: (folder / "depth/0003.png").unlink(), "8 pictures, 7 depth maps and 8 poses"),
+        ("open3d", break_file("trajectory.log", "0 0 1\n1 0 0 0\n"), "expected five for each pose"),
+        ("open3d", lambda folder: (folder / "camera_intrinsic.json").unlink(), "none of camera_intrinsic.json"),
+        ("lists", break_file("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
+        ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt, line 1: '1 2 x', expected numbers"),
+    ],
+)
+def test_a_broken_capture_gets_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
+    options = WRITERS[kind](tmp_path, views)
+    damage(tmp_path)
+    with pytest.raises(InputError, match=message) as caught:
+        READERS[kind](tmp_path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_boxes_and_empty_depth_are_refused(views):
+    with pytest.raises(InputError, match="expected one inside"):
+        masks_from_box(views, (0, 0, 5, 9999))
+    with pytest.raises(InputError, match="covers the whole image"):
+        grab_cut(views[0].rgb, (0, 0, *views[0].camera.size))
+    blind = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
+    with pytest.raises(InputError, match="no known depth on the object"):
+        fuse(blind)

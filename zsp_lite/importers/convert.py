@@ -1,0 +1,71 @@
+"""A capture of any known format as a sequence of a data folder in CO3D's layout."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from zsp_lite.cameras import Box
+from zsp_lite.co3d import SequenceData, write_co3d
+from zsp_lite.errors import InputError
+from zsp_lite.files import plain_name
+from zsp_lite.importers.capture import Capture
+from zsp_lite.importers.fusion import fuse, scale_frame, unit_scale
+from zsp_lite.importers.lists import read_lists
+from zsp_lite.importers.masks import masks_from_box, masks_from_files
+from zsp_lite.importers.nerfstudio import read_nerfstudio
+from zsp_lite.importers.open3d_folder import read_open3d
+from zsp_lite.importers.tum import read_tum
+
+READERS: dict[str, Callable[..., Capture]] = {
+    "tum": read_tum,
+    "nerfstudio": read_nerfstudio,
+    "open3d": read_open3d,
+    "lists": read_lists,
+}
+MAX_FRAMES = 100  # about as many as CO3D's sequences have
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What came in.  scale: what the capture's lengths were multiplied by."""
+
+    frames: int
+    points: int
+    scale: float
+
+
+def import_capture(
+    capture: Capture,
+    root: str | Path,
+    category: str,
+    sequence: str,
+    box: Box | None = None,
+    masks: str | Path | None = None,
+    max_frames: int = MAX_FRAMES,
+) -> Imported:
+    """Write a capture as `root/category/sequence`: masks, a fused cloud, all scaled as CO3D's are.
+
+    box: of the object in the first frame (top, left, height, width), for GrabCut; or masks: a folder of mask files;
+    neither: the capture's own masks. An earlier sequence of that name is replaced. Raises InputError, before anything
+    is written, on what cannot be read, masked or fused.
+    """
+    plain_name(category, "category"), plain_name(sequence, "sequence")
+    capture = capture.thinned(max_frames)
+    frames = [shot.load() for shot in capture.shots]
+    if box is not None and masks is not None:
+        raise InputError("both a box and a folder of masks are given, expected one of them")
+    if box is not None:
+        frames = masks_from_box(frames, box)
+    elif masks is not None:
+        frames = masks_from_files(frames, masks)
+    elif any(frame.mask is None for frame in frames):
+        raise InputError(
+            "the capture has no masks of its own, expected a box in its first picture or a folder of masks"
+        )
+    points, colours, normals = fuse(frames)
+    scale = unit_scale(points)
+    scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
+    times = [shot.time - capture.shots[0].time for shot in capture.shots]
+    data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
+    write_co3d(root, category, [data])
+    return Imported(len(frames), len(points), scale)

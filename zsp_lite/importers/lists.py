@@ -1,0 +1,49 @@
+"""Plain lists: rgb.txt, depth.txt, poses.txt and intrinsics.txt, for captures of any other origin.
+
+rgb.txt and depth.txt name one file a line, poses.txt has one camera-to-world matrix a line (12 or 16 numbers, row by
+row, OpenCV axes: +x right, +y down, +z forward), intrinsics.txt the 3 x 3 matrix K in pixels, with pixel centres at
+half-integers (the image's middle is at half its width). Depth files are 16-bit PNGs, or .npy.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from zsp_lite.errors import InputError
+from zsp_lite.importers.capture import Capture, Shot, camera_of, image_size, listed_file, numbers, read_rows
+
+
+def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
+    """Line n of each list belongs together.  depth_unit: world units per stored value of depth.
+
+    Raises InputError where a list is missing or broken, or their lengths differ.
+    """
+    folder = Path(folder)
+    columns = {"rgb.txt": 1, "depth.txt": 1, "poses.txt": 12}
+    rows = {name: read_rows(folder / name, count, "list") for name, count in columns.items()}
+    counts = {name: len(found) for name, found in rows.items()}
+    if len(set(counts.values())) > 1 or not counts["rgb.txt"]:
+        found = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise InputError(f"capture {folder}: lists have lines: {found}; expected equally many, at least 1")
+    matrix = _intrinsics(folder / "intrinsics.txt")
+    size, shots = None, []
+    for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
+        where = f"{folder / 'poses.txt'}, line {pose_line}"
+        values = numbers(pose, where)
+        if len(values) not in (12, 16):
+            raise InputError(f"{where}: {len(values)} numbers, expected 12 or 16")
+        to_world = np.eye(4)
+        to_world[:3] = np.array(values[:12]).reshape(3, 4)
+        path = listed_file(folder, image[0], f"{folder / 'rgb.txt'}, line {line}")
+        size = size or image_size(path)
+        camera = camera_of(to_world, matrix.diagonal()[:2], matrix[:2, 2], size, where)
+        depth_path = listed_file(folder, depth[0], f"{folder / 'depth.txt'}, line {line}")
+        shots.append(Shot(path, depth_path, camera, float(len(shots)), depth_unit))
+    return Capture(tuple(shots))
+
+
+def _intrinsics(path: Path) -> np.ndarray:
+    rows = [numbers(words, f"{path}, line {line}") for line, words in read_rows(path, 3, "intrinsics")]
+    if len(rows) != 3 or any(len(row) != 3 for row in rows):
+        raise InputError(f"intrinsics {path} have {len(rows)} lines, expected a 3 x 3 matrix in pixels")
+    return np.array(rows)

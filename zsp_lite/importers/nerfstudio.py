@@ -1,0 +1,83 @@
+"""nerfstudio's transforms.json with depth, as phone scanners export it: OpenGL cameras (+y up, looking along -z)."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from zsp_lite.annotations import decode
+from zsp_lite.errors import InputError
+from zsp_lite.files import read_bytes
+from zsp_lite.importers.capture import Capture, Shot, camera_of, listed_file
+
+FILE = "transforms.json"
+_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_Row = tuple[float, float, float, float]
+
+
+class _Intrinsics(msgspec.Struct, kw_only=True):
+    """May stand for all frames, or with each."""
+
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: int | float | None = None
+    h: int | float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+
+class _Frame(_Intrinsics, kw_only=True):
+    file_path: str
+    transform_matrix: tuple[_Row, _Row, _Row, _Row]
+    depth_file_path: str | None = None
+    mask_path: str | None = None
+
+
+class _File(_Intrinsics, kw_only=True):
+    frames: list[_Frame]
+    camera_model: str = "OPENCV"
+    depth_unit_scale_factor: float = 0.001
+
+
+def read_nerfstudio(folder: str | Path) -> Capture:
+    """The frames that have depth; files without it in the whole capture are an InputError.
+
+    Depth PNGs are in millimetres unless `depth_unit_scale_factor` says otherwise. Radial and tangential distortion is
+    taken out. Raises InputError for other camera models and missing intrinsics, naming the frame.
+    """
+    path = Path(folder) / FILE
+    content = decode(read_bytes(path, FILE), _File, path)
+    if content.camera_model not in _MODELS:
+        raise InputError(f"{path}: camera_model is {content.camera_model!r}, expected one of {', '.join(_MODELS)}")
+    shots = []
+    for number, frame in enumerate(content.frames):
+        if frame.depth_file_path is None:
+            continue
+        where = f"{path}, frame {number}"
+        given = {name: _either(frame, content, name) for name in _Intrinsics.__struct_fields__}
+        given["fl_y"] = given["fl_x"] if given["fl_y"] is None else given["fl_y"]
+        missing = [name for name in ("fl_x", "cx", "cy", "w", "h") if given[name] is None]
+        if missing:
+            raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
+        to_world = np.array(frame.transform_matrix) @ _TO_OPENCV
+        size = int(given["h"]), int(given["w"])
+        camera = camera_of(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
+        files = [None if name is None else listed_file(Path(folder), name, where)
+                 for name in (frame.file_path, frame.depth_file_path, frame.mask_path)]  # fmt: skip
+        distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2"))
+        shots.append(
+            Shot(files[0], files[1], camera, float(number), content.depth_unit_scale_factor, distortion, files[2])
+        )
+    if not shots:
+        raise InputError(f"{path}: none of {len(content.frames)} frames has depth_file_path, expected RGB-D frames")
+    return Capture(tuple(shots))
+
+
+def _either(frame: _Frame, content: _File, name: str) -> float | None:
+    own = getattr(frame, name)
+    return getattr(content, name) if own is None else own
