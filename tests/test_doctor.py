@@ -41,7 +41,11 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
 
     pins = doctor.read_pins((doctor.REPOSITORY / "environment.txt").read_text())
     project = tomllib.loads((doctor.REPOSITORY / "pyproject.toml").read_text())["project"]
-    optional = [one for extra in ("notebooks", "test", "cluster") for one in project["optional-dependencies"][extra]]
+    optional = [
+        one
+        for extra in ("notebooks", "test", "cluster", "course", "browser")
+        for one in project["optional-dependencies"][extra]
+    ]
     for requirement in map(Requirement, project["dependencies"] + optional):
         own_extra = requirement.name == "zsp-lite"
         if not own_extra and (requirement.marker is None or requirement.marker.evaluate()):
