@@ -12,6 +12,7 @@ from rich.console import Console
 
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.compare import compare, comparison_table
+from zsp_lite.benchmark.document import with_tables
 from zsp_lite.benchmark.figures import accuracy_against_views, error_curves, error_distribution, write_figures
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
@@ -170,6 +171,18 @@ def test_tables_are_written_in_all_formats(run, tmp_path):
     written = write_tables(every_table(run[1]), tmp_path)
     assert len(written) == 4 * len(every_table(run[1])) + 1 and all(path.stat().st_size for path in written)
     assert (tmp_path / "tables.html").read_text().count("<table") == len(every_table(run[1]))
+
+
+def test_a_document_gets_the_tables_that_it_has_marks_for(run):
+    first, second = (f"<!-- table {name} -->\nold\n<!-- end of table -->\n" for name in ("table_1", "table_3"))
+    text = f"before\n{first}between\n{second}"
+    once = with_tables(text, every_table(run[1]))
+    assert "old" not in once and once.startswith("before\n<!-- table table_1 -->\n**Table 1.") and "between" in once
+    assert f"{run[1]['methods']['ours']['acc30']:.1f}" in once and "hydrant" not in once
+    assert with_tables(once, every_table(run[1])) == once
+    for wrong, told in (("no marks", "no marked table"), (text.replace("table_3", "table_9"), "table_9")):
+        with pytest.raises(InputError, match=told):
+            with_tables(wrong, every_table(run[1]))
 
 
 def test_the_papers_figures_were_copied_right():

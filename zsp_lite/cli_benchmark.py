@@ -132,13 +132,22 @@ def _list_rows() -> None:
 def add_tables(commands) -> None:
     parser = _command(
         commands, "tables", _tables, "tables and figures of a finished benchmark run",
-        ["tables outputs/benchmark", "tables results.json.gz --out outputs/tables"],
+        ["tables outputs/benchmark", "tables results.json.gz --out outputs/tables",
+         "tables notebooks/results/paper_run/results.json.gz --into README.md"],
     )  # fmt: skip
     parser.add_argument("source", type=Path, help="a run's folder, or its results.json.gz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: where the run is")
+    parser.add_argument(
+        "--into", type=Path, metavar="FILE",
+        help="do nothing but put the tables that a Markdown document has marks for in their places",
+    )  # fmt: skip
 
 
 def _tables(arguments: argparse.Namespace) -> None:
+    if arguments.into:
+        if arguments.out:
+            raise InputError("tables: --into writes no folder; give it or --out")
+        return _tables_into(arguments)
     import matplotlib
 
     matplotlib.use("Agg")
@@ -152,6 +161,16 @@ def _tables(arguments: argparse.Namespace) -> None:
     console = Console()
     for table in [all_rows(results.summary), *paper_tables(results.summary)]:
         console.print(as_rich(table))
+    return None
+
+
+def _tables_into(arguments: argparse.Namespace) -> None:
+    from zsp_lite.benchmark.document import update_document
+    from zsp_lite.benchmark.results import read_results
+    from zsp_lite.benchmark.tables import every_table
+
+    update_document(arguments.into, every_table(read_results(arguments.source).summary))
+    print(f"Written: {arguments.into}")
 
 
 def add_compare(commands) -> None:

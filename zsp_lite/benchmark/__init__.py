@@ -8,7 +8,7 @@
     execution    who does the jobs: this process, a pool, Dask, any `concurrent.futures.Executor`
     storage      a run's folder, safe against a kill at any moment
     run          all of these together: `evaluate`, and `plan_run`
-    summary tables formats figures compare results reports      what is made of a run
+    summary tables formats figures document compare results reports      what is made of a run
 
 Several processes of one machine: `--workers 2`. A Dask cluster (extra `cluster`; data, backbone and the run's folder at
 the same path for all, one thread per worker):

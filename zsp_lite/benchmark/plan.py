@@ -80,9 +80,13 @@ def plan(
     """
     before = process_memory()
     frames = peak = pairs = estimates = 0
+    asked: Counter[str] = Counter()  # frames by who has to describe them
     for found in work.values():
         ordered = [item for chunk in split(found, 1) for item in chunk]
         frames += len({key for pair, _ in ordered for key in frame_keys(pair)})
+        for name in extractors:
+            asked[name] += len({key for pair, names in ordered if name in {rows[row].features for row in names}
+                                for key in frame_keys(pair)})  # fmt: skip
         peak = max(peak, frames_at_once([pair for pair, _ in ordered]))
         pairs += len(ordered)
         estimates += sum(len(names) for _, names in ordered)
@@ -91,18 +95,14 @@ def plan(
         return Plan(0, 0, 0, before, 0, 0, 0.0, 0.0, default_threads(1), "nothing is left to do")
     store = FrameStore(Co3D(root), category, extractors, threads=1)
     labels = read_labels(root, category)
-    spent_on_frames = 0.0
     timed: Counter[tuple] = Counter()
     took: dict[tuple, float] = {}
     with one_thread_each():
         _warm_up(store, found, rows, labels)
         start = time.perf_counter()
-        described = 0
         for pair, names in _each_kind(found):
             record = evaluate_pair(pair, {name: rows[name] for name in names}, store, labels)
             on_frames = sum(record["spent"].get(name, (0, 0.0))[1] for name in ("reading", *extractors))
-            described += record["spent"].get("reading", (0, 0.0))[0]
-            spent_on_frames += on_frames
             kind = len(pair.target_frames), tuple(names)
             timed[kind] += 1
             took[kind] = took.get(kind, 0.0) + record["seconds"] - on_frames
@@ -111,6 +111,8 @@ def plan(
                 break
     kinds = Counter((len(pair.target_frames), tuple(names)) for one in work.values() for pair, names in one)
     mean = sum(took.values()) / sum(timed.values())
+    each = {name: spent.seconds / spent.times for name, spent in store.spent.items() if spent.times}
+    spent_on_frames = frames * each.get("reading", 0.0) + sum(n * each.get(name, 0.0) for name, n in asked.items())
     spent_on_rows = sum(n * (took[kind] / timed[kind] if kind in took else mean) for kind, n in kinds.items())
     key = frame_keys(found[-1][0])[0]
     feature_bytes = sum(_bytes(one) for name in extractors
@@ -118,7 +120,7 @@ def plan(
     results = pairs * _LINE_BYTES + estimates * _ROW_BYTES
     return Plan(
         frames, pairs, estimates, before + peak * (_CROP_BYTES + feature_bytes), results, frames * feature_bytes,
-        spent_on_frames / max(described, 1), spent_on_rows / pairs, default_threads(1),
+        spent_on_frames / frames, spent_on_rows / pairs, default_threads(1),
         f"{sum(timed.values())} pairs of {category}",
     )  # fmt: skip
 

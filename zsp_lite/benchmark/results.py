@@ -14,13 +14,13 @@ from zsp_lite.files import read_bytes, write_atomic
 RESULTS = "results.json.gz"
 # Beyond these decimals an error in degrees, or a length, says nothing.
 _DECIMALS = 4
-_KEPT = ("error", "translation_error", "scale", "view", "inliers")
+_KEPT = ("error", "translation_error", "scale", "view", "inliers", "confidence")
 
 
 @dataclass(frozen=True)
 class Results:
     """summary: what OUT/summary.json says.  settings, invocations: of the run.  rows: by name and pair key, what each
-    row found: "error" in degrees, and where it has them "translation_error", "scale", "view", "inliers".
+    row found: "error" in degrees, and where it has them "translation_error", "scale", "view", "inliers", "confidence".
     """
 
     summary: dict[str, Any]

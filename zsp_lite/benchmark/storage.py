@@ -149,6 +149,7 @@ def merge(record: dict, line: Mapping[str, Any]) -> None:
 
 def surroundings() -> dict[str, Any]:
     """What a run's results may one day have to be explained by: versions, revision, machine, command."""
+    program = Path(sys.argv[0]).name  # `python -m zsp_lite` is the same command under another name
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -157,7 +158,7 @@ def surroundings() -> dict[str, Any]:
             continue
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
         "versions": versions,
         "git": git_revision(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},

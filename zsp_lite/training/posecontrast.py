@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from safetensors.torch import save_file
 from torch import Tensor
 
 from zsp_lite.baselines.posecontrast import (
@@ -33,6 +32,7 @@ from zsp_lite.metrics import accuracy, median, rotation_error
 from zsp_lite.training.batches import MEAN, STD
 from zsp_lite.training.batches import _recolour as recolour
 from zsp_lite.training.object_crops import VIEWS, ObjectCrops, object_crops
+from zsp_lite.training.swav import export
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class PoseContrastConfig:
     """What decides the result.  tilt: degrees (standard deviation) by which pictures are turned in their plane."""
 
     seed: int = 0
-    objects: int = 2400
-    steps: int = 1500
-    batch: int = 64
+    objects: int = 1500
+    steps: int = 450
+    batch: int = 32
     learning_rate: float = 1e-3
     weight_decay: float = 5e-4
     contrast: float = 1.0
@@ -90,20 +90,16 @@ def train(
             optimiser.zero_grad()
             (loss + config.contrast * contrast).backward()
             for group in optimiser.param_groups:
-                warm = min(1.0, (step + 1) / 100)
+                warm = min(1.0, (step + 1) / 30)
                 group["lr"] = config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
             optimiser.step()
-            if (step + 1) % 100 == 0 or step + 1 == config.steps:
+            if (step + 1) % 50 == 0 or step + 1 == config.steps:
                 row = {"step": step + 1, "loss": round(loss.item(), 4), "contrast": round(contrast.item(), 4)}
                 row |= held_out_errors(model, held_out)
                 file.write(json.dumps(row) + "\n")
                 file.flush()
                 log("  ".join(f"{name} {value}" for name, value in row.items()))
-    path = folder / "posecontrast-tiny.safetensors"
-    weights = {name: value.contiguous() for name, value in model.state_dict().items() if "num_batches" not in name}
-    save_file(weights, path, metadata={"name": "posecontrast-tiny"})
-    path.chmod(0o644)  # safetensors makes files that only their owner reads
-    return path
+    return export(model, folder / "posecontrast-tiny.safetensors")
 
 
 def sample(

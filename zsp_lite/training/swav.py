@@ -32,10 +32,10 @@ class SwavConfig:
     """What decides the result. Sides are pixels, scales the crops' width as a fraction (low, high) of the picture's."""
 
     seed: int = 0
-    objects: int = 2400
-    steps: int = 900
-    batch: int = 96
-    prototypes: int = 64  # SwAV has 3,000, for a thousand kinds of object
+    objects: int = 1500
+    steps: int = 320
+    batch: int = 48
+    prototypes: int = 32  # SwAV has 3,000, for a thousand kinds of object
     large: int = 96
     small: int = 48
     large_scale: tuple[float, float] = (0.5, 1.0)
@@ -117,17 +117,24 @@ def train(
             if step < config.steps // 20:  # SwAV holds the prototypes for the first epoch
                 model.prototypes.grad = None
             for group in optimiser.param_groups:
-                warm = min(1.0, (step + 1) / 50)
+                warm = min(1.0, (step + 1) / 20)
                 group["lr"] = config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
             optimiser.step()
-            if (step + 1) % 50 == 0 or step + 1 == config.steps:
+            if (step + 1) % 20 == 0 or step + 1 == config.steps:
                 row = {"step": step + 1, "loss": round(loss.item(), 4), "evenness": round(evenness, 4)}
                 file.write(json.dumps(row) + "\n")
                 file.flush()
                 log("  ".join(f"{name} {value}" for name, value in row.items()))
-    path = folder / "swav-tiny.safetensors"
-    weights = {name: x.contiguous() for name, x in model.backbone.state_dict().items() if "num_batches" not in name}
-    save_file(weights, path, metadata={"name": "swav-tiny"})
+    return export(model.backbone, folder / "swav-tiny.safetensors")
+
+
+def export(module: nn.Module, path: Path) -> Path:
+    """Write a network's weights in half precision; what batch norms measured stays in single, for it has any range."""
+    weights = {}
+    for name, value in module.state_dict().items():
+        if not name.endswith("num_batches_tracked"):
+            weights[name] = (value if "running_" in name else value.half()).contiguous()
+    save_file(weights, path, metadata={"name": path.stem})
     path.chmod(0o644)  # safetensors makes files that only their owner reads
     return path
 

@@ -1,0 +1,48 @@
+"""A run's tables inside a Markdown document, such as a README: what stands between a table's marks is replaced.
+
+<!-- table table_1 -->
+(anything)
+<!-- end of table -->
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from zsp_lite.benchmark.formats import as_markdown
+from zsp_lite.benchmark.tables import Table
+from zsp_lite.errors import InputError
+from zsp_lite.files import read_bytes, write_atomic
+
+_MARKED = re.compile(r"(<!-- table (\S+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
+_CATEGORY = re.compile(r"\w+ Acc30")
+
+
+def with_tables(text: str, tables: Sequence[Table]) -> str:
+    """The text with its marked tables anew, without their notes and columns of single categories.
+
+    Raises InputError for a mark that names no table of the run, and where there is none.
+    """
+    by_name = {table.name: table for table in tables}
+    if not _MARKED.search(text):
+        raise InputError("document has no marked table, expected <!-- table NAME --> and <!-- end of table -->")
+
+    def fresh(found: re.Match[str]) -> str:
+        start, name, _, end = found.groups()
+        if name not in by_name:
+            raise InputError(f"document asks for table {name}, the run has {', '.join(by_name)}")
+        return f"{start}{as_markdown(_narrow(by_name[name]))}\n{end}"
+
+    return _MARKED.sub(fresh, text)
+
+
+def update_document(path: str | Path, tables: Sequence[Table]) -> None:
+    """Write the tables into a file. Raises what `with_tables` does."""
+    text = read_bytes(Path(path), "document").decode()
+    write_atomic(path, with_tables(text, tables).encode())
+
+
+def _narrow(table: Table) -> Table:
+    kept = [i for i, column in enumerate(table.columns) if not _CATEGORY.fullmatch(column.title)]
+    rows = tuple((label, tuple(cells[i] for i in kept)) for label, cells in table.rows)
+    return Table(table.name, table.title, tuple(table.columns[i] for i in kept), rows)
