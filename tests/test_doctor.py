@@ -1,5 +1,8 @@
 """The doctor sees what is missing and names the command that mends it."""
 
+import subprocess
+import sys
+
 import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
@@ -101,3 +104,11 @@ def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
     for extra, (modules, _) in doctor.EXTRAS.items():
         names = {Requirement(one).name for one in project["optional-dependencies"][extra]}
         assert names == {module.replace("_", "-") for module in modules}
+
+
+def test_open3d_says_nothing_in_a_notebook():
+    """It looks for IPython's shell by the name of its class, and would start a web server there."""
+    notebook = "import builtins; builtins.get_ipython = type('ZMQInteractiveShell', (), {})\n"
+    code = notebook + "from zsp_lite.open3d_import import load_open3d; load_open3d()"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout == ""
