@@ -7,7 +7,7 @@ and a contrastive term that pushes two pictures' features apart the more, the mo
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ from zsp_lite.metrics import accuracy, median, rotation_error
 from zsp_lite.training.batches import MEAN, STD
 from zsp_lite.training.batches import _recolour as recolour
 from zsp_lite.training.object_crops import VIEWS, ObjectCrops, object_crops
-from zsp_lite.training.swav import export
+from zsp_lite.training.swav import export, note_config
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def train(
     training, held_out = (
         crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS) if len(crops) > VIEWS else (crops, crops)
     )
-    (folder / "posecontrast-tiny.json").write_text(json.dumps(asdict(config), indent=1) + "\n")
+    note_config(config, folder / "posecontrast-tiny.json")
     torch.manual_seed(config.seed)
     model = TinyParts()
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)

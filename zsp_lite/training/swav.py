@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from zsp_lite.baselines.resnet import TINY, ResNet
 from zsp_lite.baselines.swav import normalised
 from zsp_lite.errors import InputError
 from zsp_lite.matchers import sinkhorn
+from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.batches import MEAN, STD
 from zsp_lite.training.batches import _crop_grids as crop_grids
 from zsp_lite.training.batches import _recolour as recolour
@@ -99,7 +101,7 @@ def train(
     """Render, train, and export `folder`/swav-tiny.safetensors, with its configuration and log beside it."""
     folder = Path(folder)
     crops = object_crops(folder / "crops", config.objects, config.seed, progress=progress)
-    (folder / "swav-tiny.json").write_text(json.dumps(asdict(config), indent=1) + "\n")
+    note_config(config, folder / "swav-tiny.json")
     torch.manual_seed(config.seed)
     model = Network(config.prototypes)
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
@@ -126,6 +128,11 @@ def train(
                 file.flush()
                 log("  ".join(f"{name} {value}" for name, value in row.items()))
     return export(model.backbone, folder / "swav-tiny.safetensors")
+
+
+def note_config(config: Any, path: Path) -> None:
+    """Write down what decides a training's result, and whose pictures it sees."""
+    path.write_text(json.dumps(asdict(config) | {"categories": list(TRAINING)}, indent=1) + "\n")
 
 
 def export(module: nn.Module, path: Path) -> Path:
