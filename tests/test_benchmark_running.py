@@ -334,6 +334,9 @@ def test_a_plan_counts_what_the_run_then_does(tmp_path):
 def test_a_plan_shares_the_work_out():
     made = Plan(100, 10, 40, 2**30, 10_000, 2**40, 0.2, 0.3, 2, "4 pairs of lump")
     assert made.seconds(1) - made.seconds(2) == pytest.approx((100 * 0.2 + 10 * 0.3) / 2)
+    larger = made.scaled(3000, 50)
+    assert larger.seconds(1) - larger.seconds(2) == pytest.approx((3000 * 0.2 + 50 * 0.3) / 2)
+    assert (larger.estimates, larger.results_bytes, larger.cache_bytes) == (200, 50_000, 30 * 2**40)
     text = "\n".join(made.lines(8))
     assert "1 worker," in text and "8 workers" in text and "1.0 TiB" in text and "1.0 GiB" in text
     assert [duration(s) for s in (5, 600, 7200, 200_000)] == ["5 s", "10 min", "2 h 0 min", "2 d 8 h"]

@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,14 @@ class Plan:
         (Of other machines, give as many workers as cores, and think of them as this machine's.)
         """
         return _START_SECONDS + (self.frames * self.frame_seconds + self.pairs * self.pair_seconds) / workers
+
+    def scaled(self, frames: int, pairs: int) -> "Plan":
+        """The same rows on so many frames and pairs of other data, at the pace that was measured here."""
+        more_frames, more_pairs = frames / max(self.frames, 1), pairs / max(self.pairs, 1)
+        return replace(
+            self, frames=frames, pairs=pairs, estimates=round(self.estimates * more_pairs),
+            results_bytes=round(self.results_bytes * more_pairs), cache_bytes=round(self.cache_bytes * more_frames),
+        )  # fmt: skip
 
     def lines(self, workers: int) -> list[str]:
         """For people to read."""
