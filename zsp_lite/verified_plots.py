@@ -29,10 +29,10 @@ KINDS: dict[str, tuple[str, str]] = {
 _ON, _HIDDEN, _FLOATING, _OUTSIDE, _UNKNOWN = range(5)
 # What to call the parts of the evidence, and the values at the ends of their colours.
 _TERMS = {
-    "off": ("way out of the silhouette (1: costs in full)", (0.0, 1.0)),
-    "front": ("way before the surface (1: costs in full)", (0.0, 1.0)),
-    "touch": ("weight as a point on the surface", (0.0, 1.0)),
-    "alike": ("similarity, less its means", (-0.3, 0.3)),
+    "off": ("offence (1: in full)", (0.0, 1.0)),
+    "front": ("offence (1: in full)", (0.0, 1.0)),
+    "touch": ("on the surface (weight)", (0.0, 1.0)),
+    "alike": ("similarity", (-0.3, 0.3)),
 }
 _HATCHES = ("", "///", "...", "xx")
 _COLOURS = (BLUE, ORANGE, "0.6", VERMILLION)
