@@ -16,5 +16,5 @@ WIDGETS: dict[str, str] = {
     "one_outlier": "alignment:example_one_outlier",
     "measured_accuracy": "metrics:example_measured_accuracy",
     "symmetry_turn": "metrics:example_symmetry_turn",
-    "ranked hypotheses": "verified:example_ranked_hypotheses",
+    "ranked_hypotheses": "verified:example_ranked_hypotheses",
 }
