@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 
 from zsp_lite.best_view import VIEW_SELECTORS, Comparison
+from zsp_lite.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, CHOSEN, patch_centres
 from zsp_lite.views import View
@@ -65,19 +66,23 @@ def match_canvas(axis: Axes, first: np.ndarray, second: np.ndarray, titles: tupl
 
 
 def around(
-    centres: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"]
+    cameras: Sequence[Camera], others: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 2"]]:
-    """Camera centres that walk round an object, seen from above: unit vectors from the middle of the walk.
+    """Where cameras that walk round an object stand, seen from above: unit vectors from the middle of the walk.
 
-    centres: the walk, in any frame.  others: more centres in the same frame.  The plane is the walk's own.
-    Raises InputError for fewer than three centres, or a walk along a line, which goes round nothing.
+    others: more camera centres in the same world.  The plane is the walk's own; up is what the cameras have above.
+    Raises InputError for fewer than three cameras, or a walk along a line, which goes round nothing.
     """
-    centres, others = np.asarray(centres, np.float64), np.asarray(others, np.float64)
+    centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
     middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
     _, spread, axes = np.linalg.svd(centres - middle)
     if len(centres) < 3 or spread[1] < 0.05 * spread[0]:
         raise InputError(f"{len(centres)} camera centres are too few or on one line, expected a walk round an object")
-    flat = [(points - middle) @ axes[:2].T for points in (centres, others)]
+    across, ahead = axes[:2]
+    down = np.mean([camera.R[1] for camera in cameras], axis=0)
+    if np.cross(across, ahead) @ down > 0:
+        ahead = -ahead
+    flat = [(points - middle) @ np.stack([across, ahead], axis=1) for points in (centres, np.asarray(others))]
     return tuple(points / np.linalg.norm(points, axis=1, keepdims=True) for points in flat)
 
 
@@ -197,7 +202,8 @@ def example_best_view():
     method = ZeroShotPose(backbone)
     compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     truths = [relative_pose(first, frames[0].camera, second, frame.camera) for frame in frames[1:]]
-    centres = np.stack([frame.camera.centre for frame in frames[1:]])
     seen_from = second.trans @ np.linalg.inv(first.trans) @ np.append(frames[0].camera.centre, 1)
     angles = rotation_error(np.eye(3), np.stack(truths)[:, :3, :3])
-    return best_view(reference, targets, compared, around(centres, seen_from[None, :3]), angles)
+    return best_view(
+        reference, targets, compared, around([frame.camera for frame in frames[1:]], seen_from[None, :3]), angles
+    )
