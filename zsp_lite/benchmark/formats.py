@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 
 from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, Cell, Table
@@ -17,8 +18,11 @@ _NOTHING = "–"
 
 def as_rich(table: Table) -> RichTable:
     """For a terminal: an interval below its figure, published figures dim and headed as such."""
-    made = RichTable(title=table.title, caption=table.note or None, caption_justify="left")
-    made.add_column("", justify="left")
+    made = RichTable(
+        title=table.title, caption=table.note or None, caption_justify="left", box=SIMPLE_HEAD, pad_edge=False
+    )
+    longest = max((len(label) for label, _ in table.rows), default=0)
+    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
     for column in table.columns:
         group = column.group.removeprefix(THIS_RUN).removeprefix(": ")
         title = column.title.replace(" (", "\n(")
