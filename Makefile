@@ -7,13 +7,15 @@ RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test lab notebooks doctor clean
+.PHONY: help demo test lab notebooks browser exercises doctor clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
 	@echo "make test       unit tests, then every notebook re-executed and checked (nbval)"
 	@echo "make lab        JupyterLab on the notebooks"
 	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
+	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
+	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
 	@echo "make clean      remove .venv, caches and outputs/"
 	@echo "PYTHON=/path/to/python3.12 make demo   chooses the interpreter (3.11 or newer)"
@@ -44,6 +46,15 @@ lab: $(STAMP)
 
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
+
+# Part of `make test` too; skipped where there is no Chromium.
+browser: $(STAMP)
+	$(RUN) -m pytest -v tests/browser
+
+# nbgrader calls `alembic` by name.
+exercises: $(STAMP)
+	cd notebooks/exercises && PATH="$(CURDIR)/$(VENV)/bin:$$PATH" && \
+	  for folder in source/*; do nbgrader generate_assignment --force "$${folder#source/}" || exit 1; done
 
 doctor: $(STAMP)
 	$(RUN) -m zsp_lite doctor

@@ -1,0 +1,183 @@
+"""A JupyterLab of one's own on loopback, and what a reader does there: open, run, look, move a slider."""
+
+import json
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[2]
+
+# A notebook of which every cell is in the page, no news asked for.
+_SETTINGS = {
+    "@jupyterlab/notebook-extension/tracker": {"windowingMode": "none"},
+    "@jupyterlab/apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
+    "@jupyterlab/docmanager-extension/plugin": {"autosave": False},
+}
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A running server. `url` is its address, `token` opens it."""
+
+    url: str
+    token: str
+
+    def ask(self, path: str, method: str = "GET"):
+        """The server's answer below /api/, decoded; None where it is empty."""
+        request = urllib.request.Request(
+            f"{self.url}/api/{path}", method=method, headers={"Authorization": f"token {self.token}"}
+        )
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            body = answer.read()
+        return json.loads(body) if body else None
+
+    def stop_kernels(self) -> None:
+        for session in self.ask("sessions"):
+            self.ask(f"sessions/{session['id']}", "DELETE")
+
+
+@contextmanager
+def serve(folder: Path, state: Path, data: Path, patience: float = 180):
+    """A `Lab` on `folder`, with settings, workspaces and log in `state`, so that the user's own stay as they are."""
+    for plugin, settings in _SETTINGS.items():
+        path = state / "settings" / f"{plugin}.jupyterlab-settings"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(settings))
+    environment = os.environ | {
+        "JUPYTERLAB_SETTINGS_DIR": str(state / "settings"),
+        "JUPYTERLAB_WORKSPACES_DIR": str(state / "workspaces"),
+        "JUPYTER_CONFIG_DIR": str(state / "config"),
+        "JUPYTER_RUNTIME_DIR": str(state / "runtime"),
+        "IPYTHONDIR": str(state / "ipython"),
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")])),
+        "ZSP_LITE_DATA": str(data),
+    }
+    environment.pop("MPLBACKEND", None)  # the tests' own: kernels draw into the notebook
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    lab = Lab(f"http://127.0.0.1:{port}", secrets.token_hex(16))
+    command = [
+        sys.executable, "-m", "jupyter", "lab", "--no-browser", "--allow-root", "--ServerApp.ip=127.0.0.1",
+        f"--ServerApp.port={port}", "--ServerApp.port_retries=0", f"--IdentityProvider.token={lab.token}",
+        f"--ServerApp.root_dir={folder}",
+        "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False}}",
+    ]  # fmt: skip
+    with open(state / "jupyterlab.log", "w") as log:
+        server = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        deadline = time.monotonic() + patience
+        while not _answers(lab):
+            if server.poll() is not None or time.monotonic() > deadline:
+                raise RuntimeError(f"JupyterLab did not start:\n{(state / 'jupyterlab.log').read_text()[-3000:]}")
+            time.sleep(0.5)
+        yield lab
+        lab.stop_kernels()
+    finally:
+        server.terminate()
+        server.wait(timeout=30)
+
+
+def _answers(lab: Lab) -> bool:
+    try:
+        lab.ask("status")
+    except (urllib.error.URLError, ConnectionError, TimeoutError):
+        return False
+    return True
+
+
+def open_notebook(page, lab: Lab, name: str) -> None:
+    """Show a notebook, and wait until its kernel is there."""
+    page.goto(f"{lab.url}/lab/tree/{name}?reset&token={lab.token}", timeout=180_000)
+    page.wait_for_selector(".jp-Notebook .jp-CodeCell", timeout=180_000)
+    page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=180_000)
+
+
+def run_all(page, patience: float) -> None:
+    """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
+    page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+    page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
+    deadline = time.monotonic() + patience
+    rest = 0
+    while rest < 3:  # between two cells there is a moment in which none runs
+        prompts = page.locator(".jp-Notebook .jp-CodeCell .jp-InputPrompt").all_inner_texts()
+        running = [number for number, prompt in enumerate(prompts) if "*" in prompt]
+        rest = 0 if running or not any(prompt.strip("[]: ") for prompt in prompts) else rest + 1
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"code cells {running} of {len(prompts)} had not run after {patience:.0f} s")
+        time.sleep(1)
+    page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=60_000)
+
+
+def saved(page, lab: Lab, name: str) -> dict:
+    """The notebook as it is after saving it."""
+    page.keyboard.press("Control+s")
+    page.wait_for_selector(".jp-mod-dirty", state="detached", timeout=60_000)
+    return lab.ask(f"contents/{name}")["content"]
+
+
+def errors(page, notebook: dict) -> list[str]:
+    """What went wrong: error outputs of a saved notebook, cells that never ran, and what the page cannot show."""
+    found = []
+    for number, cell in enumerate(notebook["cells"]):
+        if cell["cell_type"] == "code":
+            outputs = [output for output in cell["outputs"] if output["output_type"] == "error"]
+            found += [f"cell {number}: {output['ename']}: {output['evalue']}" for output in outputs]
+            if cell["execution_count"] is None:
+                found.append(f"cell {number} did not run")
+    for failure in ("Error displaying widget", "Error creating widget", "Loading widget...", "JavaScript Error"):
+        found += [failure] * page.locator(".jp-OutputArea-output", has_text=failure).count()
+    broken = (
+        "() => [...document.querySelectorAll('.jp-Notebook img')].filter(e => e.complete && !e.naturalWidth).length"
+    )
+    return found + ["a picture that cannot be shown"] * page.evaluate(broken)
+
+
+def slider_outputs(page) -> list:
+    """One locator for each output that has a slider in it."""
+    return page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".noUi-handle")).all()
+
+
+# Everything that is drawn, as text: pixels of images and canvases, plotly's SVG.
+_PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .js-plotly-plot')].map(async e => {
+  if (e.tagName == 'DIV') return e.innerHTML;
+  if (e.tagName == 'CANVAS') return e.toDataURL();
+  await e.decode();
+  const c = document.createElement('canvas');
+  [c.width, c.height] = [e.naturalWidth, e.naturalHeight];
+  c.getContext('2d').drawImage(e, 0, 0);
+  return c.toDataURL();
+})).then(all => all.join('|'))"""
+
+
+def slider_moves_picture(output, patience: float = 20) -> bool:
+    """Whether the pictures of a widget change when one of its sliders is moved by keyboard."""
+    output.scroll_into_view_if_needed()
+    before = output.evaluate(_PICTURES)
+    for handle in output.locator(".noUi-handle").all():
+        for key in ("ArrowRight", "ArrowLeft", "ArrowLeft"):  # it may stand at one end
+            handle.focus()
+            handle.press(key)
+            deadline = time.monotonic() + patience / 3
+            while time.monotonic() < deadline:
+                time.sleep(0.2)
+                if output.evaluate(_PICTURES) != before:
+                    return True
+    return False
+
+
+def photograph(page, path: Path, width: int = 1300, highest: int = 16_000) -> None:
+    """The whole notebook as one picture, as far as Chromium can draw (`highest` pixels)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    height = page.evaluate("() => document.querySelector('.jp-WindowedPanel-outer').scrollHeight")
+    page.set_viewport_size({"width": width, "height": min(height + 150, highest)})
+    time.sleep(2)  # until everything is laid out anew
+    page.screenshot(path=path, timeout=120_000)

@@ -1,0 +1,107 @@
+"""Every notebook runs in a real JupyterLab, in a real browser, without an error, and its widgets answer."""
+
+import shutil
+from pathlib import Path
+
+import nbformat
+import pytest
+from lab_in_browser import (
+    REPOSITORY,
+    errors,
+    open_notebook,
+    photograph,
+    run_all,
+    saved,
+    serve,
+    slider_moves_picture,
+    slider_outputs,
+)
+from nbformat.v4 import new_code_cell, new_notebook
+
+NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
+PICTURES = REPOSITORY / "outputs" / "browser"
+MINUTES = 20  # a notebook may take on a busy machine
+
+BROKEN = """\
+import io, ipywidgets, matplotlib.pyplot as plt
+drawn = io.BytesIO()
+plt.figure(figsize=(1, 1)).savefig(drawn, format="png")
+plt.close("all")
+display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.getvalue())]))
+"""
+
+
+def chromium(playwright) -> str | None:
+    """The system's Chromium or Chrome, or else the one that Playwright has installed."""
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    found = next(filter(None, map(shutil.which, names)), None)
+    own = playwright.chromium.executable_path
+    return found or (own if Path(own).exists() else None)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        program = chromium(playwright)
+        if program is None:
+            pytest.skip(
+                "no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one"
+            )
+        options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
+        options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
+        running = playwright.chromium.launch(executable_path=program, args=options)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def lab(browser, tmp_path_factory):
+    """JupyterLab on copies of notebooks, without their outputs, and data."""
+    folder = tmp_path_factory.mktemp("lab")
+    shutil.copytree(REPOSITORY / "notebooks", folder / "notebooks", ignore=shutil.ignore_patterns("exercises", ".*"))
+    shutil.copytree(REPOSITORY / "data_samples", folder / "data_samples")
+    for path in (folder / "notebooks").glob("*.ipynb"):
+        notebook = nbformat.read(path, as_version=4)
+        for cell in notebook.cells:
+            if cell.cell_type == "code":
+                cell.outputs, cell.execution_count = [], None
+        nbformat.write(notebook, path)
+    cells = [new_code_cell(source) for source in (BROKEN, "1 / 0", "'never reached'")]
+    python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    broken = new_notebook(cells=cells, metadata=python)
+    nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
+    with serve(folder / "notebooks", folder, folder / "data_samples") as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser, lab):
+    context = browser.new_context(viewport={"width": 1300, "height": 1000})
+    yield context.new_page()
+    context.close()
+    lab.stop_kernels()
+
+
+def test_a_broken_notebook_is_found_out(page, lab):
+    open_notebook(page, lab, "broken.ipynb")
+    run_all(page, patience=300)
+    assert errors(page, saved(page, lab, "broken.ipynb")) == [
+        "cell 1: ZeroDivisionError: division by zero",
+        "cell 2 did not run",
+    ]
+    (output,) = slider_outputs(page)
+    assert not slider_moves_picture(output, patience=3)
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
+    open_notebook(page, lab, name)
+    run_all(page, patience=60 * MINUTES)
+    try:
+        assert not errors(page, saved(page, lab, name))
+        silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]
+        assert not silent, f"pictures of widgets {silent} of {name} did not change when their sliders were moved"
+    finally:
+        photograph(page, PICTURES / f"{Path(name).stem}.png")
