@@ -176,13 +176,13 @@ def test_tables_are_written_in_all_formats(run, tmp_path):
 def test_a_document_gets_the_tables_that_it_has_marks_for(run):
     first, second = (f"<!-- table {name} -->\nold\n<!-- end of table -->\n" for name in ("table_1", "table_3"))
     text = f"before\n{first}between\n{second}"
-    once = with_tables(text, every_table(run[1]))
+    once = with_tables(text, every_table(run[1]), 1234)
     assert "old" not in once and once.startswith("before\n<!-- table table_1 -->\n**Table 1.") and "between" in once
     assert f"{run[1]['methods']['ours']['acc30']:.1f}" in once and "hydrant" not in once
-    assert with_tables(once, every_table(run[1])) == once
+    assert with_tables(once, every_table(run[1]), 1234) == once
     for wrong, told in (("no marks", "no marked table"), (text.replace("table_3", "table_9"), "table_9")):
         with pytest.raises(InputError, match=told):
-            with_tables(wrong, every_table(run[1]))
+            with_tables(wrong, every_table(run[1]), 1234)
 
 
 def test_the_papers_figures_were_copied_right():

@@ -122,7 +122,7 @@ def _list_rows() -> None:
         parts += [method.answer] if method.answer != "pose" else []
         parts += [f"{key}={value}" for key, value in method.settings.items()]
         parts += [f"{method.targets} target views"] if method.targets else []
-        parts += [f"{method.solve.__module__}:{method.solve.__name__}"] if method.solve else []
+        parts += [_source(method.solve)] if method.solve else []
         print(f"{name:20} {', '.join(parts) or 'the paper, K = 50 with k-means'}")
     print("\nGroups:")
     for name, rows in GROUPS.items():
@@ -169,7 +169,8 @@ def _tables_into(arguments: argparse.Namespace) -> None:
     from zsp_lite.benchmark.results import read_results
     from zsp_lite.benchmark.tables import every_table
 
-    update_document(arguments.into, every_table(read_results(arguments.source).summary))
+    summary = read_results(arguments.source).summary
+    update_document(arguments.into, every_table(summary), max(row["n"] for row in summary["methods"].values()))
     print(f"Written: {arguments.into}")
 
 

@@ -18,9 +18,10 @@ _MARKED = re.compile(r"(<!-- table (\S+) -->\n)(.*?)(<!-- end of table -->)", re
 _CATEGORY = re.compile(r"\w+ Acc30")
 
 
-def with_tables(text: str, tables: Sequence[Table]) -> str:
+def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     """The text with its marked tables anew, without their notes and columns of single categories.
 
+    pairs: that the run's figures are of; the titles say so.
     Raises InputError for a mark that names no table of the run, and where there is none.
     """
     by_name = {table.name: table for table in tables}
@@ -31,18 +32,18 @@ def with_tables(text: str, tables: Sequence[Table]) -> str:
         start, name, _, end = found.groups()
         if name not in by_name:
             raise InputError(f"document asks for table {name}, the run has {', '.join(by_name)}")
-        return f"{start}{as_markdown(_narrow(by_name[name]))}\n{end}"
+        return f"{start}{as_markdown(_narrow(by_name[name], pairs))}\n{end}"
 
     return _MARKED.sub(fresh, text)
 
 
-def update_document(path: str | Path, tables: Sequence[Table]) -> None:
+def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> None:
     """Write the tables into a file. Raises what `with_tables` does."""
     text = read_bytes(Path(path), "document").decode()
-    write_atomic(path, with_tables(text, tables).encode())
+    write_atomic(path, with_tables(text, tables, pairs).encode())
 
 
-def _narrow(table: Table) -> Table:
+def _narrow(table: Table, pairs: int) -> Table:
     kept = [i for i, column in enumerate(table.columns) if not _CATEGORY.fullmatch(column.title)]
     rows = tuple((label, tuple(cells[i] for i in kept)) for label, cells in table.rows)
-    return Table(table.name, table.title, tuple(table.columns[i] for i in kept), rows)
+    return Table(table.name, f"{table.title} ({pairs:,} pairs)", tuple(table.columns[i] for i in kept), rows)
