@@ -1,6 +1,7 @@
 """Labels from picks: what is known comes back, nothing is lost, and bad picks are refused in one line."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks, rigid_label
 from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.desktop import label_category
+from zsp_lite.labelling.guess import guess_alignment
 from zsp_lite.labels import PoseLabel, read_labels, write_label
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.export import POSES_FILE, export_categories
@@ -231,3 +233,30 @@ def test_the_contact_sheet_has_a_row_for_every_candidate(root):
     assert figure.axes[0].get_ylabel() == "best\ncloud 3.00\nviews 2.00"
     with pytest.raises(InputError, match="no candidate sequences"):
         contact_sheet(dataset, "chair", [])
+
+
+def test_without_a_display_the_window_says_so_at_once(root, monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    labelling = Labelling(root, "chair")
+    with pytest.raises(InputError, match="DISPLAY is not set"):
+        label_category(labelling, lambda _: "q", lambda _: None)
+
+
+def test_the_method_proposes_an_alignment_with_a_confidence(tmp_path):
+    """With features that know the surface the guess is the truth; a real backbone's is as good as the method."""
+    from synthetic_views import CoordinateBackbone, look_at, render
+
+    turned = Sim3(1.2, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.array([0.1, 0, 0.05]))
+    placed = {"a": Sim3.identity(), "b": turned}
+    for name, placement in placed.items():
+        directions = [(1, 0.6, 0.4), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4)]
+        frames = [render(look_at(direction, 4.5), placement, name) for direction in directions]
+        sequence = replace(sequence_data(name), frames=frames)
+        write_co3d(tmp_path, "egg", [sequence], quality=100)
+    sim3, confidence = guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "b", references=2, views=4)
+    assert rotation_error(sim3.R, turned.R) < 10 and sim3.scale == pytest.approx(1.2, rel=0.15)
+    assert 0 <= confidence <= 1
+    with pytest.raises(InputError, match="no frames of a sequence 'c'"):
+        guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "c")

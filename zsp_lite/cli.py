@@ -47,11 +47,12 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr, exit code 2.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    from zsp_lite import cli_benchmark as benchmark  # which takes its helpers from here
+    from zsp_lite import cli_benchmark as benchmark  # which take their helpers from here
+    from zsp_lite import cli_data as data
 
     for add in (
         _add_demo, benchmark.add_benchmark, benchmark.add_tables, benchmark.add_compare, _add_synth, _add_weights,
-        _add_train, benchmark.add_train_baseline, _add_profile, _add_doctor,
+        _add_train, benchmark.add_train_baseline, data.add_label, data.add_data, _add_profile, _add_doctor,
     ):  # fmt: skip
         add(commands)
     return parser

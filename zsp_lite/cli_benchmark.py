@@ -122,7 +122,9 @@ def _list_rows() -> None:
         parts += [method.answer] if method.answer != "pose" else []
         parts += [f"{key}={value}" for key, value in method.settings.items()]
         parts += [f"{method.targets} target views"] if method.targets else []
-        parts += [_source(method.solve)] if method.solve else []
+        if method.solve:
+            kind = method.solve if hasattr(method.solve, "__name__") else type(method.solve)
+            parts.append(f"{kind.__module__}:{kind.__name__}")
         print(f"{name:20} {', '.join(parts) or 'the paper, K = 50 with k-means'}")
     print("\nGroups:")
     for name, rows in GROUPS.items():

@@ -3,6 +3,8 @@
 In the window: shift + left click picks the point, shift + right click takes the last one back, Q closes it.
 """
 
+import os
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -25,10 +27,9 @@ _BLUE, _ORANGE = (0.0, 0.45, 0.70), (0.90, 0.62, 0.0)
 
 def pick_in_window(cloud: Cloud, title: str) -> list[int]:
     """Indices of the points that were picked, in order. Raises InputError where no window can be opened."""
-    o3d = load_open3d()
-    window = o3d.visualization.VisualizerWithEditing()
-    if not window.create_window(window_name=title, width=1280, height=900):
-        raise InputError("no window can be opened, expected a desktop; without one use notebooks/08_label_poses.ipynb")
+    _check_display()
+    window = load_open3d().visualization.VisualizerWithEditing()
+    window.create_window(window_name=title, width=1280, height=900)
     window.add_geometry(_geometry(cloud[0], cloud[1] / 255))
     window.run()
     window.destroy_window()
@@ -37,6 +38,7 @@ def pick_in_window(cloud: Cloud, title: str) -> list[int]:
 
 def show_in_window(reference: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], title: str) -> None:
     """Both clouds in one plain colour each, blue the reference, orange the sequence."""
+    _check_display()
     o3d = load_open3d()
     clouds = [_geometry(points, np.tile(colour, (len(points), 1))) for points, colour in
               ((reference, _BLUE), (target, _ORANGE))]  # fmt: skip
@@ -100,6 +102,14 @@ def _label_sequence(labelling, sequence, ask, say, guess, pick, show) -> bool:
                 labelling.skip(sequence)
             return answer == "s"
         labelling.clear(sequence)
+
+
+def _check_display() -> None:
+    """Without a display Open3D draws into memory, and its window would wait for ever."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError(
+            "no window can be opened: DISPLAY is not set, expected a desktop; notebooks/08_label_poses.ipynb needs none"
+        )
 
 
 def _geometry(points: np.ndarray, colours: np.ndarray):

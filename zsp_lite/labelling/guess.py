@@ -1,11 +1,11 @@
 """A first guess of a label by the method itself: the person corrects instead of beginning from nothing."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones import Backbone
 from zsp_lite.cameras import Camera
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
@@ -13,9 +13,12 @@ from zsp_lite.frames import Frame
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import look, object_crop
 
+if TYPE_CHECKING:
+    from zsp_lite.backbones import Backbone
+
 
 def guess_alignment(
-    dataset: Co3D, backbone: Backbone, category: str, reference: str, sequence: str, references: int = 3, views: int = 6
+    dataset: Co3D, backbone: "Backbone", category: str, reference: str, sequence: str, references: int = 3, views: int = 6
 ) -> tuple[Sim3, float]:
     """The reference's world laid on the sequence's world, and how sure the method is (0 to 1).
 

@@ -35,12 +35,14 @@ class _Picks(msgspec.Struct):
 class Progress:
     """How far a sequence is.  state: "reference", "open", "accepted" or "skipped".  picks: how many.
     rms: residual of its alignment, a share of the picks' spread; None before all keypoints are picked.
+    problem: why its picks give no alignment, such as two at one place; "" where nothing is wrong.
     """
 
     sequence: str
     state: str
     picks: int
     rms: float | None
+    problem: str = ""
 
 
 class Labelling:
@@ -138,6 +140,17 @@ class Labelling:
             self._stored.names.clear()
         self._save()
 
+    def put(self, sequence: str, points: Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
+        """Replace all picks of a sequence: what taking a change back needs.  names: of the reference's keypoints."""
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        wanted = len(names) if sequence == self.reference else min(len(points), len(self.names))
+        if not np.isfinite(points).all() or len(points) != wanted:
+            raise InputError(f"{len(points)} picks put on {sequence}, expected {wanted} finite points")
+        self._editable(sequence)[:] = [tuple(point) for point in points.tolist()]
+        if sequence == self.reference:
+            self._stored.names[:] = names
+        self._save()
+
     def rename(self, index: int, name: str) -> None:
         """Give keypoint `index` (from 0) another name."""
         if not 0 <= index < len(self.names) or not name.strip():
@@ -203,8 +216,12 @@ class Labelling:
         for name in self.sequences:
             state = REFERENCE if name == self.reference else ACCEPTED if name in labels else OPEN
             state = SKIPPED if name in self._stored.skipped else state
-            alignment = None if name == self.reference else self.alignment(name)
-            rows.append(Progress(name, state, len(self.picks(name)), alignment and alignment.rms))
+            alignment, problem = None, ""
+            try:
+                alignment = None if name == self.reference else self.alignment(name)
+            except InputError as error:
+                problem = str(error)
+            rows.append(Progress(name, state, len(self.picks(name)), alignment and alignment.rms, problem))
         return rows
 
     def _known(self, sequence: str) -> str:

@@ -1,0 +1,114 @@
+"""The commands that look after data: what they print, what they write, and one line for what is wrong."""
+
+import json
+
+import numpy as np
+import pytest
+from co3d_folders import sequence_data
+
+from zsp_lite.cli import main
+from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.labels import PoseLabel, read_labels, write_label
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "data"
+    write_co3d(folder, "chair", [sequence_data("a", quality=2.0), sequence_data("b")])
+    return folder
+
+
+def test_a_whole_folder_passes_the_check_and_a_broken_one_does_not(root, capsys):
+    assert main(["data", "check", str(root)]) == 0
+    said = capsys.readouterr().out
+    assert "chair" in said and "No problems" in said
+    (root / "chair/a/images/frame000001.jpg").unlink()
+    assert main(["data", "check", str(root)]) == 1
+    assert "chair: chair/a/images/frame000001.jpg is missing" in capsys.readouterr().out
+
+
+def test_labels_are_brought_and_carried(root, tmp_path, capsys):
+    for name in "ab":
+        write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
+    assert main(["data", "labels", str(tmp_path / "clone"), "--root", str(root)]) == 0
+    assert "2 labels, 0 files of pairs" in capsys.readouterr().out
+    write_co3d(tmp_path / "v2", "chair", [sequence_data("a", quality=2.0), sequence_data("b")],
+               intrinsics_format="ndc_isotropic")  # fmt: skip
+    assert main(["data", "carry", str(root), str(tmp_path / "v2"), "chair"]) == 0
+    assert "camera centres agree to 0.00 %" in capsys.readouterr().out
+    assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]
+
+
+def test_a_capture_is_imported(root, tmp_path, capsys):
+    source = tmp_path / "scan"
+    from test_importers import METRES, write_lists
+
+    from zsp_lite.synthetic.export import make_sequence
+
+    source.mkdir()
+    exact = make_sequence("teapot", 0, 4, 3, 64)[1]
+    from dataclasses import replace
+
+    from zsp_lite.frames import Frame, write_mask
+
+    frames = []
+    for number, view in enumerate(exact.views):
+        camera = replace(view.camera, t=view.camera.t * METRES)
+        mask = view.mask.astype(np.float32)
+        frames.append(Frame(view.rgb, (view.depth * METRES).astype(np.float32), mask, camera, f"{number:04d}"))
+        write_mask(tmp_path / f"masks/{number:04d}.png", mask)
+    write_lists(source, frames)
+    arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
+    assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
+    assert "4 frames" in capsys.readouterr().out
+    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 4
+
+
+def test_the_labelling_lists_and_draws_its_candidates(root, tmp_path, capsys):
+    assert main(["label", str(root), "chair", "--list"]) == 0
+    assert capsys.readouterr().out.split()[:2] == ["a", "reference"]
+    sheet = tmp_path / "sheets/chair.png"
+    assert main(["label", str(root), "chair", "--contact-sheet", str(sheet)]) == 0
+    assert sheet.read_bytes().startswith(b"\x89PNG")
+
+
+def test_labelling_without_a_desktop_is_one_line(root, monkeypatch, capsys):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["label", str(root), "chair"]) == 2
+    assert "DISPLAY is not set" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["data"], "expected one of check, labels, carry, import"),
+        (["data", "check", "/nowhere"], "does not exist"),
+        (["data", "labels", "/nowhere", "--root", "."], "cannot be read"),
+        (["data", "labels", "https://host/a.zip", "--root", "."], "needs its SHA-256"),
+        (["data", "carry", "/nowhere", "/nowhere", "chair"], "/nowhere"),
+        (["data", "import", "tum", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
+        (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit", "1"],
+         "--depth-unit does not go with the format tum"),
+        (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--box", "1,2"],
+         "expected four numbers"),
+        (["label", "/nowhere", "chair"], "does not exist"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
+    try:
+        code = main(arguments)
+    except SystemExit as stop:  # argparse's own refusals
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2 and message in error and len(error.strip().splitlines()) == 1
+
+
+def test_picks_on_disk_are_readable_json(root):
+    from zsp_lite.labelling import Labelling
+
+    labelling = Labelling(root, "chair")
+    labelling.pick("a", (0.5, 1.0, 2.0), "seat")
+    content = json.loads(labelling.path.read_text())
+    assert content["names"] == ["seat"] and content["picks"] == {"a": [[0.5, 1.0, 2.0]]}
