@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 
 def guess_alignment(
-    dataset: Co3D, backbone: "Backbone", category: str, reference: str, sequence: str, references: int = 3, views: int = 6
-) -> tuple[Sim3, float]:
+    dataset: Co3D, backbone: "Backbone", category: str, reference: str, sequence: str,
+    references: int = 3, views: int = 6,
+) -> tuple[Sim3, float]:  # fmt: skip
     """The reference's world laid on the sequence's world, and how sure the method is (0 to 1).
 
     From `references` frames of the one and `views` of the other, each evenly spread, by the verified solver; the
