@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.errors import InputError
@@ -14,8 +14,8 @@ from zsp_lite.widgets.common import choice, explorer, slider
 _STEP = 5  # degrees between the turns whose distances are worked out beforehand
 
 
-def binomial(n: int, p: float) -> Float[np.ndarray, "n+1"]:
-    """Chances of 0 to n successes in n trials of chance p each."""
+def binomial(n: int, p: float) -> Float[np.ndarray, "_"]:
+    """Chances (n + 1,) of 0 to n successes in n trials of chance p each."""
     if n < 1 or not 0 <= p <= 1:
         raise InputError(f"binomial: n={n}, p={p}, expected n >= 1 and p in [0, 1]")
     if p in (0, 1):
@@ -75,7 +75,7 @@ def measured_accuracy():
 
 
 def turned_distance(
-    cloud: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"], degrees: Float[np.ndarray, "k"]
+    cloud: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"], degrees: Real[np.ndarray, "k"]
 ) -> Float[np.ndarray, "k"]:
     """Mean distance from the cloud's points, turned about the z axis, to the nearest points of the other cloud.
 
