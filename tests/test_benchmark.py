@@ -21,6 +21,7 @@ from zsp_lite.benchmark.profile import (
     ransac_by_loop,
     ransac_rows,
     similarity_rows,
+    verified_row,
 )
 from zsp_lite.benchmark.run import METHODS, category_pairs, evaluate, random_backbone, read_records
 from zsp_lite.co3d import Co3D
@@ -232,6 +233,11 @@ def test_profile_rows_carry_their_limits():
     assert ratio.value > 4
     assert not Row("x", 2, "s", 1).kept and Row("x", 2, "s", 1, at_most=False).kept and Row("x", 2, "s").kept
     assert "MISSED" in str(Row("x", 2, "s", 1)) and "MISSED" not in str(Row("x", 1, "s", 1))
+
+
+def test_the_verified_solver_is_timed_and_has_a_limit():
+    row = verified_row(repeats=1)
+    assert row.name == "verified solver, N = 5" and row.limit == 300 and row.at_most and row.value > 1
 
 
 def test_a_similarity_by_algebra_is_timed_against_the_loop():

@@ -13,7 +13,13 @@ from rich.console import Console
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.compare import compare, comparison_table
 from zsp_lite.benchmark.document import with_tables
-from zsp_lite.benchmark.figures import accuracy_against_views, error_curves, error_distribution, write_figures
+from zsp_lite.benchmark.figures import (
+    accuracy_against_views,
+    error_curves,
+    error_distribution,
+    reliability_diagram,
+    write_figures,
+)
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
@@ -264,3 +270,22 @@ def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_pa
 def read_results_of(out, rows):
     made_up_run(out, rows)
     return read_results(out)
+
+
+def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
+    with pytest.raises(InputError, match="reliability: no row states fewer than 20 confidences"):
+        reliability_diagram(read_results(run[0]))
+    rng = np.random.default_rng(0)
+    sure = rng.random(200)
+    right = rng.random(200) < sure
+    rows = {f"chair/{i}": {"error": 5.0 if ok else 90.0, "confidence": c} for i, (c, ok) in enumerate(zip(sure, right))}
+    path = write_results(Results({}, {}, [], {"ours": {"chair/0": {"error": 1.0}}, "verified": rows}), tmp_path / "r.gz")
+    results = read_results(path)
+    assert results.confidences("ours") == {}
+    assert results.confidences("verified") == {key: pytest.approx(one["confidence"], abs=1e-4) for key, one in rows.items()}
+    figure = reliability_diagram(results)
+    line = figure.axes[0].lines[1]  # after the diagonal
+    order = np.argsort(sure)
+    np.testing.assert_allclose(line.get_xdata(), sure[order].reshape(10, 20).mean(1), atol=1e-3)
+    np.testing.assert_allclose(line.get_ydata(), right[order].reshape(10, 20).mean(1))
+    assert f"(all: {100 * right.mean():.0f} %)" in figure.axes[0].get_title()

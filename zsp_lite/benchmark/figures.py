@@ -1,4 +1,4 @@
-"""The paper's figures from a run: how errors are distributed, what more target views bring, and error curves."""
+"""Figures from a run: errors' distribution and curves, what more target views bring, what confidences are worth."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +11,13 @@ from zsp_lite.benchmark import published
 from zsp_lite.benchmark.results import Results
 from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, GREEN, ORANGE, VERMILLION
+from zsp_lite.verified.confidence import reliability
 
 _VIEWS = (1, 3, 5, 10, 20)
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")
 _DPI = 150
+RIGHT = 30.0  # degrees: what a confidence is about
+_LEAST_STATED = 20
 
 
 def error_distribution(results: Results, row: str = "ours") -> Figure:
@@ -94,6 +97,42 @@ def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
     return figure
 
 
+def reliability_diagram(results: Results, row: str | None = None) -> Figure:
+    """How often answers of a confidence are within 30 degrees, in ten bins of as many pairs, and who is how sure.
+
+    row: default the first that states confidences. Raises InputError where none does.
+    """
+    stated = {name: found for name in results.rows if len(found := results.confidences(name)) >= _LEAST_STATED}
+    row = row or next(iter(stated), None)
+    if row not in stated:
+        raise InputError(f"reliability: {row or 'no row'} states fewer than {_LEAST_STATED} confidences")
+    errors = results.errors(row)
+    confidence = np.array(list(stated[row].values()))
+    right = np.array([errors[key] < RIGHT for key in stated[row]])
+    found = reliability(confidence, right, min(10, len(right) // 5))
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(5, 5.6), layout="constrained", sharex=True, gridspec_kw={"height_ratios": [3, 1]}
+    )
+    spread = np.sqrt(found.accuracy * (1 - found.accuracy) / found.count)
+    above.plot([0, 1], [0, 1], ":", color="0.5", label="calibrated")
+    above.errorbar(found.confidence, found.accuracy, spread, fmt="o-", color=BLUE, capsize=2, ms=4, label=f'"{row}"')
+    above.set(ylim=(-0.02, 1.05), ylabel="share within 30°")
+    above.set_title(
+        f"AUROC {found.auroc:.2f}, calibration error {100 * found.calibration_error:.1f} points,\n"
+        f"surest half {100 * found.surest_half:.0f} % right (all: {100 * right.mean():.0f} %)", fontsize=10,
+    )  # fmt: skip
+    above.legend(fontsize=8, loc="upper left")
+    below.hist([confidence[right], confidence[~right]], bins=np.linspace(0, 1, 21), stacked=True,
+               color=[BLUE, ORANGE], label=["right", "wrong"])  # fmt: skip
+    for patch in below.containers[1].patches:
+        patch.set_hatch("///")
+    below.set(xlim=(-0.02, 1.02), xlabel="confidence", ylabel="pairs")
+    below.legend(fontsize=8, loc="upper left")
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+    return figure
+
+
 def write_figures(results: Results, folder: str | Path) -> list[Path]:
     """The figures that the run has rows for, as PNG files."""
     folder = Path(folder)
@@ -103,12 +142,13 @@ def write_figures(results: Results, folder: str | Path) -> list[Path]:
         "error_distribution": lambda: error_distribution(results, first),
         "accuracy_against_views": lambda: accuracy_against_views(results),
         "error_curves": lambda: error_curves(results),
+        "reliability": lambda: reliability_diagram(results),
     }
     written = []
     for name, make in makers.items():
         try:
             figure = make()
-        except InputError:  # too few numbers of views: this run has no such figure
+        except InputError:  # too few numbers of views, or nobody says how sure he is: this run has no such figure
             continue
         path = folder / f"{name}.png"
         figure.savefig(path, dpi=_DPI)

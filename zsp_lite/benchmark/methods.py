@@ -8,7 +8,7 @@ import hashlib
 import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
@@ -182,6 +182,8 @@ def fingerprint(method: Method) -> str:
     for function in functions:
         if function is None:
             continue
+        if is_dataclass(function) and " at 0x" not in repr(function):  # a function with settings, none without a name
+            text += repr(function)
         known = function if inspect.isroutine(function) or inspect.isclass(function) else type(function)
         try:
             text += inspect.getsource(known)

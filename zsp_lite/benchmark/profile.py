@@ -25,7 +25,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.features import log_bin
 from zsp_lite.frames import Frame
 from zsp_lite.matching import similarities
-from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.pipeline import ZeroShotPose, look, object_crop
 from zsp_lite.vit import VisionTransformer
 
 N_TARGETS = 5
@@ -62,6 +62,7 @@ def profile(repeats: int = 5) -> Iterator[Row]:
     if hasattr(os, "getloadavg"):
         yield Row("load average before", os.getloadavg()[0], "processes", note="limits: for an idle machine")
     yield from stage_rows(repeats)
+    yield verified_row(repeats)
     yield from similarity_rows(repeats)
     yield from ransac_rows(repeats)
     yield memory_row()
@@ -81,6 +82,17 @@ def stage_rows(repeats: int = 5) -> list[Row]:
     rows = [Row(names.get(name, name), 1000 * value, "ms", note=threads) for name, value in stages.items()]
     share = 100 * float(np.median(rest))
     return [*rows, Row("everything but the forward, share of it", share, "%", 25, note="N = 5, K = 50")]
+
+
+def verified_row(repeats: int = 5) -> Row:
+    """Median milliseconds of all stages of the verified solver that follow features, similarities and matches."""
+    method = ZeroShotPose(random_vits8(), foreground="mask", solver="verified")
+    crops = [object_crop(frame) for frame in made_up_frames(1 + N_TARGETS)]
+    reference, *targets = look(method.backbone, crops, method.foreground)
+    compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
+    (seconds,) = _median_seconds([lambda: method.estimate_from_comparisons(reference, targets, compared)], repeats)
+    note = f"beyond features, similarities and matches; {torch.get_num_threads()} threads"
+    return Row(f"verified solver, N = {N_TARGETS}", 1000 * seconds, "ms", 300, note=note)
 
 
 def similarity_rows(repeats: int = 5, tokens: int = 8) -> list[Row]:

@@ -34,6 +34,10 @@ class Results:
             raise InputError(f"row {row!r} is not in the run, expected one of {', '.join(self.rows)}")
         return {key: found["error"] for key, found in self.rows[row].items()}
 
+    def confidences(self, row: str) -> dict[str, float]:
+        """What the row's method thinks its chances are to be within 30 degrees, by pair key, where it says so."""
+        return {key: one["confidence"] for key, one in self.rows.get(row, {}).items() if "confidence" in one}
+
 
 def read_results(path: str | Path) -> Results:
     """A run's folder or its `results.json.gz`. Raises InputError where it is neither, or has not been summed up yet."""

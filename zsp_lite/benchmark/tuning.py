@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize
 
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.co3d import Co3D
@@ -28,11 +27,11 @@ from zsp_lite.pairs import Pair, sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.verified.confidence import MODES_APART, Calibration, fit_calibration, margins, reliability
-from zsp_lite.verified.verification import TERMS, Terms, Weights
+from zsp_lite.verified.verification import TERMS, Weights
 
 # Errors of so many degrees make a hypothesis e times less right; what no hypothesis comes near teaches nothing.
 _RIGHT_WIDTH, _TEACHES = 12.0, 0.3
-_RIDGE = 3e-3
+_RIDGE = 1e-2
 _RIGHT = 30.0
 _Fit = TypeVar("_Fit")
 
@@ -92,8 +91,9 @@ def outcome(pair: Pair, store: FrameStore, labels: Mapping[str, PoseLabel]) -> O
     first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
     keys = [(pair.reference_sequence, pair.reference_frame), *((pair.target_sequence, n) for n in pair.target_frames)]
     store.load(keys)
-    reference, *targets = [store.view("backbone", key) for key in keys]
     solver = ZeroShotPose(store.extractors["backbone"], solver="verified", seed=pair.seed)
+    settings = solver.foreground, solver.saliency_threshold
+    reference, *targets = [store.view("backbone", key, *settings) for key in keys]
     found = solver.estimate_from_features(reference, targets).hypotheses
     cameras = [target.frame.camera for target in targets]
     truth = [relative_pose(first, reference.frame.camera, second, camera)[:3, :3] for camera in cameras]
@@ -112,26 +112,34 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _RIDGE) -> Weights:
     ridge: of the weights per standard deviation of their terms. Raises InputError where no pair has a right hypothesis.
     """
     rights = [np.exp(-np.square(one.errors / _RIGHT_WIDTH)) for one in outcomes]
-    taught = [(one.terms - one.terms.mean(axis=0), right) for one, right in zip(outcomes, rights)
-              if right.max() > _TEACHES and len(right) > 1]  # fmt: skip
+    taught = [(one.terms, right) for one, right in zip(outcomes, rights) if right.max() > _TEACHES and len(right) > 1]
     if not taught:
         raise InputError(f"{len(outcomes)} pairs, none with a right hypothesis among several, expected some")
-    spread = np.concatenate([terms for terms, _ in taught]).std(axis=0) + 1e-9
+    spread = np.concatenate([terms - terms.mean(axis=0) for terms, _ in taught]).std(axis=0) + 1e-9
+    # One row per pair, as long as the longest; what is beyond a pair's hypotheses has no chance.
+    longest = max(len(right) for _, right in taught)
+    terms = torch.zeros(len(taught), longest, len(TERMS), dtype=torch.float64)
+    right = torch.full((len(taught), longest), -torch.inf, dtype=torch.float64)
+    there = torch.full_like(right, -torch.inf)
+    for row, (some, how_right) in enumerate(taught):
+        n = len(how_right)
+        terms[row, :n] = torch.from_numpy((some - some.mean(axis=0)) / spread)
+        right[row, :n] = torch.from_numpy(np.log(how_right.clip(1e-12)))
+        there[row, :n] = 0
+    with torch.enable_grad():
+        w = torch.zeros(len(TERMS), dtype=torch.float64, requires_grad=True)
+        descent = torch.optim.LBFGS([w], max_iter=200, line_search_fn="strong_wolfe")
 
-    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
-        total, gradient = 0.0, np.zeros_like(w)
-        for terms, right in taught:
-            scaled = terms / spread
-            score = scaled @ w
-            chance = np.exp(score - score.max())
-            chance /= chance.sum()
-            likely = max(float(chance @ right), 1e-12)
-            total -= np.log(likely)
-            gradient += scaled.T @ (chance - chance * right / likely)
-        return total / len(taught) + ridge * float(w @ w), gradient / len(taught) + 2 * ridge * w
+        def loss() -> Float[torch.Tensor, ""]:
+            descent.zero_grad()
+            score = terms @ w + there
+            lost = torch.logsumexp(score, dim=1) - torch.logsumexp(score + right, dim=1)
+            value = lost.mean() + ridge * w.square().sum()
+            value.backward()
+            return value
 
-    found = minimize(loss, np.zeros(len(TERMS)), jac=True, method="L-BFGS-B").x / spread
-    return Weights(*map(float, found))
+        descent.step(loss)
+    return Weights(*(float(value) for value in w.detach().numpy() / spread))
 
 
 def calibrate(outcomes: Sequence[Outcome], weights: Weights) -> Calibration:
@@ -150,9 +158,13 @@ def leave_one_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]]
 def equally_good_shares(
     outcomes: Sequence[Outcome], weights: Weights, bounds: Sequence[float]
 ) -> list[tuple[float, int, float]]:
-    """Per bound in nats: the bound, how many pairs have a rival within it, and how often their best is right."""
+    """Per bound in nats: the bound, how many pairs have a rival within it, and the share whose best is right."""
     _, margin, error = np.array([one.best(weights) for one in outcomes]).T
-    return [(bound, int((margin < bound).sum()), float((error[margin < bound] < _RIGHT).mean())) for bound in bounds]
+    rows = []
+    for bound in bounds:
+        right = error[margin < bound] < _RIGHT
+        rows.append((bound, len(right), float(right.mean()) if len(right) else float("nan")))
+    return rows
 
 
 def report(outcomes: Sequence[Outcome]) -> list[str]:
@@ -161,7 +173,7 @@ def report(outcomes: Sequence[Outcome]) -> list[str]:
     found_now = np.array([one.best(now) for one in outcomes])
     others = leave_one_out(outcomes, lambda some: (w := fit_weights(some), calibrate(some, w)))
     judged = np.array([one.best(w) for one, (w, _) in zip(outcomes, others)])
-    trust = np.array([float(c.confidence(score, margin)) for (_, c), (score, margin, _) in zip(others, judged)])
+    trust = np.concatenate([one.confidence(*found[:2, None]) for (_, one), found in zip(others, judged)])
     nearest = np.array([one.errors.min() for one in outcomes])
     lines = [
         f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",

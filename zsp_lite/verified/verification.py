@@ -63,17 +63,17 @@ TERMS = tuple(field.name for field in fields(Terms))
 class Weights:
     """What each term is worth in the score, in nats: e^score is in proportion to a pose's chances among others.
 
-    The defaults are a conditional logit, fitted on objects of training categories by `benchmark.tuning`.
+    The defaults are a conditional logit, fitted on objects of training categories by `benchmark.tuning` and rounded.
     """
 
-    f_sim: float = 78.0
-    f_seen: float = 0.0
-    f_off: float = -32.0
-    f_front: float = -17.0
-    r_sim: float = 0.0
-    r_seen: float = 30.0
-    r_off: float = -14.0
-    r_front: float = -27.0
+    f_sim: float = 60.0
+    f_seen: float = 5.0
+    f_off: float = -25.0
+    f_front: float = -20.0
+    r_sim: float = 20.0
+    r_seen: float = 35.0
+    r_off: float = -10.0
+    r_front: float = -30.0
 
     def score(self, terms: Terms) -> Float[Tensor, "m"]:
         """The weighted sum of the terms, the higher the better."""
