@@ -7,10 +7,11 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from zsp_lite.benchmark.formats import as_markdown
-from zsp_lite.benchmark.tables import Table
+from zsp_lite.benchmark.tables import THIS_RUN, Table
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 
@@ -46,4 +47,6 @@ def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> No
 def _narrow(table: Table, pairs: int) -> Table:
     kept = [i for i, column in enumerate(table.columns) if not _CATEGORY.fullmatch(column.title)]
     rows = tuple((label, tuple(cells[i] for i in kept)) for label, cells in table.rows)
-    return Table(table.name, f"{table.title} ({pairs:,} pairs)", tuple(table.columns[i] for i in kept), rows)
+    columns = [replace(table.columns[i], group=table.columns[i].group.removeprefix(THIS_RUN).removeprefix(": "))
+               for i in kept]  # fmt: skip
+    return Table(table.name, f"{table.title} ({pairs:,} pairs)", tuple(columns), rows)
