@@ -17,4 +17,5 @@ WIDGETS: dict[str, str] = {
     "measured_accuracy": "metrics:example_measured_accuracy",
     "symmetry_turn": "metrics:example_symmetry_turn",
     "ranked_hypotheses": "verified:example_ranked_hypotheses",
+    "box_to_mask": "masks:example_box_to_mask",
 }
