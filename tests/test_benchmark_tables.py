@@ -279,10 +279,10 @@ def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     sure = rng.random(200)
     right = rng.random(200) < sure
     rows = {f"chair/{i}": {"error": 5.0 if ok else 90.0, "confidence": c} for i, (c, ok) in enumerate(zip(sure, right))}
-    path = write_results(Results({}, {}, [], {"ours": {"chair/0": {"error": 1.0}}, "verified": rows}), tmp_path / "r.gz")
-    results = read_results(path)
+    both = {"ours": {"chair/0": {"error": 1.0}}, "verified": rows}
+    results = read_results(write_results(Results({}, {}, [], both), tmp_path / "results.json.gz"))
     assert results.confidences("ours") == {}
-    assert results.confidences("verified") == {key: pytest.approx(one["confidence"], abs=1e-4) for key, one in rows.items()}
+    np.testing.assert_allclose(list(results.confidences("verified").values()), sure, atol=1e-4)
     figure = reliability_diagram(results)
     line = figure.axes[0].lines[1]  # after the diagonal
     order = np.argsort(sure)
