@@ -1,0 +1,210 @@
+// A point cloud on a plain canvas: drag turns it, the wheel zooms, shift and drag moves it, a click is sent to Python.
+// No WebGL and no network. Lengths are view units: the cloud fills the ball of radius 1; depth grows away from the eye.
+
+const FILL = 0.46; // of the canvas' side, for one view unit
+const SPOT = 0.034; // side of a point, in view units
+const SLACK = 4; // pixels that the hand may tremble within a click
+
+const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+
+// Row-major 3x3 times row-major 3x3.
+const times = (a, b) =>
+  [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
+
+// The view after a drag by dx, dy radians: about the screen's upright axis, then about its level one.
+function turned(view, dx, dy) {
+  const [c, s, d, t] = [Math.cos(dx), Math.sin(dx), Math.cos(dy), Math.sin(dy)];
+  return times(times([1, 0, 0, 0, d, -t, 0, t, d], [c, 0, -s, 0, 1, 0, s, 0, c]), view);
+}
+
+const floats = (data) => new Float32Array(data.buffer.slice(data.byteOffset, data.byteOffset + data.byteLength));
+const bytes = (data) => new Uint8Array(data.buffer, data.byteOffset, data.byteLength);
+
+function render({ model, el }) {
+  const canvas = document.createElement("canvas");
+  canvas.className = "zsp-cloud";
+  canvas.tabIndex = 0;
+  canvas.setAttribute("role", "img");
+  el.append(canvas);
+  const pen = canvas.getContext("2d");
+  let points, colours, crosses, view, zoom, pan, side, unit, scheduled = false, held = null;
+
+  const place = (p) => {
+    const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
+    return [side / 2 + pan[0] + at[0] * unit, side / 2 + pan[1] + at[1] * unit, at[2]];
+  };
+  // For whoever drives a browser: where a drawn point is on the canvas, in CSS pixels, and how many there are.
+  canvas.place = (index) => place(points.subarray(3 * index, 3 * index + 3)).slice(0, 2);
+
+  function take() {
+    points = floats(model.get("points"));
+    colours = bytes(model.get("colours"));
+    crosses = bytes(model.get("crosses"));
+    canvas.dataset.points = points.length / 3;
+    schedule();
+  }
+
+  function aim() {
+    view = model.get("view");
+    [zoom, pan] = [1, [0, 0]];
+    schedule();
+  }
+
+  function schedule() {
+    if (!scheduled) requestAnimationFrame(draw);
+    scheduled = true;
+  }
+
+  function draw() {
+    scheduled = false;
+    side = model.get("side");
+    unit = side * FILL * zoom;
+    const ratio = window.devicePixelRatio || 1;
+    const n = Math.round(side * ratio);
+    if (canvas.width !== n) canvas.width = canvas.height = n;
+    canvas.style.width = canvas.style.height = `${side}px`;
+    const depth = spots(n, ratio);
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    for (const mark of model.get("marks")) drawMark(mark, depth, n, ratio);
+    const cursor = model.get("cursor");
+    if (cursor.length) drawCursor(place(cursor));
+    canvas.dataset.marks = model.get("marks").length;
+    canvas.dataset.cursor = cursor.join(" ");
+    canvas.setAttribute("aria-label", model.get("alt"));
+  }
+
+  // The points, nearest in front, paler with depth; gives the depth of every pixel.
+  function spots(n, ratio) {
+    const depth = new Float32Array(n * n).fill(Infinity);
+    const picture = pen.createImageData(n, n);
+    const pixels = new Uint32Array(picture.data.buffer).fill(0xffffffff);
+    const reach = Math.max(1, Math.round((SPOT * unit * ratio) / 2));
+    for (let i = 0; i < points.length; i += 3) {
+      const [x, y, z] = place(points.subarray(i, i + 3));
+      const [column, row] = [Math.round(x * ratio), Math.round(y * ratio)];
+      const pale = clamp(0.15 + 0.3 * z, 0, 0.45);
+      const [r, g, b] = [0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]));
+      const colour = (255 << 24) | (b << 16) | (g << 8) | r;
+      const cross = crosses[i / 3];
+      const arm = cross ? reach + 1 : reach;
+      for (let v = Math.max(row - arm, 0); v <= Math.min(row + arm, n - 1); v++) {
+        for (let u = Math.max(column - arm, 0); u <= Math.min(column + arm, n - 1); u++) {
+          const [du, dv] = [Math.abs(u - column), Math.abs(v - row)];
+          if (cross ? Math.abs(du - dv) > 0.5 * ratio : du * du + dv * dv > reach * (reach + 1)) continue;
+          if (z < depth[v * n + u]) [depth[v * n + u], pixels[v * n + u]] = [z, colour];
+        }
+      }
+    }
+    pen.putImageData(picture, 0, 0);
+    return depth;
+  }
+
+  // A number in a disc beside the point that it names; broken outline where the cloud hides the point.
+  function drawMark({ at, label, chosen }, depth, n, ratio) {
+    const [x, y, z] = place(at);
+    const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
+    const hidden = z > depth[pixel] + 0.12;
+    const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
+    pen.globalAlpha = hidden ? 0.6 : 1;
+    pen.setLineDash(hidden ? [3, 2] : []);
+    for (const [width, colour] of [[4, "white"], [1.5, "black"]]) {
+      [pen.lineWidth, pen.strokeStyle] = [width, colour];
+      pen.beginPath();
+      pen.moveTo(x, y);
+      pen.lineTo(left, top);
+      pen.stroke();
+      pen.beginPath();
+      pen.arc(x, y, 3.5, 0, 7);
+      pen.stroke();
+    }
+    pen.beginPath();
+    pen.arc(left, top, 9, 0, 7);
+    pen.fillStyle = chosen ? "black" : "white";
+    pen.fill();
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.fillStyle = chosen ? "white" : "black";
+    pen.font = "bold 12px sans-serif";
+    [pen.textAlign, pen.textBaseline] = ["center", "middle"];
+    pen.fillText(label, left, top + 0.5);
+    pen.globalAlpha = 1;
+  }
+
+  function drawCursor([x, y]) {
+    for (const [width, colour] of [[5, "white"], [2, "black"]]) {
+      [pen.lineWidth, pen.strokeStyle] = [width, colour];
+      pen.beginPath();
+      for (const [a, b] of [[-14, -5], [5, 14]]) {
+        pen.moveTo(x + a, y);
+        pen.lineTo(x + b, y);
+        pen.moveTo(x, y + a);
+        pen.lineTo(x, y + b);
+      }
+      pen.stroke();
+    }
+  }
+
+  function settle() {
+    model.set("view", view);
+    model.save_changes();
+  }
+
+  function zoomBy(factor, x, y) {
+    const next = clamp(zoom * factor, 0.4, 20);
+    pan = [pan[0], pan[1]].map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
+    zoom = next;
+    schedule();
+  }
+
+  canvas.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
+    canvas.focus({ preventScroll: true });
+    canvas.setPointerCapture(event.pointerId);
+    held = { x: event.offsetX, y: event.offsetY, moved: false };
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!held) return;
+    const [dx, dy] = [event.offsetX - held.x, event.offsetY - held.y];
+    if (!held.moved && Math.hypot(dx, dy) < SLACK) return;
+    held = { x: event.offsetX, y: event.offsetY, moved: true };
+    if (event.shiftKey) pan = [pan[0] + dx, pan[1] + dy];
+    else view = turned(view, (2.4 * dx) / side, (2.4 * dy) / side);
+    schedule();
+  });
+  canvas.addEventListener("pointerup", (event) => {
+    if (!held) return;
+    const still = !held.moved;
+    held = null;
+    if (!still) return settle();
+    const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
+    model.send({ kind: "click", at, view, reach: 9 / unit });
+  });
+  canvas.addEventListener("pointercancel", () => (held = null));
+  canvas.addEventListener("dblclick", (event) => event.preventDefault());
+  // Only after the cloud was touched: else it would catch the page as it is scrolled past.
+  canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas) return;
+    event.preventDefault();
+    zoomBy(Math.exp(-clamp(event.deltaY, -100, 100) * 0.002), event.offsetX, event.offsetY);
+  }, { passive: false });
+  canvas.addEventListener("keydown", (event) => {
+    const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (turn) {
+      view = turned(view, 0.12 * turn[0], 0.12 * turn[1]);
+      settle();
+    } else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2, side / 2, side / 2);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+    schedule();
+  });
+
+  model.on("change:points change:colours change:crosses", take);
+  model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
+  model.on("change:aimed", aim);
+  model.on("change:marks change:cursor change:alt change:side", schedule);
+  take();
+  aim();
+}
+
+export default { render };
