@@ -152,7 +152,7 @@ def context(
         said = []
         for panel, (kind, sim) in enumerate(zip(kinds, sims)):
             similar = sim[row * grid[1] + col].reshape(grid)
-            said.append(f"{kind}: {panels.fill(panel, similar, np.unravel_index(similar.argmax(), grid))}")
+            said.append(f"{kind}: {panels.fill(panel, similar, np.array(np.unravel_index(similar.argmax(), grid)))}")
         return "<br>".join(said)
 
     row, col = _first_patch(found)
@@ -216,12 +216,12 @@ class _SimilarityPanels:
         self._box(row, col)
         self._true = true
         for star in self._stars:
-            star.set_data(*([[], []] if true is None else plots.patch_centres([true], self.grid, self.size).T))
+            star.set_data(*([[], []] if true is None else plots.patch_centres(true[None], self.grid, self.size).T))
 
     def fill(self, panel: int, similar: Float[np.ndarray, "rows cols"], nearest: Int[np.ndarray, "2"]) -> str:
         """Draw the map and its nearest neighbour; the sentence about them."""
         self._maps[panel].set_data(similar)
-        self._dots[panel].set_data(*plots.patch_centres([nearest], self.grid, self.size).T)
+        self._dots[panel].set_data(*plots.patch_centres(nearest[None], self.grid, self.size).T)
         said = f"nearest neighbour ({nearest[0]}, {nearest[1]}), cosine {similar[tuple(nearest)]:.2f}; "
         if self._true is None:
             return said + "the true partner is not in sight."

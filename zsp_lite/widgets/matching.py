@@ -69,8 +69,8 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
         maps[1].set_data(values[u].reshape(grid2))
         boxes[0](row, col)
         boxes[1](v_row, v_col)
-        ends = plots.patch_centres([(row, col), (w_row, w_col)], grid, size)
-        there = plots.patch_centres([(v_row, v_col)], grid2, size2)[0]
+        ends = plots.patch_centres(np.array([(row, col), (w_row, w_col)]), grid, size)
+        there = plots.patch_centres(np.array([(v_row, v_col)]), grid2, size2)[0]
         returned.set_data(*ends[1:].T)
         for arrow, end in zip(arrows, ends):
             arrow.xy1, arrow.xy2 = end, there
