@@ -134,7 +134,7 @@ def errors(page, notebook: dict) -> list[str]:
             if cell["execution_count"] is None:
                 found.append(f"cell {number} did not run")
     for failure in ("Error displaying widget", "Error creating widget", "Loading widget...", "JavaScript Error"):
-        found += [failure] * page.locator(".jp-OutputArea-output", has_text=failure).count()
+        found += page.locator(".jp-OutputArea-output", has_text=failure).all_inner_texts()
     broken = (
         "() => [...document.querySelectorAll('.jp-Notebook img')].filter(e => e.complete && !e.naturalWidth).length"
     )
@@ -177,7 +177,9 @@ def slider_moves_picture(output, patience: float = 20) -> bool:
 def photograph(page, path: Path, width: int = 1300, highest: int = 16_000) -> None:
     """The whole notebook as one picture, as far as Chromium can draw (`highest` pixels)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    height = page.evaluate("() => document.querySelector('.jp-WindowedPanel-outer').scrollHeight")
-    page.set_viewport_size({"width": width, "height": min(height + 150, highest)})
+    cells = "() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height"
+    page.set_viewport_size({"width": width, "height": int(min(page.evaluate(cells) + 150, highest))})
     time.sleep(2)  # until everything is laid out anew
+    page.evaluate("() => { document.querySelector('.jp-WindowedPanel-outer').scrollTop = 0 }")
+    time.sleep(1)
     page.screenshot(path=path, timeout=120_000)

@@ -100,7 +100,8 @@ def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
     open_notebook(page, lab, name)
     run_all(page, patience=60 * MINUTES)
     try:
-        assert not errors(page, saved(page, lab, name))
+        wrong = errors(page, saved(page, lab, name))
+        assert not wrong
         silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]
         assert not silent, f"pictures of widgets {silent} of {name} did not change when their sliders were moved"
     finally:

@@ -16,6 +16,7 @@ Rules for a widget:
 
 from collections.abc import Callable, Mapping
 from functools import cache
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -77,7 +78,9 @@ def explorer(figure: Figure, controls: Mapping[str, "ValueWidget"], update: Call
     widgets = load_ipywidgets()
     plt.close(figure)  # else the notebook would show it a second time
     canvas = FigureCanvasAgg(figure)
-    picture = widgets.Image(format="png", tooltip=alt, layout={"max_width": "100%", "object_fit": "contain"})
+    picture = widgets.Image(format="png", layout={"max_width": "100%", "object_fit": "contain"})
+    # Image widgets have no alternative text, and JupyterLab fails on those with a tooltip: text for screen readers.
+    described = widgets.HTML(f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>')
     sentence = widgets.HTML()
     # A layout engine would arrange everything again at each move, and make the picture jump.
     update(**{name: control.value for name, control in controls.items()})
@@ -94,7 +97,7 @@ def explorer(figure: Figure, controls: Mapping[str, "ValueWidget"], update: Call
         control.observe(redraw, names="value")
     redraw()
     row = widgets.HBox(list(controls.values()), layout={"flex_flow": "row wrap"})
-    box = widgets.VBox([row, picture, sentence])
+    box = widgets.VBox([row, described, picture, sentence])
     box.redraw, box.controls, box.figure, box.picture, box.sentence = redraw, dict(controls), figure, picture, sentence
     return box
 
