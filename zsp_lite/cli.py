@@ -7,8 +7,12 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zsp_lite.errors import InputError
+
+if TYPE_CHECKING:
+    from zsp_lite.backbones import BackboneChoice
 
 SYNTHETIC_NOTE = (
     "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and "
@@ -127,7 +131,7 @@ def _add_backbone(parser: Parser) -> None:
     )  # fmt: skip
 
 
-def _backbone(arguments: argparse.Namespace):
+def _backbone(arguments: argparse.Namespace) -> "str | BackboneChoice":
     """What `load_backbone` takes for the options of `_add_backbone`: a name alone where nothing else was asked for."""
     from zsp_lite.backbones import BackboneChoice
 
