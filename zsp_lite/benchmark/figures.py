@@ -66,7 +66,7 @@ def accuracy_against_views(results: Results) -> Figure:
             numbers = list(found)
             low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
             axis.fill_between(numbers, low, high, color=colour, alpha=0.18, lw=0)
-            style = "o-" if printed else "D--"
+            style = {"full": "o-", "bv": "s-", None: "D--"}[printed]
             axis.plot(numbers, [found[n][name] for n in numbers], style, color=colour, label=label)
             if printed is None:
                 continue
@@ -86,7 +86,7 @@ def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
     for index, name in enumerate(names):
         errors = np.sort(list(results.errors(name).values()))
         share = 100 * np.arange(len(errors) + 1) / len(errors)
-        style = {"color": _COLOURS[index % len(_COLOURS)], "ls": ("-", "--", ":")[index // len(_COLOURS) % 3]}
+        style = {"color": _COLOURS[index % len(_COLOURS)], "ls": ("-", "--", "-.", ":")[index % 4]}
         axis.step(np.concatenate([[0], errors]), share, where="post", label=name, **style)
     for threshold in (15, 30):
         axis.axvline(threshold, color="0.7", lw=1, zorder=0)

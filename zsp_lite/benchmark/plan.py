@@ -71,7 +71,7 @@ class Plan:
             f"{size(self.cache_bytes)}",
             f"calibration          {1000 * self.frame_seconds:.0f} ms per frame, {1000 * self.pair_seconds:.0f} ms per "
             f"pair on one core ({self.described})",
-            f"time                 {times}; this machine has {self.cores} cores",
+            f"time                 {times}; this machine has {self.cores} core{'s' * (self.cores > 1)}",
         ]
 
 
