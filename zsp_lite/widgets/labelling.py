@@ -82,6 +82,9 @@ class _Desk:
         if point is None:
             return "No point of the cloud is there."
         labelling, chosen = self.labelling, self.controls["keypoint"].value
+        there = np.flatnonzero((labelling.picks(sequence) == point).all(axis=1))
+        if len(there) and there[0] != chosen:
+            raise InputError(f"keypoint {there[0] + 1}, {labelling.names[there[0]]}, is at this very point already")
         if chosen != _NEXT:
             with self._change(sequence):
                 labelling.move(sequence, chosen, point)
@@ -303,7 +306,9 @@ class _Desk:
             )
         if done < len(names):
             return f"Click on the right cloud: keypoint {done + 1}, {names[done]}."
-        rms = 100 * labelling.alignment(self.current).rms
+        if (alignment := labelling.alignment(self.current)) is None:
+            return f"Pick {MIN_KEYPOINTS} or more keypoints on the reference first."
+        rms = 100 * alignment.rms
         return f"All {done} keypoints are picked, residual {rms:.1f} %. Do both clouds agree? Accept it, or redo it."
 
     def _refresh(self) -> None:
