@@ -146,7 +146,7 @@ def slider_outputs(page) -> list:
     return page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".noUi-handle")).all()
 
 
-# Everything that is drawn, as text: pixels of images and canvases, plotly's SVG.
+# Everything that is drawn, as text: pixels of images and canvases, plotly's SVG. Null while an image is being replaced.
 _PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .js-plotly-plot')].map(async e => {
   if (e.tagName == 'DIV') return e.innerHTML;
   if (e.tagName == 'CANVAS') return e.toDataURL();
@@ -155,7 +155,7 @@ _PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .
   [c.width, c.height] = [e.naturalWidth, e.naturalHeight];
   c.getContext('2d').drawImage(e, 0, 0);
   return c.toDataURL();
-})).then(all => all.join('|'))"""
+})).then(all => all.join('|'), () => null)"""
 
 
 def slider_moves_picture(output, patience: float = 20) -> bool:
@@ -169,17 +169,19 @@ def slider_moves_picture(output, patience: float = 20) -> bool:
             deadline = time.monotonic() + patience / 3
             while time.monotonic() < deadline:
                 time.sleep(0.2)
-                if output.evaluate(_PICTURES) != before:
+                if output.evaluate(_PICTURES) not in (before, None):
                     return True
     return False
 
 
-def photograph(page, path: Path, width: int = 1300, highest: int = 16_000) -> None:
-    """The whole notebook as one picture, as far as Chromium can draw (`highest` pixels)."""
+def photograph(page, path: Path, width: int = 1300, highest: int = 15_000) -> None:
+    """The whole notebook as a picture; what Chromium cannot draw at once goes into further ones, NAME-2.png and so on."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    cells = "() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height"
-    page.set_viewport_size({"width": width, "height": int(min(page.evaluate(cells) + 150, highest))})
+    cells = page.evaluate("() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height")
+    page.set_viewport_size({"width": width, "height": int(min(cells + 150, highest))})
     time.sleep(2)  # until everything is laid out anew
-    page.evaluate("() => { document.querySelector('.jp-WindowedPanel-outer').scrollTop = 0 }")
-    time.sleep(1)
-    page.screenshot(path=path, timeout=120_000)
+    shown = page.evaluate("() => document.querySelector('.jp-WindowedPanel-outer').clientHeight")
+    for part in range(int(cells // shown) + 1):
+        page.evaluate(f"() => {{ document.querySelector('.jp-WindowedPanel-outer').scrollTop = {part * shown} }}")
+        time.sleep(1)
+        page.screenshot(path=path.with_stem(f"{path.stem}-{part + 1}") if part else path, timeout=120_000)
