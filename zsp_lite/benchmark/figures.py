@@ -102,7 +102,8 @@ def reliability_diagram(results: Results, row: str | None = None) -> Figure:
 
     row: default the first that states confidences. Raises InputError where none does.
     """
-    stated = {name: found for name in results.rows if len(found := results.confidences(name)) >= _LEAST_STATED}
+    names = dict.fromkeys([*results.summary.get("methods", ()), *results.rows])  # in the order they were asked for
+    stated = {name: found for name in names if len(found := results.confidences(name)) >= _LEAST_STATED}
     row = row or next(iter(stated), None)
     if row not in stated:
         raise InputError(f"reliability: {row or 'no row'} states fewer than {_LEAST_STATED} confidences")
