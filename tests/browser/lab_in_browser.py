@@ -175,7 +175,7 @@ def slider_moves_picture(output, patience: float = 20) -> bool:
 
 
 def photograph(page, path: Path, width: int = 1300, highest: int = 15_000) -> None:
-    """The whole notebook as a picture; what Chromium cannot draw at once goes into further ones, NAME-2.png and so on."""
+    """The whole notebook as a picture; what Chromium cannot draw at once goes into further ones, NAME-2.png etc."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cells = page.evaluate("() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height")
     page.set_viewport_size({"width": width, "height": int(min(cells + 150, highest))})
