@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -189,6 +190,14 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
     for wrong, told in (("no marks", "no marked table"), (text.replace("table_3", "table_9"), "table_9")):
         with pytest.raises(InputError, match=told):
             with_tables(wrong, every_table(run[1]), 1234)
+
+
+def test_the_readmes_tables_are_those_of_the_stored_run():
+    repository = Path(__file__).parents[1]
+    summary = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz").summary
+    text = (repository / "README.md").read_text()
+    assert with_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
+    assert {"icp", "sift", "ours", *GROUPS["views"], *GROUPS["verified-views"]} <= summary["methods"].keys()
 
 
 def test_the_papers_figures_were_copied_right():

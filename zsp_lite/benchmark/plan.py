@@ -183,8 +183,9 @@ def _each_kind(found: Sequence[tuple[Pair, Sequence[str]]]) -> list[tuple[Pair, 
 def _warm_up(
     store: FrameStore, found: Sequence[tuple[Pair, Sequence[str]]], rows: Mapping[str, Method], labels
 ) -> None:
-    """The first estimate pays for lazy imports and allocations; its time is nobody's."""
-    pair, names = found[-1]
+    """Each row's first answer pays for lazy imports and allocations; its time is nobody's."""
+    pair = min((pair for pair, _ in reversed(found)), key=lambda pair: len(pair.target_frames))
+    names = dict.fromkeys(name for _, names in found for name in names)
     evaluate_pair(pair, {name: rows[name] for name in names}, store, labels)
     store.forget_similarities()
     store.spent.clear()
