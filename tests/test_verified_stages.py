@@ -15,6 +15,14 @@ from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame
 from zsp_lite.metrics import rotation_error
+from zsp_lite.verified.confidence import (
+    Calibration,
+    auroc,
+    calibration_for,
+    fit_calibration,
+    margins,
+    reliability,
+)
 from zsp_lite.verified.maps import look_up, make_maps
 from zsp_lite.verified.poses import Poses, angles, fit_poses, join, suppress
 from zsp_lite.verified.proposals import from_matches, propose, view_rotations
@@ -455,3 +463,51 @@ def test_points_share_the_surface_evenly_however_densely_it_was_seen():
     share = surface_shares(ring)
     assert float(share.sum()) == pytest.approx(1, abs=1e-5)
     assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)
+
+
+# Confidence
+
+
+def test_fewer_views_are_trusted_less():
+    score, margin = np.zeros(4), np.array([0.5, 1.0, 3.0, 8.0])
+    found = [calibration_for(n).confidence(score, margin) for n in (1, 2, 3, 4, 5, 20)]
+    assert all((fewer <= more).all() for fewer, more in zip(found, found[1:]))
+    assert calibration_for(1).confidence(score, margin).max() < 0.5
+    np.testing.assert_allclose(calibration_for(20).confidence(score, margin), 1 / (1 + np.exp(-margin)))
+    between = calibration_for(2)
+    assert (between.bias, between.margin) == pytest.approx((-1.25, 0.45))
+
+
+def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():
+    confidence, right = np.array([0.9, 0.6, 0.6, 0.2]), np.array([True, True, False, False])
+    assert auroc(confidence, right) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
+    assert np.isnan(auroc(confidence, np.ones(4, dtype=bool)))
+
+
+def test_reliability_by_hand():
+    confidence = np.array([0.1, 0.3, 0.5, 0.7, 0.8, 0.8])
+    right = np.array([False, True, False, True, True, True])
+    found = reliability(confidence, right, bins=2)
+    np.testing.assert_allclose(found.confidence, [0.3, 2.3 / 3])
+    np.testing.assert_allclose(found.accuracy, [1 / 3, 1])
+    assert found.calibration_error == pytest.approx((1 / 3 - 0.3 + 1 - 2.3 / 3) / 2)
+    assert found.surest_half == 1 and "surest half 100.0 % right" in str(found)
+    with pytest.raises(InputError, match="6 outcomes and 6 confidences, expected equally many, at least 10"):
+        reliability(confidence, right)
+
+
+def test_a_lead_is_over_the_best_rival_that_is_another_answer():
+    score = np.array([5.0, 4.5, 3.0])
+    apart = np.array([[0.0, 20, 90], [20, 0, 100], [90, 100, 0]])
+    np.testing.assert_allclose(margins(score, apart), [2, 1.5, -2])
+    np.testing.assert_allclose(margins(score[:1], apart[:1, :1]), [8])  # without a rival
+
+
+def test_a_logistic_function_is_fitted_again():
+    rng = np.random.default_rng(0)
+    score, margin = rng.normal(5, 4, 4000), rng.uniform(0, 6, 4000)
+    true = Calibration(-1.0, 0.1, 0.8)
+    fitted = fit_calibration(score, margin, rng.random(4000) < true.confidence(score, margin), ridge=0)
+    assert (fitted.bias, fitted.score, fitted.margin) == pytest.approx((-1, 0.1, 0.8), abs=0.15)
+    with pytest.raises(InputError, match="4000 outcomes are all True"):
+        fit_calibration(score, margin, np.ones(4000, dtype=bool))

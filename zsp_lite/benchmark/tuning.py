@@ -187,6 +187,8 @@ def report(outcomes: Sequence[Outcome]) -> list[str]:
         f"calibration of the present weights: bias {present.bias:.2f}, score {present.score:.3f}, "
         f"margin {present.margin:.3f}"
     )
+    alone = fit_calibration(np.zeros(len(outcomes)), found_now[:, 1], found_now[:, 2] < _RIGHT)
+    lines.append(f"from the margin alone: bias {alone.bias:.2f}, margin {alone.margin:.3f}")
     lines += ["confidence, left-out category:", str(reliability(trust, judged[:, 2] < _RIGHT, min(10, len(trust))))]
     lines.append(f"rivals more than {MODES_APART:.0f} degrees apart within so many nats: pairs, of these right")
     for bound, count, right in equally_good_shares(outcomes, now, (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)):
@@ -206,6 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.benchmark.tuning", description=__doc__.split("\n")[0])
     parser.add_argument("root", nargs="+", help="folders of training categories in CO3D's layout, with pose labels")
     parser.add_argument("--pairs", type=int, default=30, metavar="N", help="pairs per category (default 30)")
+    parser.add_argument("--targets", type=int, default=5, metavar="N", help="target views per pair (default 5)")
     parser.add_argument("--backbone", default="zsp-tiny", help="name or checkpoint (default zsp-tiny)")
     given = parser.parse_args(arguments)
     try:
@@ -216,7 +219,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         backbone, outcomes = load_backbone(given.backbone), []
         with torch.no_grad():
             for root in given.root:
-                outcomes += collect(root, given.pairs, backbone, said=lambda line: print(line, flush=True))
+                outcomes += collect(
+                    root, given.pairs, backbone, given.targets, said=lambda line: print(line, flush=True)
+                )
         print("\n".join(report(outcomes)))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

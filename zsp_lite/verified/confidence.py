@@ -23,8 +23,8 @@ _MARGIN_CAP = 8.0
 class Calibration:
     """chance = sigmoid(bias + score * score_slope + margin * margin_slope).
 
-    On objects of training categories `benchmark.tuning` fits 0.04, -0.02 and 1.06, which is what the defaults round:
-    scores are in nats, so a lead of so many should have the odds of e to it, and does.
+    The defaults are for five target views: on objects of training categories `benchmark.tuning` fits 0.04, -0.02 and
+    1.06. Scores are in nats, so a lead of so many should have the odds of e to it, and does.
     """
 
     bias: float = 0.0
@@ -34,6 +34,17 @@ class Calibration:
     def confidence(self, score: Float[np.ndarray, "m"], margin: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Confidences of hypotheses, from their scores and `margins`."""
         return 1 / (1 + np.exp(-(self.bias + self.score * score + self.margin * margin)))
+
+
+# By the number of target views, from the margin alone, fitted likewise. Few views show few surfaces, and a lead among
+# poses that could hardly be tested says little: with one view it is right two times of five.
+CALIBRATIONS = {1: Calibration(bias=-1.8, margin=0.2), 3: Calibration(bias=-0.7, margin=0.7), 5: Calibration()}
+
+
+def calibration_for(views: int) -> Calibration:
+    """The calibration for so many target views; between those that were fitted, and the nearest beyond them."""
+    parts = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "score", "margin"))
+    return Calibration(*(float(np.interp(views, list(CALIBRATIONS), part)) for part in parts))
 
 
 def margins(score: Float[np.ndarray, "m"], apart: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
-from zsp_lite.verified.confidence import MODES_APART, Calibration, margins
+from zsp_lite.verified.confidence import MODES_APART, Calibration, calibration_for, margins
 from zsp_lite.verified.poses import Poses, angles, join, suppress
 from zsp_lite.verified.proposals import propose
 from zsp_lite.verified.refinement import COARSE, FINE, POLISH, refine
@@ -43,12 +43,13 @@ _NOTHING_SEEN = 0.05
 class VerifiedSettings:
     """What the verified solver does; the defaults are what measured best, the rest is for ablations.
 
-    weights: of the score.  calibration: of the confidences.  features: weight of similarity in the soft ICP.
+    weights: of the score.  calibration: of the confidences, None for the one that fits the number of target views.
+    features: weight of similarity in the soft ICP.
     icp, refinement: whether these stages run.
     """
 
     weights: Weights = Weights()
-    calibration: Calibration = Calibration()
+    calibration: Calibration | None = None
     features: float = 8.0
     icp: bool = True
     refinement: bool = True
@@ -118,7 +119,8 @@ def solve(
     with _timed(timings, "ranking"), torch.no_grad():
         score = settings.weights.score(terms).double().numpy()
         apart = angles(poses.rotation, poses.rotation).double().numpy()
-        confidence = settings.calibration.confidence(score, margins(score, apart))
+        calibration = settings.calibration or calibration_for(len(order))
+        confidence = calibration.confidence(score, margins(score, apart))
         sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
         hypotheses = []
         for i in range(len(poses)):
