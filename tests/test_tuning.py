@@ -21,7 +21,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import reliability
 from zsp_lite.verified.verification import TERMS, Weights
 
-TRUE = Weights(6, 0, -4, -2, 0, 3, 0, -1)
+TRUE = Weights(6, 0, -4, -2, 0, 3, 0, -1, 0)
 
 
 def drawn(n: int, rng: np.random.Generator, m: int = 6) -> list[Outcome]:
@@ -46,7 +46,9 @@ def test_the_weights_that_outcomes_were_drawn_with_are_found_again():
 def test_a_ridge_shrinks_and_pairs_without_a_right_hypothesis_teach_nothing():
     rng = np.random.default_rng(1)
     some = drawn(200, rng)
-    hopeless = [Outcome("x", rng.normal(size=(6, 8)), np.full(6, 90.0), 90 * (1 - np.eye(6))) for _ in range(50)]
+    hopeless = [
+        Outcome("x", rng.normal(size=(6, len(TERMS))), np.full(6, 90.0), 90 * (1 - np.eye(6))) for _ in range(50)
+    ]
     free, held = fit_weights(some, ridge=1e-3), fit_weights(some, ridge=1)
     assert np.linalg.norm(astuple(held)) < np.linalg.norm(astuple(free))
     np.testing.assert_allclose(astuple(fit_weights(some + hopeless)), astuple(fit_weights(some)), rtol=0.1, atol=0.1)
@@ -71,11 +73,11 @@ def test_nothing_is_fitted_to_the_category_it_is_judged_on():
 
 def test_rivals_within_a_bound_are_counted():
     def pair(margin, error):
-        terms = np.zeros((2, 8))
+        terms = np.zeros((2, len(TERMS)))
         terms[0, 0] = margin
         return Outcome("x", terms, np.array([error, 100.0]), np.array([[0.0, 90], [90, 0]]))
 
-    plain = Weights(1, 0, 0, 0, 0, 0, 0, 0)
+    plain = Weights(1, 0, 0, 0, 0, 0, 0, 0, 0)
     shares = equally_good_shares([pair(0.2, 5.0), pair(0.8, 170.0), pair(3.0, 5.0)], plain, (0.5, 1.0))
     assert shares == [(0.5, 1, 1.0), (1.0, 2, 0.5)]
 
@@ -87,7 +89,7 @@ def test_outcomes_of_a_folder_hold_the_solvers_hypotheses(ellipsoids):
     assert len(outcomes) == 2 and said == [f"ellipsoid: 2 pairs, {50 * right} % within 30 degrees"]
     assert min(one.errors[0] for one in outcomes) < 5
     for one in outcomes:
-        assert one.terms.shape == (len(one.errors), 8) and one.apart.shape == (len(one.errors),) * 2
+        assert one.terms.shape == (len(one.errors), len(TERMS)) and one.apart.shape == (len(one.errors),) * 2
         assert one.best(Weights())[2] == one.errors[0]  # ranked by the present weights
         np.testing.assert_allclose(np.diag(one.apart), 0, atol=1e-3)
         assert one.apart[~np.eye(len(one.errors), dtype=bool)].min() > 14.9

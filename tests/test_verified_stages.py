@@ -29,7 +29,7 @@ from zsp_lite.verified.proposals import from_matches, propose, view_rotations
 from zsp_lite.verified.refinement import Search, refine, rotations
 from zsp_lite.verified.scene import contrast, make_scene, surface_shares
 from zsp_lite.verified.soft_icp import soft_icp, spread_indices
-from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, verify
+from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, same_side, verify
 from zsp_lite.views import View, look, object_crop
 
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
@@ -400,9 +400,26 @@ def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
 def test_the_score_is_the_weighted_sum_of_the_terms():
     rng = np.random.default_rng(4)
     terms = Terms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERMS))
-    weights = Weights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0)
+    weights = Weights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
     by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERMS)
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
+
+
+def test_the_view_term_prefers_the_pose_that_looks_from_the_side_of_the_likest_view(views):
+    """Of two targets seen from far apart, one is alike: being seen from there is worth more, by likeness and angle."""
+    alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
+    scene = make_scene(views[0], views[1:3], [alike, other])
+    np.testing.assert_allclose(scene.likeness, [0.3, -0.3], atol=1e-6)
+    sides = view_rotations(scene)
+    apart = rotation_error(*sides.rotation.double().numpy())
+    expected = 0.3 * (1 - np.exp(-((apart / 45) ** 2)))
+    np.testing.assert_allclose(same_side(scene, sides), [expected, -expected], atol=1e-3)
+    np.testing.assert_allclose(verify(scene, sides).view, same_side(scene, sides))
+
+
+def test_with_one_view_the_view_term_says_nothing(views):
+    scene = make_scene(views[0], views[1:2], [torch.rand(784, 784)])
+    np.testing.assert_array_equal(same_side(scene, view_rotations(scene)), [0])
 
 
 def test_reverse_is_forward_with_the_sides_exchanged(views, truth):

@@ -58,9 +58,12 @@ def _verified_rows() -> dict[str, Method]:
     less = {
         "nosilhouette": VerifiedSettings(weights=Weights(f_off=0, r_off=0)),
         "nofreespace": VerifiedSettings(weights=Weights(f_front=0, r_front=0)),
-        "simonly": VerifiedSettings(weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0)),
-        "forward": VerifiedSettings(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0)),
-        "nofeatures": VerifiedSettings(weights=Weights(f_sim=0, r_sim=0), features=0),
+        "noview": VerifiedSettings(weights=Weights(view=0)),
+        "simonly": VerifiedSettings(
+            weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0, view=0)
+        ),
+        "forward": VerifiedSettings(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0, view=0)),
+        "nofeatures": VerifiedSettings(weights=Weights(f_sim=0, r_sim=0, view=0), features=0),
         "noicp": VerifiedSettings(icp=False),
         "norefinement": VerifiedSettings(refinement=False),
     }
@@ -135,7 +138,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "published": ("ours", "ours-published"),
     "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
     "verified-ablations": ("ours", "verified", *(f"verified-{name}" for name in (
-        "mask", "n1", "nosilhouette", "nofreespace", "simonly", "forward", "nofeatures", "noicp", "norefinement",
+        "mask", "n1", "nosilhouette", "nofreespace", "noview", "simonly", "forward", "nofeatures", "noicp",
+        "norefinement",
     ))),
     "robustness": tuple(f"{row}{damage}" for damage in ("", "-mask", "-clean", *(f"-{name}" for name in DAMAGES))
                         for row in ("ours", "verified")),

@@ -45,7 +45,7 @@ class Outcome:
     """
 
     category: str
-    terms: Float[np.ndarray, "m 8"]
+    terms: Float[np.ndarray, "m terms"]
     errors: Float[np.ndarray, "m"]
     apart: Float[np.ndarray, "m m"]
 

@@ -40,6 +40,7 @@ class Scene:
     reference_maps, target_maps: what the views say about their pixels.
     reference_frame: reference camera to working units.  target_frame: first target camera to working units.
     cameras: of the targets.  matches: per target the matched points of both sides, in working units.
+    likeness: of each target view to the reference (see `view_likeness`), less their mean.
     """
 
     reference_points: Float[Tensor, "n 3"]
@@ -54,6 +55,7 @@ class Scene:
     target_frame: Sim3
     cameras: tuple[Camera, ...]
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
+    likeness: Float[Tensor, "v"]
 
     def sim3(self, poses: Poses, index: int, view: int) -> Sim3:
         """A pose as the similarity from reference-camera points to a target view's camera points."""
@@ -90,14 +92,15 @@ def make_scene(
 
     rows = np.flatnonzero(source_on)
     foregrounds = [np.flatnonzero(np.asarray(target.foreground.cpu()).ravel()) for target in targets]
-    columns, blocks, width = [], [], 0
+    columns, blocks, width, likeness = [], [], 0, []
     for target, patches, similarity in zip(targets, foregrounds, similarities, strict=True):
         column = np.full(target.foreground.numel(), -1)
         column[patches] = width + np.arange(len(patches))
         width += len(patches)
         columns.append(column)
-        block = similarity.cpu().float()[torch.from_numpy(rows)][:, torch.from_numpy(patches)]
-        blocks.append(contrast(block))
+        similarity = similarity.cpu().float()[:, torch.from_numpy(patches)]
+        blocks.append(contrast(similarity[torch.from_numpy(rows)]))
+        likeness.append(view_likeness(similarity[reference.foreground.cpu().ravel()]))
     row = np.full(source_on.shape, -1)
     row[rows] = np.arange(len(rows))
 
@@ -121,6 +124,7 @@ def make_scene(
         target_frame,
         tuple(target.frame.camera for target in targets),
         tuple(pairs),
+        torch.stack(likeness) - torch.stack(likeness).mean(),
     )
 
 
@@ -134,6 +138,16 @@ def contrast(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
         return similarity
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
+
+
+def view_likeness(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
+    """How alike two views are: each foreground patch's highest similarity in the other, averaged, both ways.
+
+    A view without foreground is as unlike as can be.
+    """
+    if not similarity.numel():
+        return similarity.new_tensor(-1.0)
+    return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
 
 
 def surface_shares(points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:

@@ -6,6 +6,8 @@ sim    how alike in features a point is to what the views show where it lies on 
 seen   the share of points that lie on a seen surface
 off    how far points fall outside the silhouettes
 front  how far they float before the surfaces seen there, in space that a view saw to be free
+And one of the pictures as wholes:
+view   how alike the reference and the target views are that look from the same side as it, under the pose
 A point behind a seen surface is hidden, and one where the depth is unknown may be anywhere: neither is held against
 the pose.
 """
@@ -18,12 +20,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from zsp_lite.verified.maps import Seen, look_up
-from zsp_lite.verified.poses import Poses
+from zsp_lite.verified.poses import Poses, angles
 from zsp_lite.verified.scene import Scene
 
 # In working units, shares of the object's spread: the width of "on the surface", and where an offence costs in full.
 TOUCH = 0.25
 FULL = 0.5
+SAME_SIDE = 45.0  # degrees between two lines of sight at which a view's likeness counts 1/e
 # Weight at which a point's similarity counts half: a glimpse in one view is less than the sight of three.
 _GLIMPSE = 0.5
 # Lookups at a time; what they need then stays in the processor's cache.
@@ -32,7 +35,7 @@ _CHUNK = 250_000
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The terms of m poses (see above): of sim and seen the more the better, of off and front the less."""
+    """The terms of m poses (see above): of sim, seen and view the more the better, of off and front the less."""
 
     f_sim: Float[Tensor, "m"]
     f_seen: Float[Tensor, "m"]
@@ -42,12 +45,13 @@ class Terms:
     r_seen: Float[Tensor, "m"]
     r_off: Float[Tensor, "m"]
     r_front: Float[Tensor, "m"]
+    view: Float[Tensor, "m"]
 
     def __getitem__(self, index) -> "Terms":
         """The terms of the poses at an index array, slice or mask."""
         return Terms(*(getattr(self, name)[index] for name in TERMS))
 
-    def table(self) -> Float[Tensor, "m 8"]:
+    def table(self) -> Float[Tensor, "m terms"]:
         """One column per term, in the order of `TERMS`."""
         return torch.stack([getattr(self, name) for name in TERMS], dim=1)
 
@@ -74,6 +78,7 @@ class Weights:
     r_seen: float = 35.0
     r_off: float = -10.0
     r_front: float = -30.0
+    view: float = 20.0
 
     def score(self, terms: Terms) -> Float[Tensor, "m"]:
         """The weighted sum of the terms, the higher the better."""
@@ -130,7 +135,17 @@ def verify(scene: Scene, poses: Poses, every: tuple[int, int] = (1, 1)) -> Terms
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
         parts.append((*forward(scene, some, rows).terms(even), *reverse(scene, some, chosen).terms(shares)))
-    return Terms(*(torch.cat(term) for term in zip(*parts)))
+    return Terms(*(torch.cat(term) for term in zip(*parts)), same_side(scene, poses))
+
+
+def same_side(scene: Scene, poses: Poses) -> Float[Tensor, "m"]:
+    """The view term: what the method chooses the best view by (sec. 4.2), as evidence for a pose among others.
+
+    Each target view's likeness to the reference, less their mean, counts by how near the pose puts its line of sight
+    to the reference's. With one target view it is 0.
+    """
+    away = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
+    return torch.exp(-((away / SAME_SIDE) ** 2)) @ scene.likeness
 
 
 def _weigh(scene: Scene, seen: Seen, point: Int[Tensor, "n"], patch_stride: int) -> Evidence:
