@@ -10,12 +10,12 @@ from zsp_lite.baselines.posecontrast import angles_of, load_posecontrast_tiny, r
 from zsp_lite.baselines.swav import load_swav_tiny
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
+from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training import object_crops as crops_module
 from zsp_lite.training import posecontrast, swav
 from zsp_lite.training.object_crops import SIZE, VIEWS, ObjectCrops, object_crops, render_object
 from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
 from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -107,8 +107,9 @@ def test_swapped_predictions_of_agreeing_crops_cost_least():
 
 def test_crops_are_two_large_and_two_small_ones():
     pictures = torch.rand(3, 3, SIZE, SIZE)
-    large, small = multi_crop(pictures, np.random.default_rng(0), SwavConfig())
-    assert large.shape == (6, 3, 96, 96) and small.shape == (6, 3, 48, 48)
+    config = SwavConfig()
+    large, small = multi_crop(pictures, np.random.default_rng(0), config)
+    assert large.shape == (6, 3, config.large, config.large) and small.shape == (6, 3, config.small, config.small)
 
 
 def test_both_trainers_write_what_the_loaders_read(folder):
@@ -119,7 +120,8 @@ def test_both_trainers_write_what_the_loaders_read(folder):
     load_posecontrast_tiny(path)
     row = json.loads((folder / "posecontrast-tiny.jsonl").read_text().splitlines()[-1])
     assert row["step"] == 2 and 0 <= row["held_out_median"] <= 180 and len(lines) == 2
-    assert json.loads((folder / "swav-tiny.json").read_text())["steps"] == 2
+    config = json.loads((folder / "swav-tiny.json").read_text())
+    assert config["steps"] == 2 and config["categories"] == list(TRAINING)
 
 
 def test_settings_without_a_meaning_are_refused(tmp_path):

@@ -119,7 +119,7 @@ def load_posecontrast_tiny(path: str | Path = TINY_WEIGHTS) -> PoseContrast:
     return PoseContrast(parts.network, parts.estimator, "posecontrast-tiny", TINY_SIZE)
 
 
-TINY_SIZE = 112
+TINY_SIZE = 64
 
 
 class TinyParts(nn.Module):

@@ -41,7 +41,7 @@ class PoseContrastConfig:
 
     seed: int = 0
     objects: int = 1500
-    steps: int = 450
+    steps: int = 1500
     batch: int = 32
     learning_rate: float = 1e-3
     weight_decay: float = 5e-4

@@ -35,13 +35,13 @@ class SwavConfig:
 
     seed: int = 0
     objects: int = 1500
-    steps: int = 320
+    steps: int = 700
     batch: int = 48
     prototypes: int = 32  # SwAV has 3,000, for a thousand kinds of object
-    large: int = 96
-    small: int = 48
-    large_scale: tuple[float, float] = (0.5, 1.0)
-    small_scale: tuple[float, float] = (0.2, 0.5)
+    large: int = 64
+    small: int = 32
+    large_scale: tuple[float, float] = (0.25, 0.8)
+    small_scale: tuple[float, float] = (0.12, 0.35)
     temperature: float = 0.1
     regularisation: float = 0.05
     learning_rate: float = 1e-3
