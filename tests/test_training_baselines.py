@@ -17,6 +17,7 @@ from zsp_lite.training.object_crops import SIZE, VIEWS, ObjectCrops, object_crop
 from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
 from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
 
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Crops of two objects, rendered in this process."""
