@@ -18,4 +18,5 @@ WIDGETS: dict[str, str] = {
     "symmetry_turn": "metrics:example_symmetry_turn",
     "ranked_hypotheses": "verified:example_ranked_hypotheses",
     "box_to_mask": "masks:example_box_to_mask",
+    "label_poses": "labelling:example_label_poses",
 }

@@ -5,12 +5,17 @@ once. Run the cell again after a restart and go on.
 """
 
 import html
+import shutil
 from collections.abc import Callable
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from zsp_lite.co3d import Co3D
+from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import ACCEPTED, OPEN, SKIPPED, Labelling
@@ -46,8 +51,8 @@ def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> "VB
     """Label a category by hand: the reference's cloud on the left, on the right the sequence that is being labelled.
 
     backbone: of the button "guess"; default: zsp-tiny, loaded when it is first pressed. All that is refused is said in
-    a line of the widget. The result's `controls` and `views` are its controls and its two canvases by name; CSS
-    classes begin with `zsp-`. Raises InputError without ipywidgets or anywidget.
+    a line of the widget. The result's `controls`, `buttons` and `views` (two canvases) are its parts by name, `name` is
+    the field for a keypoint's name; CSS classes begin with `zsp-`. Raises InputError without ipywidgets or anywidget.
     """
     return _Desk(labelling, backbone).box
 
@@ -88,7 +93,7 @@ class _Desk:
         if chosen != _NEXT:
             with self._change(sequence):
                 labelling.move(sequence, chosen, point)
-            self.controls["keypoint"].value = _NEXT
+            self.controls["keypoint"].value, self.controls["name"].value = _NEXT, ""
             return f"Keypoint {chosen + 1}, {labelling.names[chosen]}, moved on {sequence}."
         if sequence != labelling.reference and len(labelling.names) < MIN_KEYPOINTS:
             raise InputError(f"the reference has {len(labelling.names)} keypoints, expected {MIN_KEYPOINTS} first")
@@ -229,7 +234,8 @@ class _Desk:
             ]
         )
         self.box.add_class("zsp-label")
-        self.box.controls, self.box.buttons, self.box.views = controls, self.buttons, self.views
+        self.box.controls = {name: control for name, control in controls.items() if name != "name"}
+        self.box.name, self.box.buttons, self.box.views = controls["name"], self.buttons, self.views
         self.box.message, self.box.tables = self.message, self.tables
 
     def _button(self, name: str, tooltip: str, action: Callable[[], str]):
@@ -465,3 +471,19 @@ def _keypoint_table(names, done: int, alignment: Alignment | None, on_reference:
         body = "<tr><td></td><td>none yet</td><td></td><td></td><td></td></tr>"
     head = "<th></th><th>keypoint</th><th>picked</th><th>residual</th><th></th>"
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def example_label_poses() -> "VBox":
+    """The widget on a temporary copy of a sample category, with four keypoints picked on two objects."""
+    folder = TemporaryDirectory(prefix="zsp-lite-")
+    category = Co3D(sample_data()).categories()[0]
+    shutil.copytree(sample_data() / category, Path(folder.name) / category)
+    labelling = Labelling(folder.name, category)
+    for sequence in labelling.sequences[:2]:
+        points = labelling.cloud(sequence)[0]
+        for point in points[:: len(points) // 4][:4]:
+            labelling.pick(sequence, point)
+    box = label_poses(labelling)
+    box.controls["sequence"].value = labelling.sequences[1]
+    box.folder = folder  # goes when the widget does
+    return box
