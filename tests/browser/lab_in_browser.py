@@ -158,7 +158,7 @@ _PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .
 })).then(all => all.join('|'), () => null)"""
 
 
-def slider_moves_picture(output, patience: float = 20) -> bool:
+def slider_moves_picture(output, patience: float = 90) -> bool:
     """Whether the pictures of a widget change when one of its sliders is moved by keyboard."""
     output.scroll_into_view_if_needed()
     before = output.evaluate(_PICTURES)

@@ -79,6 +79,7 @@ def lab(browser, tmp_path_factory):
 @pytest.fixture
 def page(browser, lab):
     context = browser.new_context(viewport={"width": 1300, "height": 1000})
+    context.set_default_timeout(180_000)  # milliseconds, for a busy machine
     yield context.new_page()
     context.close()
     lab.stop_kernels()
