@@ -83,7 +83,10 @@ def serve(folder: Path, state: Path, data: Path, patience: float = 180):
         lab.stop_kernels()
     finally:
         server.terminate()
-        server.wait(timeout=30)
+        try:
+            server.wait(timeout=120)
+        except subprocess.TimeoutExpired:
+            server.kill()
 
 
 def _answers(lab: Lab) -> bool:
