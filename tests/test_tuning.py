@@ -60,7 +60,7 @@ def test_the_calibration_says_how_often_the_preferred_one_is_right():
     outcomes = drawn(700, np.random.default_rng(2))
     calibration = calibrate(outcomes, TRUE)
     score, margin, error = np.array([one.best(TRUE) for one in drawn(700, np.random.default_rng(3))]).T
-    trust = calibration.confidence(score, margin)
+    trust = calibration.confidence(margin, np.zeros(700))
     assert reliability(trust, error < 30, 5).calibration_error < 0.08
     assert trust.mean() == pytest.approx((error < 30).mean(), abs=0.05)
 

@@ -486,13 +486,18 @@ def test_points_share_the_surface_evenly_however_densely_it_was_seen():
 
 
 def test_fewer_views_are_trusted_less():
-    score, margin = np.zeros(4), np.array([0.5, 1.0, 3.0, 8.0])
-    found = [calibration_for(n).confidence(score, margin) for n in (1, 2, 3, 4, 5, 20)]
+    margin = np.array([0.5, 1.0, 3.0, 8.0])
+    found = [calibration_for(n).confidence(margin, 0.04) for n in (1, 2, 3, 4, 5, 20)]
     assert all((fewer <= more).all() for fewer, more in zip(found, found[1:]))
-    assert calibration_for(1).confidence(score, margin).max() < 0.5
-    np.testing.assert_allclose(calibration_for(20).confidence(score, margin), 1 / (1 + np.exp(-margin)))
+    assert calibration_for(1).confidence(margin, 0.0).max() < 0.5
+    np.testing.assert_allclose(calibration_for(20).confidence(margin, 0.04), 1 / (1 + np.exp(-margin)))
     between = calibration_for(2)
-    assert (between.bias, between.margin) == pytest.approx((-1.25, 0.45))
+    assert (between.bias, between.margin, between.spread) == pytest.approx((-1.25, 0.45, 0))
+
+
+def test_views_that_the_features_tell_apart_are_trusted_more():
+    margin = np.array([0.5, 3.0])
+    assert (Calibration().confidence(margin, 0.08) > Calibration().confidence(margin, 0.02)).all()
 
 
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():
@@ -522,9 +527,9 @@ def test_a_lead_is_over_the_best_rival_that_is_another_answer():
 
 def test_a_logistic_function_is_fitted_again():
     rng = np.random.default_rng(0)
-    score, margin = rng.normal(5, 4, 4000), rng.uniform(0, 6, 4000)
-    true = Calibration(-1.0, 0.1, 0.8)
-    fitted = fit_calibration(score, margin, rng.random(4000) < true.confidence(score, margin), ridge=0)
-    assert (fitted.bias, fitted.score, fitted.margin) == pytest.approx((-1, 0.1, 0.8), abs=0.15)
+    margin, spread = rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000)
+    true = Calibration(-1.0, 0.8, 0.6)
+    fitted = fit_calibration(margin, spread, rng.random(4000) < true.confidence(margin, spread), ridge=0)
+    assert (fitted.bias, fitted.margin, fitted.spread) == pytest.approx((-1, 0.8, 0.6), abs=0.2)
     with pytest.raises(InputError, match="4000 outcomes are all True"):
-        fit_calibration(score, margin, np.ones(4000, dtype=bool))
+        fit_calibration(margin, spread, np.ones(4000, dtype=bool))

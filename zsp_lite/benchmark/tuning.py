@@ -26,6 +26,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pairs import Pair, sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.verified import solve
 from zsp_lite.verified.confidence import MODES_APART, Calibration, fit_calibration, margins, reliability
 from zsp_lite.verified.verification import TERMS, Weights
 
@@ -41,13 +42,14 @@ class Outcome:
     """What the solver found for one pair of a category.
 
     terms: of its m hypotheses, in the order of `TERMS`.  errors: their rotation errors in degrees.  apart: degrees
-    between them.
+    between them.  spread: of the target views' likeness to the reference.
     """
 
     category: str
     terms: Float[np.ndarray, "m terms"]
     errors: Float[np.ndarray, "m"]
     apart: Float[np.ndarray, "m m"]
+    spread: float = 0.0
 
     def scores(self, weights: Weights) -> Float[np.ndarray, "m"]:
         """The hypotheses' scores under some weights."""
@@ -94,7 +96,10 @@ def outcome(pair: Pair, store: FrameStore, labels: Mapping[str, PoseLabel]) -> O
     solver = ZeroShotPose(store.extractors["backbone"], solver="verified", seed=pair.seed)
     settings = solver.foreground, solver.saliency_threshold
     reference, *targets = [store.view("backbone", key, *settings) for key in keys]
-    found = solver.estimate_from_features(reference, targets).hypotheses
+    sims = solver.similarities(reference, targets)
+    matches = [solver.compare(reference, target, sim).matches for target, sim in zip(targets, sims)]
+    solution = solve(reference, targets, sims, matches, pair.seed)
+    found = solution.hypotheses
     cameras = [target.frame.camera for target in targets]
     truth = [relative_pose(first, reference.frame.camera, second, camera)[:3, :3] for camera in cameras]
     errors = np.array([rotation_error(one.sim3.R, truth[one.view]) for one in found])
@@ -102,7 +107,7 @@ def outcome(pair: Pair, store: FrameStore, labels: Mapping[str, PoseLabel]) -> O
     turned = np.stack([cameras[one.view].R.T @ one.sim3.R for one in found])
     return Outcome(
         pair.category, np.array([[one.terms[name] for name in TERMS] for one in found]), errors,
-        rotation_error(turned[:, None], turned[None]),
+        rotation_error(turned[:, None], turned[None]), solution.scene.spread,
     )  # fmt: skip
 
 
@@ -144,8 +149,12 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _RIDGE) -> Weights:
 
 def calibrate(outcomes: Sequence[Outcome], weights: Weights) -> Calibration:
     """The calibration of the hypotheses that the weights prefer."""
-    score, margin, error = np.array([one.best(weights) for one in outcomes]).T
-    return fit_calibration(score, margin, error < _RIGHT)
+    _, margin, error = np.array([one.best(weights) for one in outcomes]).T
+    return fit_calibration(margin, _spreads(outcomes), error < _RIGHT)
+
+
+def _spreads(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "n"]:
+    return np.array([one.spread for one in outcomes])
 
 
 def leave_one_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit]) -> list[_Fit]:
@@ -173,7 +182,9 @@ def report(outcomes: Sequence[Outcome]) -> list[str]:
     found_now = np.array([one.best(now) for one in outcomes])
     others = leave_one_out(outcomes, lambda some: (w := fit_weights(some), calibrate(some, w)))
     judged = np.array([one.best(w) for one, (w, _) in zip(outcomes, others)])
-    trust = np.concatenate([one.confidence(*found[:2, None]) for (_, one), found in zip(others, judged)])
+    trust = np.concatenate([
+        one.confidence(found[1:2], spread) for (_, one), found, spread in zip(others, judged, _spreads(outcomes))
+    ])  # fmt: skip
     nearest = np.array([one.errors.min() for one in outcomes])
     lines = [
         f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",
@@ -184,10 +195,10 @@ def report(outcomes: Sequence[Outcome]) -> list[str]:
     ]
     present = calibrate(outcomes, now)
     lines.append(
-        f"calibration of the present weights: bias {present.bias:.2f}, score {present.score:.3f}, "
-        f"margin {present.margin:.3f}"
+        f"calibration of the present weights: bias {present.bias:.2f}, margin {present.margin:.3f}, "
+        f"spread {present.spread:.1f}"
     )
-    alone = fit_calibration(np.zeros(len(outcomes)), found_now[:, 1], found_now[:, 2] < _RIGHT)
+    alone = fit_calibration(found_now[:, 1], np.zeros(len(outcomes)), found_now[:, 2] < _RIGHT)
     lines.append(f"from the margin alone: bias {alone.bias:.2f}, margin {alone.margin:.3f}")
     lines += ["confidence, left-out category:", str(reliability(trust, judged[:, 2] < _RIGHT, min(10, len(trust))))]
     lines.append(f"rivals more than {MODES_APART:.0f} degrees apart within so many nats: pairs, of these right")

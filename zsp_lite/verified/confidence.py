@@ -1,7 +1,7 @@
 """How sure a hypothesis is: a calibrated chance that its rotation is within 30 degrees of the truth.
 
-A logistic function of the hypothesis's score, which says how well it explains the views, and of its margin, which
-says how much better it does than any other more than 30 degrees away. Reliability is measured as ever: AUROC asks
+A logistic function of the hypothesis's margin, which says how much better it explains the views than any other more
+than 30 degrees away, and of how well the features tell this object's sides apart. Reliability is measured as ever: AUROC asks
 whether right answers get more confidence than wrong ones, the expected calibration error whether confidences are
 frequencies.
 """
@@ -21,29 +21,33 @@ _MARGIN_CAP = 8.0
 
 @dataclass(frozen=True)
 class Calibration:
-    """chance = sigmoid(bias + score * score_slope + margin * margin_slope).
+    """chance = sigmoid(bias + margin * margin_slope + spread * spread_slope).
 
-    The defaults are for five target views: on objects of training categories `benchmark.tuning` fits 0.04, -0.02 and
-    1.06. Scores are in nats, so a lead of so many should have the odds of e to it, and does.
+    margin: of a hypothesis, see `margins`.  spread: standard deviation of the target views' likeness to the reference
+    (`scene.view_likeness`): where all views look alike to the features, they tell the sides of this object badly.
+    The defaults are for five target views, rounded from a fit on objects of training categories: -1.07, 0.97 and 25.6.
+    Scores are in nats, so a lead of so many should have the odds of e to it, and does.
     """
 
-    bias: float = 0.0
-    score: float = 0.0
+    bias: float = -1.0
     margin: float = 1.0
+    spread: float = 25.0
 
-    def confidence(self, score: Float[np.ndarray, "m"], margin: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-        """Confidences of hypotheses, from their scores and `margins`."""
-        return 1 / (1 + np.exp(-(self.bias + self.score * score + self.margin * margin)))
+    def confidence(
+        self, margin: Float[np.ndarray, "m"], spread: float | Float[np.ndarray, "m"]
+    ) -> Float[np.ndarray, "m"]:
+        """Confidences of hypotheses."""
+        return 1 / (1 + np.exp(-(self.bias + self.margin * margin + self.spread * spread)))
 
 
 # By the number of target views, from the margin alone, fitted likewise. Few views show few surfaces, and a lead among
 # poses that could hardly be tested says little: with one view it is right two times of five.
-CALIBRATIONS = {1: Calibration(bias=-1.8, margin=0.2), 3: Calibration(bias=-0.7, margin=0.7), 5: Calibration()}
+CALIBRATIONS = {1: Calibration(-1.8, 0.2, 0.0), 3: Calibration(-0.7, 0.7, 0.0), 5: Calibration()}
 
 
 def calibration_for(views: int) -> Calibration:
     """The calibration for so many target views; between those that were fitted, and the nearest beyond them."""
-    parts = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "score", "margin"))
+    parts = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "margin", "spread"))
     return Calibration(*(float(np.interp(views, list(CALIBRATIONS), part)) for part in parts))
 
 
@@ -57,7 +61,7 @@ def margins(score: Float[np.ndarray, "m"], apart: Float[np.ndarray, "m m"]) -> F
 
 
 def fit_calibration(
-    score: Float[np.ndarray, "n"], margin: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"], ridge: float = 1e-3
+    margin: Float[np.ndarray, "n"], spread: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"], ridge: float = 1e-3
 ) -> Calibration:
     """The calibration under which the outcomes `right` are likeliest (logistic regression by Newton's method).
 
@@ -66,7 +70,7 @@ def fit_calibration(
     right = np.asarray(right, dtype=np.float64)
     if right.min() == right.max():
         raise InputError(f"{len(right)} outcomes are all {bool(right[0])}, expected some right and some wrong")
-    features = np.stack([score, margin], axis=1)
+    features = np.stack([margin, spread], axis=1)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     x = np.column_stack([np.ones(len(right)), (features - mean) / std])
     penalty = ridge * len(right) * np.diag([0.0, 1.0, 1.0])

@@ -120,7 +120,7 @@ def solve(
         score = settings.weights.score(terms).double().numpy()
         apart = angles(poses.rotation, poses.rotation).double().numpy()
         calibration = settings.calibration or calibration_for(len(order))
-        confidence = calibration.confidence(score, margins(score, apart))
+        confidence = calibration.confidence(margins(score, apart), scene.spread)
         sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
         hypotheses = []
         for i in range(len(poses)):

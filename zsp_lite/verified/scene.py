@@ -57,6 +57,11 @@ class Scene:
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     likeness: Float[Tensor, "v"]
 
+    @property
+    def spread(self) -> float:
+        """How much the target views differ in likeness to the reference: their standard deviation."""
+        return float(self.likeness.std(correction=0))
+
     def sim3(self, poses: Poses, index: int, view: int) -> Sim3:
         """A pose as the similarity from reference-camera points to a target view's camera points."""
         left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())  # float32's rounding off
