@@ -6,12 +6,12 @@ known and all have depth, so a pose can be tested in every one of them. Stages, 
 scene         what all views saw, in one frame and unit
 proposals     poses suggested by three matches of one view, and the views' own rotations
 soft_icp      each drawn to its neighbourhood's best alignment, weighted by features
-verification  a score of named terms: features, silhouettes, free space, forward and in reverse
+verification  a score of named terms: features, silhouettes, free space, forward and in reverse; likeness of views
 refinement    the score itself climbed by random search
 hypotheses    the ranking, and all of it in one call: `solve`
 confidence    a calibrated chance that a hypothesis is right
 
-What was tried and left out (276 pairs of 19 training categories, Acc30 of the paper's solver 59.4): locally optimised
+What was tried and left out, before the view term came (276 pairs of 19 training categories, Acc30 of the paper's solver 59.4): locally optimised
 RANSAC with the truncated score in the chosen view, thresholds of 0.2 to 0.4 (60.1 to 60.5: the inliers of a wrong pose
 agree as well as those of a right one); the same with thresholds from the object's size (62.3, of which a threshold from
 the size alone gives 61.6: `ZeroShotPose(adaptive_threshold=True)`). In the verification (418 pairs, fitted and judged
