@@ -1,9 +1,9 @@
 """How sure a hypothesis is: a calibrated chance that its rotation is within 30 degrees of the truth.
 
 A logistic function of the hypothesis's margin, which says how much better it explains the views than any other more
-than 30 degrees away, and of how well the features tell this object's sides apart. Reliability is measured as ever: AUROC asks
-whether right answers get more confidence than wrong ones, the expected calibration error whether confidences are
-frequencies.
+than 30 degrees away, and of how well the features tell this object's sides apart. Reliability is measured as ever:
+AUROC asks whether right answers get more confidence than wrong ones, the expected calibration error whether confidences
+are frequencies.
 """
 
 from dataclasses import dataclass
