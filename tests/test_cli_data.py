@@ -70,6 +70,8 @@ def test_the_labelling_lists_and_draws_its_candidates(root, tmp_path, capsys):
     sheet = tmp_path / "sheets/chair.png"
     assert main(["label", str(root), "chair", "--contact-sheet", str(sheet)]) == 0
     assert sheet.read_bytes().startswith(b"\x89PNG")
+    assert main(["label", str(root), "chair", "--contact-sheet", str(tmp_path / "sheet.doc")]) == 2
+    assert "expected the name of a .png file" in capsys.readouterr().err
 
 
 def test_labelling_without_a_desktop_is_one_line(root, monkeypatch, capsys):
@@ -92,6 +94,8 @@ def test_labelling_without_a_desktop_is_one_line(root, monkeypatch, capsys):
         (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit", "1"],
          "--depth-unit does not go with the format tum"),
         (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--box", "1,2"],
+         "expected four numbers"),
+        (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--box", "inf,1,2,3"],
          "expected four numbers"),
         (["label", "/nowhere", "chair"], "does not exist"),
     ],

@@ -127,6 +127,64 @@ def test_a_bad_file_stops_everything_before_a_file_is_written(clone, root, file,
     assert everything(root) == before
 
 
+def locked(data):
+    """A zip file whose entries claim to need a password."""
+    for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        start = data.find(mark) + flags
+        data = data[:start] + bytes([data[start] | 1]) + data[start + 1 :]
+    return data
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        locked,
+        lambda data: data.replace(b"PK\x03\x04\x14\0\0\0\0\0", b"PK\x03\x04\x14\0\0\0\x61\0").replace(
+            b"\x14\0\0\0\0\0", b"\x14\0\0\0\x61\0"
+        ),
+    ],
+    ids=["password", "unknown compression"],
+)
+def test_an_archive_that_cannot_be_unpacked_is_one_line(clone, root, damage):
+    path, _ = packed(clone, "zip")
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError, match="is broken, locked or none"):
+        bring_labels(path, root)
+    assert not (root / "class_labels").exists()
+
+
+def test_a_cut_archive_is_one_line(clone, root):
+    path, _ = packed(clone, "tar.gz")
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(InputError, match="is broken, locked or none"):
+        bring_labels(path, root)
+    assert not (root / "class_labels").exists()
+
+
+def test_a_checksum_of_a_folder_is_refused_rather_than_passed_over(clone, root):
+    with pytest.raises(InputError, match="is a folder, expected an archive or a URL"):
+        bring_labels(clone, root, "00" * 32)
+
+
+def test_labels_of_two_references_never_come_together(clone, root, tmp_path):
+    write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
+    before = everything(root)
+    with pytest.raises(InputError, match="would have references a, z, expected one; nothing was written"):
+        bring_labels(clone, root)
+    assert everything(root) == before
+    two_layouts(tmp_path)
+    write_label(tmp_path / "v2", "chair", PoseLabel(np.eye(4), "z", "z"))
+    with pytest.raises(InputError, match="would have references a, z"):
+        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+    assert list(read_labels(tmp_path / "v2", "chair")) == ["z"]
+
+
+def test_labels_come_to_where_the_folder_has_its_labels(clone, root):
+    write_label(root / "data", "chair", PoseLabel(np.eye(4), "c", "a"))
+    bring_labels(clone, root)
+    assert list(read_labels(root, "chair")) == ["a", "b", "c"]
+
+
 def test_code_in_pairs_is_not_run(clone, root, tmp_path):
     class Evil:
         def __reduce__(self):
@@ -144,7 +202,7 @@ def test_sources_without_labels_are_refused(root, tmp_path):
     for source, message in (
         (tmp_path / "empty", "holds no class_labels"),
         (tmp_path / "none.zip", "cannot be read"),
-        (tmp_path / "text.zip", "of 4 bytes is broken or none, expected .zip or .tar.gz"),
+        (tmp_path / "text.zip", "of 4 bytes is broken, locked or none, expected .zip or .tar.gz"),
     ):
         with pytest.raises(InputError, match=message):
             bring_labels(source, root)

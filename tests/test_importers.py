@@ -180,6 +180,7 @@ def test_distortion_is_taken_out(tmp_path, views):
         "k2": -0.03,
         "p1": 0.002,
         "p2": -0.001,
+        "k3": 0.02,
     }
     (folder / "transforms.json").write_text(json.dumps(content))
     # A picture as the distorting lens would take it: a grid of dots, each where OpenCV projects its ray.
@@ -189,7 +190,7 @@ def test_distortion_is_taken_out(tmp_path, views):
         np.stack(np.meshgrid(np.arange(20, width - 20, 12), np.arange(20, height - 20, 12)), -1).reshape(-1, 2) + 0.5
     )
     rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
-    coefficients = np.array([0.12, -0.03, 0.002, -0.001])
+    coefficients = np.array([0.12, -0.03, 0.002, -0.001, 0.02])
     matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     stored, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
     picture = np.zeros((height, width, 3), np.float32)
@@ -286,6 +287,11 @@ def edited(change):
         ("open3d", break_file("trajectory.log", "0 0 1\n1 0 0 0\n"), "expected five for each pose"),
         ("open3d", lambda folder: (folder / "camera_intrinsic.json").unlink(), "none of camera_intrinsic.json"),
         ("lists", break_file("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
+        ("tum", break_file("groundtruth.txt", "1305031102.1 0 0 0 0 0 0 0\n"), "expected a quaternion"),
+        ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][3].__setitem__(0, 1.0)), "frame 1: pose is"),
+        ("lists", break_file("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "expected a finite rigid"),
+        ("lists", break_file("poses.txt", 8 * "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1\n"), "line 1: pose is"),
+        ("lists", break_file("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
         ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt, line 1: '1 2 x', expected numbers"),
     ],
 )
@@ -295,6 +301,53 @@ def test_a_broken_capture_gets_one_line_that_names_the_part(tmp_path, views, kin
     with pytest.raises(InputError, match=message) as caught:
         READERS[kind](tmp_path, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
+    write_nerfstudio(tmp_path, views[:1])
+    height, width = views[0].camera.size
+    plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
+    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane, 1)
+    shot = READERS["nerfstudio"](tmp_path).shots[0]
+    np.testing.assert_allclose(shot.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
+    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2], 1)
+    with pytest.raises(InputError, match="expected the camera's"):
+        shot.load()
+
+
+def test_tum_pictures_of_another_size_need_intrinsics(tmp_path, views):
+    write_tum(tmp_path, views)
+    with pytest.raises(InputError, match="expected intrinsics, for the default ones are of"):
+        READERS["tum"](tmp_path)
+
+
+@pytest.mark.parametrize("values", [np.array([1 + 1j]), np.array(["x"]), np.float32(3), np.ones((4, 4, 3))])
+def test_npy_depth_that_is_no_map_is_named(tmp_path, views, values):
+    write_lists(tmp_path, views[:1])
+    np.save(tmp_path / f"z/{views[0].name}.npy", values)
+    with pytest.raises(InputError, match=r"expected numbers \(H, W\)"):
+        READERS["lists"](tmp_path).shots[0].load()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_capture_of_few_frames_is_fused_as_well(views, count):
+    points, _, _ = fuse(views[:1] * count)
+    pixels, depth = views[0].camera.project(points)
+    column, row = np.floor(pixels).astype(int).T
+    assert len(points) > 200
+    assert np.median(np.abs(views[0].depth[row, column] - depth)) < 0.005
+
+
+def test_a_surface_that_one_of_many_frames_saw_is_left_out(views):
+    ghost = replace(views[0], depth=np.where(views[0].mask > 0.5, 0.5 * views[0].depth, 0).astype(np.float32))
+    _, depth = views[0].camera.project(fuse([*views, ghost])[0])
+    assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()
+
+
+def test_frames_that_see_nothing_in_common_fuse_to_nothing(views):
+    apart = [replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])]
+    with pytest.raises(InputError, match="expected overlapping depth maps"):
+        fuse(apart)
 
 
 def test_bad_boxes_and_empty_depth_are_refused(views):

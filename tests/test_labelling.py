@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from co3d_folders import seeds, sequence_data
-from hypothesis import given, settings
+from co3d_folders import sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
@@ -15,7 +14,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks, rigid_label
 from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.desktop import label_category
-from zsp_lite.labelling.guess import guess_alignment
+from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.labels import PoseLabel, read_labels, write_label
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.export import POSES_FILE, export_categories
@@ -63,20 +62,19 @@ def test_picks_at_known_points_give_the_known_label(synthetic):
         assert rotation_error(made.trans[:3, :3], label.trans[:3, :3]) < 1
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds)
-def test_picks_with_noise_give_it_to_five_degrees(synthetic, seed):
+def test_picks_with_noise_give_it_to_five_degrees(synthetic):
     root, picks = synthetic
-    known, rng = read_labels(root, "chair"), np.random.default_rng(seed)
+    known, rng = read_labels(root, "chair"), np.random.default_rng(0)
     reference, name = list(known)[0], list(known)[1]
-    size = np.ptp(picks[name], axis=0).max()
-    noisy = [
-        points + rng.normal(0, 0.03 * size / np.sqrt(3), points.shape) for points in (picks[reference], picks[name])
-    ]
-    alignment = align_picks(*noisy)
     wanted = known[name].trans[:3, :3] @ known[reference].trans[:3, :3].T
-    assert rotation_error(alignment.sim3.R, wanted) < 5
-    assert 0 < alignment.rms < 0.2
+    noise = 0.03 * np.ptp(picks[name], axis=0).max() / np.sqrt(3)  # 3 % of the size, on both objects
+    made = [
+        align_picks(*(picks[one] + rng.normal(0, noise, (len(KEYPOINTS), 3)) for one in (reference, name)))
+        for _ in range(200)
+    ]
+    errors = np.array([rotation_error(one.sim3.R, wanted) for one in made])
+    assert np.median(errors) < 3 and (errors < 5).mean() > 0.97
+    assert all(0 < one.rms < 0.2 for one in made)
 
 
 def test_residuals_are_shares_of_the_keypoints_spread():
@@ -226,6 +224,30 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
     assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
 
 
+def test_the_desktop_says_what_picks_are_bad_and_asks_for_them_anew(root):
+    labelling, said = Labelling(root, "chair"), []
+    pick_all(labelling, "best", corners())
+    labelling.put("a", np.outer(np.arange(5), (1, 2, 3)))  # on a line, from an earlier run
+    picks = iter([[0, 1, 2, 3, 3], [0, 1, 2, 3, 4]])
+
+    def guess(sequence):
+        raise InputError("no frame has depth")
+
+    answers = iter(["a", "s"])
+    label_category(labelling, lambda _: next(answers), said.append, guess, lambda *_: next(picks, []), lambda *_: None)
+    assert any("collinear" in line for line in said) and any("are one point" in line for line in said)
+    assert "b: no guess: no frame has depth" in said
+    assert [row.state for row in labelling.progress()] == ["reference", "accepted", "skipped"]
+
+
+def test_the_reference_of_given_sequences_is_the_best_of_them(root):
+    write_co3d(root, "chair", [sequence_data("c", quality=2.5)])
+    labelling = Labelling(root, "chair", ["b", "c", "a", "b"])
+    assert labelling.reference == "c" and labelling.sequences == ["c", "b", "a"]
+    with pytest.raises(InputError, match="c is the reference, which cannot be skipped"):
+        labelling.skip("c")
+
+
 def test_the_contact_sheet_has_a_row_for_every_candidate(root):
     dataset = Co3D(root)
     figure = contact_sheet(dataset, "chair", dataset.select("chair"), views=3)
@@ -258,5 +280,7 @@ def test_the_method_proposes_an_alignment_with_a_confidence(tmp_path):
     sim3, confidence = guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "b", references=2, views=4)
     assert rotation_error(sim3.R, turned.R) < 10 and sim3.scale == pytest.approx(1.2, rel=0.15)
     assert 0 <= confidence <= 1
+    loaded = [one.name for one in _frames(Co3D(tmp_path), "egg", "b", 4)]
+    assert loaded == [f"b/{number}" for number in range(4)], "all frames where there are no more than asked for"
     with pytest.raises(InputError, match="no frames of a sequence 'c'"):
         guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "c")

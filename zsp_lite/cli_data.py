@@ -1,6 +1,7 @@
 """The commands that look after data: `label` and `data check`, `data labels`, `data carry`, `data import`."""
 
 import argparse
+import math
 from pathlib import Path
 
 from zsp_lite.cli import _command, _count, _names, _positive
@@ -30,6 +31,8 @@ def _label(arguments: argparse.Namespace) -> None:
 
     labelling = Labelling(arguments.root, arguments.category, arguments.sequences, arguments.reference)
     if arguments.contact_sheet:
+        if arguments.contact_sheet.suffix.lower() != ".png":
+            raise InputError(f"--contact-sheet is {arguments.contact_sheet}, expected the name of a .png file")
         import matplotlib
 
         matplotlib.use("Agg")
@@ -209,6 +212,6 @@ def _numbers(text: str) -> tuple[float, ...]:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:
         values = ()
-    if len(values) != 4:
+    if len(values) != 4 or not all(math.isfinite(value) for value in values):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected four numbers separated by commas")
     return values

@@ -2,8 +2,10 @@
 
 import hashlib
 import io
+import lzma
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
@@ -15,42 +17,50 @@ from zsp_lite.download import cache_folder, fetch
 from zsp_lite.errors import InputError
 from zsp_lite.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import rigid_label
-from zsp_lite.labels import PoseLabel, parse_label, read_labels, write_label
+from zsp_lite.labels import PoseLabel, label_folder, parse_label, read_labels, write_label
 from zsp_lite.pairs import check_upstream_pairs
 
 # Cameras of the same frames in v1 and v2 differ by a similarity, up to what the reconstruction was improved by.
 MAX_RESIDUAL = 0.05
 _FEWEST_CAMERAS = 4
+_KINDS = {"class_labels": ".json", "determ_eval": ".pt"}  # folders and their files' endings
+# What zipfile and tarfile raise for bytes that are cut or wrong, a password, or a compression they do not know.
+_BROKEN = (
+    zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError,
+)  # fmt: skip
 
 
 def bring_labels(source: str | Path, root: str | Path, sha256: str | None = None) -> dict[str, int]:
     """Bring labels and evaluation pairs from upstream's repository into the data folder `root`.
 
     source: a local clone (a folder), an archive of one (.zip, .tar, .tar.gz), or the URL of such an archive.  sha256:
-    of the archive, required for a URL.  Files under class_labels/ and determ_eval/ are taken, wherever these folders
-    lie; all are checked before the first is written, nothing in them is executed. Returns how many files of each kind
-    came. Raises InputError where the checksum differs, a file is not what it should be, or there are none.
+    of the archive, required for a URL.  The files class_labels/CATEGORY/SEQ.json and determ_eval/SET/CATEGORY.pt are
+    taken, wherever these folders lie; all are checked before the first is written, nothing in them is executed. Returns
+    how many files of each kind came. Raises InputError where the checksum differs, a file is not what it should be, the
+    labels of a category would have two reference sequences, or there are none.
     """
     if not Path(root).is_dir():
         raise InputError(f"data folder {root} is not there, expected a folder with categories in CO3D's layout")
-    files = {}
+    files, labels = {}, {}
     for path, data in _files(source, sha256):
-        parts = PurePosixPath(path).parts
-        if "class_labels" in parts and path.endswith(".json"):
-            category, name = _last_two(parts, path)
+        kind, group, name = PurePosixPath(path).parts[-3:]
+        group, name = plain_name(group, "folder"), plain_name(name, "file")
+        if kind == "class_labels":
             label = parse_label(data, f"{source}: {path}")
             if f"{label.seq}.json" != name:
                 raise InputError(f"{source}: label {path} is of sequence {label.seq!r}, expected that of its name")
-            files["class_labels", category, name] = data
-        elif "determ_eval" in parts and path.endswith(".pt"):
-            group, name = _last_two(parts, path)
+            labels.setdefault(group, {})[label.seq] = label
+            files[kind, label_folder(root, group) / name] = data
+        else:
             check_upstream_pairs(data, f"{source}: {path}")
-            files["determ_eval", group, name] = data
+            files[kind, Path(root) / kind / group / name] = data
     if not files:
         raise InputError(f"{source} holds no class_labels/CATEGORY/SEQ.json, expected a clone of the published code")
-    for parts, data in files.items():
-        write_atomic(Path(root).joinpath(*parts), data)
-    kinds = [kind for kind, *_ in files]
+    for category, brought in labels.items():
+        _check_one_reference(root, category, brought)
+    for (_, path), data in files.items():
+        write_atomic(path, data)
+    kinds = [kind for kind, _ in files]
     return {kind: kinds.count(kind) for kind in ("class_labels", "determ_eval")}
 
 
@@ -61,8 +71,8 @@ def carry_labels(
 
     The centres of the same frames' cameras are aligned by Umeyama with scale, sequence by sequence; labels are carried
     along. Returns the residual of each sequence: root mean square distance, a share of the centres' spread. Raises
-    InputError, and writes nothing, where one exceeds `max_residual`, a sequence lacks in `target`, or fewer than four
-    cameras are common.
+    InputError, and writes nothing, where one exceeds `max_residual`, a sequence lacks in `target`, fewer than four
+    cameras are common, or `target` has labels of another reference sequence.
     """
     labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
     if not labels:
@@ -84,6 +94,7 @@ def carry_labels(
         rigid = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
         trans = rigid_label(worlds[name] @ rigid @ worlds[reference].inverse(), centre, name, reference)
         carried.append(PoseLabel(np.eye(4), name, reference) if name == reference else trans)
+    _check_one_reference(target, category, {label.seq: label for label in carried})
     for label in carried:
         write_label(target, category, label)
     return residuals
@@ -123,8 +134,10 @@ def _files(source: str | Path, sha256: str | None) -> Iterator[tuple[str, bytes]
         return
     source = Path(source)
     if source.is_dir():
-        for folder in ("class_labels", "determ_eval"):
-            for path in sorted(source.glob(f"**/{folder}/*/*")):
+        if sha256:
+            raise InputError(f"{source} is a folder, expected an archive or a URL where a SHA-256 is given")
+        for folder, ending in _KINDS.items():
+            for path in sorted(source.glob(f"**/{folder}/*/*{ending}")):
                 if path.is_file():
                     yield path.relative_to(source).as_posix(), read_bytes(path, "file")
         return
@@ -136,21 +149,30 @@ def _files(source: str | Path, sha256: str | None) -> Iterator[tuple[str, bytes]
         if zipfile.is_zipfile(io.BytesIO(data)):
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 for name in archive.namelist():
-                    if not name.endswith("/"):
+                    if _is_taken(name):
                         yield name, archive.read(name)
             return
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             for member in archive:
-                if member.isfile():
+                if member.isfile() and _is_taken(member.name):
                     yield member.name, archive.extractfile(member).read()
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError, OSError) as error:
+    except _BROKEN as error:
         raise InputError(
-            f"archive {source} of {len(data)} bytes is broken or none, expected .zip or .tar.gz"
+            f"archive {source} of {len(data)} bytes is broken, locked or none, expected .zip or .tar.gz"
         ) from error
 
 
-def _last_two(parts: tuple[str, ...], path: str) -> tuple[str, str]:
-    """Folder and name of a file, both plain."""
-    if len(parts) < 2:
-        raise InputError(f"file {path} lies in no folder, expected CATEGORY/FILE")
-    return plain_name(parts[-2], "folder"), plain_name(parts[-1], "file")
+def _is_taken(path: str) -> bool:
+    """Whether a file of an archive is a label or an evaluation set."""
+    parts = PurePosixPath(path).parts
+    return len(parts) >= 3 and parts[-3] in _KINDS and path.endswith(_KINDS[parts[-3]])
+
+
+def _check_one_reference(root: str | Path, category: str, new: dict[str, PoseLabel]) -> None:
+    """InputError where the category's labels, with the new ones over those that are there, have several references."""
+    references = sorted({label.reference_seq for label in (read_labels(root, category) | new).values()})
+    if len(references) > 1:
+        raise InputError(
+            f"labels of {category} in {root} would have references {', '.join(references)}, expected one; "
+            "nothing was written"
+        )

@@ -23,8 +23,9 @@ class Shot:
     """One picture of a capture.
 
     camera: of the image as stored (OpenCV axes, pixel centres at half-integers).  depth: a 16-bit PNG or a .npy file,
-    whose values times `depth_unit` are in the world's unit.  distortion: OpenCV's k1 k2 p1 p2, () for none; camera,
-    image and depth are undistorted on loading.  time: seconds.
+    whose values times `depth_unit` are in the world's unit.  distortion: OpenCV's k1 k2 p1 p2 k3, () for none; camera,
+    image and depth are undistorted on loading.  A smaller depth map of the image's proportions, which phones store, is
+    enlarged to it.  time: seconds.
     """
 
     image: Path
@@ -39,7 +40,8 @@ class Shot:
         """The frame. Raises InputError where a file is missing, broken, or of another size than the camera's."""
         size = self.camera.size
         rgb = _sized(read_image(self.image), size, self.image)
-        depth = _sized(_read_depth(self.depth) * np.float32(self.depth_unit), size, self.depth)
+        depth = _enlarged(_read_depth(self.depth) * np.float32(self.depth_unit), size)
+        depth = _sized(depth, size, self.depth)
         mask = None if self.mask is None else _sized(read_mask(self.mask), size, self.mask)
         if any(self.distortion):
             columns, rows = self._undistorted_pixels()
@@ -79,7 +81,11 @@ def camera_of(
     """A camera from its pose in the world (OpenCV axes). Raises InputError, naming `where`, where it is not rigid."""
     to_world = np.asarray(to_world, dtype=np.float64)
     rotation = to_world[:3, :3]
-    if not np.isfinite(to_world).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE:
+    if (
+        not np.isfinite(to_world).all()
+        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
+        or np.abs(to_world[3] - (0, 0, 0, 1)).max() > _ROTATION_TOLERANCE  # such as a matrix column by column
+    ):
         raise InputError(f"{where}: pose is {to_world.tolist()}, expected a finite rigid camera-to-world matrix")
     left, _, right = np.linalg.svd(rotation)  # printed with few digits: the nearest rotation
     rotation = left @ right
@@ -131,13 +137,23 @@ def image_size(path: Path) -> tuple[int, int]:
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     if path.suffix == ".npy":
         try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+            values = np.asarray(np.load(path, allow_pickle=False))
+        except (OSError, ValueError, EOFError) as error:
             raise InputError(f"depth {path} cannot be read as .npy: {error}") from error
     else:
         values = read_grey16(path)
-    values = np.asarray(values, dtype=np.float32)
+    if values.ndim != 2 or values.dtype.kind not in "fiu":
+        raise InputError(f"depth {path} holds {values.dtype} of shape {values.shape}, expected numbers (H, W)")
+    values = values.astype(np.float32)
     return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
+
+
+def _enlarged(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2"]:
+    """A smaller map of the same proportions, to a percent, at `size`; nearest values, for means lie on no surface."""
+    (rows, columns), (height, width) = depth.shape, size
+    if (rows, columns) != (height, width) and rows < height and abs(rows * width / (columns * height) - 1) < 0.01:
+        return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return depth
 
 
 def _sized(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:

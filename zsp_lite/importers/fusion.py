@@ -13,7 +13,7 @@ from zsp_lite.open3d_import import load_open3d
 
 _VOXELS = 96  # along three standard deviations of the object: finer than depth cameras are
 _MAX_POINTS = 50_000
-_CONFIRMED = 2  # frames that a surface must be seen in
+_CONFIRMED = 3  # frames that a surface must be seen in, where there are so many
 
 
 def fuse(
@@ -39,7 +39,8 @@ def fuse(
         reach = {"depth_scale": 1.0, "depth_max": 1.01 * float(depth.max()), "trunc_voxel_multiplier": 4.0}
         blocks = volume.compute_unique_block_coordinates(seen, intrinsic, extrinsic, **reach)
         volume.integrate(blocks, seen, colour, intrinsic, intrinsic, extrinsic, **reach)
-    cloud = volume.extract_point_cloud(weight_threshold=min(_CONFIRMED, len(frames))).to_legacy()
+    enough = min(_CONFIRMED, len(frames)) - 0.5  # Open3D takes what is above it
+    cloud = volume.extract_point_cloud(weight_threshold=enough).to_legacy()
     cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     if len(cloud.points) > _MAX_POINTS:
         cloud = cloud.uniform_down_sample(int(np.ceil(len(cloud.points) / _MAX_POINTS)))

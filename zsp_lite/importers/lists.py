@@ -33,7 +33,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
         if len(values) not in (12, 16):
             raise InputError(f"{where}: {len(values)} numbers, expected 12 or 16")
         to_world = np.eye(4)
-        to_world[:3] = np.array(values[:12]).reshape(3, 4)
+        to_world[: len(values) // 4] = np.array(values).reshape(-1, 4)
         path = listed_file(folder, image[0], f"{folder / 'rgb.txt'}, line {line}")
         size = size or image_size(path)
         camera = camera_of(to_world, matrix.diagonal()[:2], matrix[:2, 2], size, where)
@@ -46,4 +46,7 @@ def _intrinsics(path: Path) -> np.ndarray:
     rows = [numbers(words, f"{path}, line {line}") for line, words in read_rows(path, 3, "intrinsics")]
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         raise InputError(f"intrinsics {path} have {len(rows)} lines, expected a 3 x 3 matrix in pixels")
-    return np.array(rows)
+    matrix = np.array(rows)
+    if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] or matrix[0, 1]:
+        raise InputError(f"intrinsics {path} are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+    return matrix

@@ -29,6 +29,7 @@ class _Intrinsics(msgspec.Struct, kw_only=True):
     k2: float | None = None
     p1: float | None = None
     p2: float | None = None
+    k3: float | None = None
 
 
 class _Frame(_Intrinsics, kw_only=True):
@@ -69,7 +70,7 @@ def read_nerfstudio(folder: str | Path) -> Capture:
         camera = camera_of(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
         files = [None if name is None else listed_file(Path(folder), name, where)
                  for name in (frame.file_path, frame.depth_file_path, frame.mask_path)]  # fmt: skip
-        distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2"))
+        distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
         shots.append(
             Shot(files[0], files[1], camera, float(number), content.depth_unit_scale_factor, distortion, files[2])
         )

@@ -9,7 +9,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import Capture, Shot, camera_of, image_size, listed_file, numbers, read_rows
 
 # The benchmark's default camera; its pixel centres are at whole numbers, ours at half ones.
-DEFAULT_INTRINSICS = 525.0, 525.0, 319.5, 239.5
+DEFAULT_INTRINSICS, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (480, 640)
 _DEPTH_UNIT = 1 / 5000
 _FARTHEST = 0.02  # seconds between a picture and its depth or pose
 
@@ -18,7 +18,8 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
     """Pictures with a depth map and a pose (camera to world, `tx ty tz qx qy qz qw`) at most 0.02 s away.
 
     intrinsics: fx, fy, cx, cy in pixels as the benchmark prints them; default: its default camera.
-    Raises InputError where a list is missing or broken, and where no picture has both.
+    Raises InputError where a list is missing or broken, where no picture has both, and where pictures of another size
+    than the default camera's come without intrinsics.
     """
     folder = Path(folder)
     fx, fy, cx, cy = intrinsics or DEFAULT_INTRINSICS
@@ -36,6 +37,10 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
             continue
         image = listed_file(folder, words[1], f"{folder / 'rgb.txt'}, line {line}")
         size = size or image_size(image)
+        if intrinsics is None and size != DEFAULT_SIZE:
+            raise InputError(
+                f"{image} is {size} pixels, expected intrinsics, for the default ones are of {DEFAULT_SIZE}"
+            )
         where = f"{folder / 'groundtruth.txt'}, line {pose[0]}"
         values = numbers(pose[1][1:8], where)
         to_world = np.eye(4)

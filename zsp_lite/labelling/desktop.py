@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.errors import InputError
-from zsp_lite.labelling.keypoints import MIN_KEYPOINTS
+from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import ACCEPTED, SKIPPED, Labelling
 from zsp_lite.open3d_import import load_open3d
 
@@ -70,13 +70,24 @@ def label_category(
             return
 
 
-def _label_sequence(labelling, sequence, ask, say, guess, pick, show) -> bool:
+def _label_sequence(
+    labelling: Labelling,
+    sequence: str,
+    ask: Ask,
+    say: Callable[[str], None],
+    guess: Guess | None,
+    pick: Pick,
+    show: Show,
+) -> bool:
     """One sequence; False to stop altogether."""
     cloud = labelling.cloud(sequence)
     if guess is not None and not len(labelling.picks(sequence)):
-        guess(sequence)
+        try:
+            guess(sequence)
+        except InputError as error:  # then by hand
+            say(f"{sequence}: no guess: {error}")
     while True:
-        if labelling.alignment(sequence) is None:
+        if _alignment(labelling, sequence, say) is None:
             say(f"{sequence}: pick, in this order, {', '.join(labelling.names)}.")
             indices = pick(cloud, f"{sequence}: {', '.join(labelling.names)}")
             if len(indices) != len(labelling.names):
@@ -89,7 +100,9 @@ def _label_sequence(labelling, sequence, ask, say, guess, pick, show) -> bool:
             labelling.clear(sequence)
             for index in indices:
                 labelling.pick(sequence, cloud[0][index])
-        alignment = labelling.alignment(sequence)
+        alignment = _alignment(labelling, sequence, say)
+        if alignment is None:
+            continue
         for name, residual in zip(labelling.names, alignment.residuals):
             say(f"  {name:20} {100 * residual:5.1f} % of the keypoints' spread")
         show(alignment.sim3.apply(labelling.cloud(labelling.reference)[0]), cloud[0], f"{sequence}: is it right?")
@@ -102,6 +115,16 @@ def _label_sequence(labelling, sequence, ask, say, guess, pick, show) -> bool:
                 labelling.skip(sequence)
             return answer == "s"
         labelling.clear(sequence)
+
+
+def _alignment(labelling: Labelling, sequence: str, say: Callable[[str], None]) -> Alignment | None:
+    """The alignment by a sequence's picks; picks that give none, such as two at one place, are said and taken back."""
+    try:
+        return labelling.alignment(sequence)
+    except InputError as error:
+        say(str(error))
+        labelling.clear(sequence)
+        return None
 
 
 def _check_display() -> None:

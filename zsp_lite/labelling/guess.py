@@ -39,8 +39,9 @@ def _frames(dataset: Co3D, category: str, sequence: str, count: int) -> Sequence
     usable = [one for one in dataset.frames(category, sequence) if None not in (one.viewpoint, one.depth, one.mask)]
     if not usable:
         raise InputError(f"sequence {category}/{sequence} has no frame with camera, depth and mask, expected some")
-    chosen = np.unique(np.linspace(0, len(usable) - 1, min(count, len(usable)) + 1)[:-1].astype(int))
-    return [dataset.load(usable[index]) for index in chosen]
+    if len(usable) > count:
+        usable = [usable[index] for index in np.linspace(0, len(usable) - 1, count + 1)[:-1].astype(int)]
+    return [dataset.load(annotation) for annotation in usable]
 
 
 def _rigid(camera: Camera) -> Sim3:

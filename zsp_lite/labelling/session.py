@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.annotations import Triple, decode
+from zsp_lite.annotations import SequenceAnnotation, Triple, decode
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
 from zsp_lite.files import plain_name, read_bytes, write_atomic
@@ -64,7 +64,8 @@ class Labelling:
         self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
         with_cloud = [name for name, one in known.items() if one.point_cloud is not None]
-        chosen = list(sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud)
+        chosen = sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud
+        chosen = list(dict.fromkeys(chosen))
         self.path = self.root / "label_picks" / f"{self.category}.json"
         stored = decode(read_bytes(self.path, "picks"), _Picks, self.path) if self.path.is_file() else None
         labelled = {label.reference_seq for label in read_labels(root, category).values()}
@@ -75,7 +76,8 @@ class Labelling:
                 f"category {category}: {given}labels and picks on disk refer to {', '.join(sorted(bound))}, "
                 "expected one reference sequence"
             )
-        self.reference = reference or next(iter(bound), None) or (chosen[0] if chosen else "")
+        best = max(chosen, key=lambda name: _cloud_quality(known.get(name)), default="")
+        self.reference = reference or next(iter(bound), None) or best
         if self.reference and self.reference not in chosen:
             chosen.insert(0, self.reference)
         for name in chosen:
@@ -111,7 +113,7 @@ class Labelling:
         """Add the next keypoint of a sequence: `point` (3,) in its world.
 
         name: of a new keypoint of the reference (default: a number). Raises InputError where all keypoints are picked
-        already, or the reference's would change under accepted labels.
+        already, or the reference's would change under those of other sequences.
         """
         point = np.asarray(point, dtype=np.float64)
         if point.shape != (3,) or not np.isfinite(point).all():
@@ -196,16 +198,19 @@ class Labelling:
                 f"expected all, at least {MIN_KEYPOINTS}"
             )
         centre = self.cloud(self.reference)[0].mean(axis=0)
+        label = rigid_label(alignment.sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
-        path = write_label(self.root, self.category, rigid_label(alignment.sim3, centre, sequence, self.reference))
+        path = write_label(self.root, self.category, label)
         if sequence in self._stored.skipped:
             self._stored.skipped.remove(sequence)
         self._save()
         return path
 
     def skip(self, sequence: str) -> None:
-        """Leave a sequence out, such as a bad cloud; picking on it takes it up again."""
-        if self._known(sequence) not in self._stored.skipped:
+        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. InputError for the reference."""
+        if self._known(sequence) == self.reference:
+            raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
+        if sequence not in self._stored.skipped:
             self._stored.skipped.append(sequence)
             self._save()
 
@@ -243,3 +248,9 @@ class Labelling:
 
     def _save(self) -> None:
         write_atomic(self.path, msgspec.json.format(msgspec.json.encode(self._stored), indent=1))
+
+
+def _cloud_quality(sequence: SequenceAnnotation | None) -> float:
+    """The score of a sequence's cloud, below all others where it has none."""
+    score = None if sequence is None or sequence.point_cloud is None else sequence.point_cloud.quality_score
+    return -np.inf if score is None else score
