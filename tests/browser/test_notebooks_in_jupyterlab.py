@@ -30,6 +30,13 @@ plt.close("all")
 display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.getvalue())]))
 """
 
+CLICKS = """\
+from zsp_lite.widgets.latency import build_example
+box = build_example("label_poses")
+box.controls["sequence"].value = box.controls["sequence"].options[2][1]
+box
+"""
+
 
 def chromium(playwright) -> str | None:
     """The system's Chromium or Chrome, or else the one that Playwright has installed."""
@@ -72,6 +79,8 @@ def lab(browser, tmp_path_factory):
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     broken = new_notebook(cells=cells, metadata=python)
     nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
+    clicks = new_notebook(cells=[new_code_cell(CLICKS)], metadata=python)
+    nbformat.write(clicks, folder / "notebooks" / "clicks.ipynb")
     with serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 
@@ -94,6 +103,23 @@ def test_a_broken_notebook_is_found_out(page, lab):
     ]
     (output,) = slider_outputs(page)
     assert not slider_moves_picture(output, patience=3)
+
+
+def test_clicks_on_a_point_cloud_pick_keypoints(page, lab):
+    open_notebook(page, lab, "clicks.ipynb")
+    run_all(page, patience=300)
+    cloud = page.locator(".zsp-cloud-sequence canvas")
+    cloud.scroll_into_view_if_needed()
+    nearest = "c => [...Array(+c.dataset.points).keys()].map(i => c.place(i))"
+    for number, share in enumerate((0.1, 0.9), 1):
+        places = sorted(cloud.evaluate(nearest))
+        x, y = places[int(share * len(places))]
+        cloud.click(position={"x": x, "y": y})
+        page.wait_for_function(
+            "n => document.querySelector('.zsp-cloud-sequence canvas').dataset.marks == n", arg=str(number)
+        )
+    page.locator("button.zsp-undo").click()
+    page.wait_for_function("() => document.querySelector('.zsp-cloud-sequence canvas').dataset.marks == '1'")
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)

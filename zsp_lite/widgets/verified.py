@@ -34,7 +34,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: We
     Raises InputError where the targets are not those of the solution, and without ipywidgets.
     """
     used = sorted(solution.order)
-    if used[-1] >= len(targets):
+    if len(targets) != len(solution.view_angles):
         raise InputError(f"{len(targets)} target views, expected all {len(solution.view_angles)} that were given")
     found, scene = solution.hypotheses, solution.scene
     evidence = forward(scene, solution.poses)
