@@ -358,3 +358,15 @@ def test_bad_boxes_and_empty_depth_are_refused(views):
     blind = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
     with pytest.raises(InputError, match="no known depth on the object"):
         fuse(blind)
+
+
+def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
+    capture = READERS["nerfstudio"](folder)
+    done = import_capture(capture, tmp_path / "data", "teapot", "mine")
+    assert (done.frames, done.empty) == (5, 1)
+    assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
+    with pytest.raises(InputError, match="mine is there already, expected another sequence name"):
+        import_capture(capture, tmp_path / "data", "teapot", "mine")

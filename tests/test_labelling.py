@@ -200,6 +200,9 @@ def test_labels_that_are_there_decide_the_reference(root):
 def test_broken_picks_are_named(root):
     labelling = Labelling(root, "chair")
     labelling.pick("best", (0, 0, 0))
+    labelling.path.write_text(labelling.path.read_text().replace('"keypoint 1"', '"seat", "back"'))
+    with pytest.raises(InputError, match="2 names and 1 picks on the reference"):
+        Labelling(root, "chair")
     labelling.path.write_text("{")
     with pytest.raises(InputError, match="label_picks/chair.json"):
         Labelling(root, "chair")

@@ -197,6 +197,7 @@ def _import(arguments: argparse.Namespace) -> None:
     print(
         f"Written: {arguments.root / arguments.category / arguments.sequence}: {done.frames} frames, {done.points:,} "
         f"points, lengths times {done.scale:.4g}"
+        + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )
 
 

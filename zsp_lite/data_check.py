@@ -133,11 +133,11 @@ def _wrong_with_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, ch
 def _wrong_with_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
     try:
         path = path_inside(dataset.root, relative)
-        size = path.stat().st_size
     except InputError as error:
         return [str(error)]
-    except OSError:
+    if not path.is_file():
         return [f"{relative} is missing"]
+    size = path.stat().st_size
     check.size += size
     return [] if size else [f"{relative} is empty"]
 

@@ -27,9 +27,10 @@ MAX_FRAMES = 100  # about as many as CO3D's sequences have
 
 @dataclass(frozen=True)
 class Imported:
-    """What came in.  scale: what the capture's lengths were multiplied by."""
+    """What came in.  empty: frames left out, for their masks show no object.  scale: of the capture's lengths."""
 
     frames: int
+    empty: int
     points: int
     scale: float
 
@@ -46,10 +47,13 @@ def import_capture(
     """Write a capture as `root/category/sequence`: masks, a fused cloud, all scaled as CO3D's are.
 
     box: of the object in the first frame (top, left, height, width), for GrabCut; or masks: a folder of mask files;
-    neither: the capture's own masks. An earlier sequence of that name is replaced. Raises InputError, before anything
-    is written, on what cannot be read, masked or fused.
+    neither: the capture's own masks. Frames whose mask is empty are left out. Raises InputError, before anything is
+    written, on what cannot be read, masked or fused, and where the folder has a sequence of that name already: labels
+    may belong to it.
     """
     plain_name(category, "category"), plain_name(sequence, "sequence")
+    if (Path(root) / category / sequence).exists():
+        raise InputError(f"{Path(root) / category / sequence} is there already, expected another sequence name")
     capture = capture.thinned(max_frames)
     frames = [shot.load() for shot in capture.shots]
     if box is not None and masks is not None:
@@ -62,10 +66,14 @@ def import_capture(
         raise InputError(
             "the capture has no masks of its own, expected a box in its first picture or a folder of masks"
         )
+    seen = [index for index, frame in enumerate(frames) if (frame.mask > 0.5).any()]
+    if not seen:
+        raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object in them")
+    empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
     points, colours, normals = fuse(frames)
     scale = unit_scale(points)
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
-    times = [shot.time - capture.shots[0].time for shot in capture.shots]
+    times = [capture.shots[index].time - capture.shots[0].time for index in seen]
     data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
     write_co3d(root, category, [data])
-    return Imported(len(frames), len(points), scale)
+    return Imported(len(frames), empty, len(points), scale)

@@ -68,6 +68,11 @@ class Labelling:
         chosen = list(dict.fromkeys(chosen))
         self.path = self.root / "label_picks" / f"{self.category}.json"
         stored = decode(read_bytes(self.path, "picks"), _Picks, self.path) if self.path.is_file() else None
+        if stored and len(stored.names) != len(stored.picks.get(stored.reference_seq, [])):
+            raise InputError(
+                f"picks {self.path}: {len(stored.names)} names and "
+                f"{len(stored.picks.get(stored.reference_seq, []))} picks on the reference, expected equally many"
+            )
         labelled = {label.reference_seq for label in read_labels(root, category).values()}
         bound = ({stored.reference_seq} if stored else set()) | labelled
         if len(bound | ({reference} if reference else set())) > 1:
