@@ -46,7 +46,10 @@ def _label(arguments: argparse.Namespace) -> None:
     if arguments.list or not arguments.contact_sheet:
         for row in labelling.progress():
             residual = "" if row.rms is None else f", residual {100 * row.rms:.1f} % of their spread"
-            print(f"{row.sequence:24} {row.state:10} {row.picks} keypoints{residual}")
+            picks = (
+                "label given, not clicked" if row.state == "accepted" and not row.picks else f"{row.picks} keypoints"
+            )
+            print(f"{row.sequence:24} {row.state:10} {picks}{residual}")
     if arguments.list or arguments.contact_sheet:
         return
     from zsp_lite.labelling.desktop import label_category

@@ -106,7 +106,7 @@ def plan(
     timed: Counter[tuple] = Counter()
     took: dict[tuple, float] = {}
     with one_thread_each():
-        _warm_up(store, found, rows, labels)
+        first = _warm_up(store, found, rows, labels)
         start = time.perf_counter()
         for pair, names in _each_kind(found):
             record = evaluate_pair(pair, {name: rows[name] for name in names}, store, labels)
@@ -119,7 +119,7 @@ def plan(
                 break
     kinds = Counter((len(pair.target_frames), tuple(names)) for one in work.values() for pair, names in one)
     mean = sum(took.values()) / sum(timed.values())
-    each = {name: spent.seconds / spent.times for name, spent in store.spent.items() if spent.times}
+    each = {name: spent.seconds / spent.times for name, spent in (first | dict(store.spent)).items() if spent.times}
     spent_on_frames = frames * each.get("reading", 0.0) + sum(n * each.get(name, 0.0) for name, n in asked.items())
     spent_on_rows = sum(n * (took[kind] / timed[kind] if kind in took else mean) for kind, n in kinds.items())
     key = frame_keys(found[-1][0])[0]
@@ -182,13 +182,18 @@ def _each_kind(found: Sequence[tuple[Pair, Sequence[str]]]) -> list[tuple[Pair, 
 
 def _warm_up(
     store: FrameStore, found: Sequence[tuple[Pair, Sequence[str]]], rows: Mapping[str, Method], labels
-) -> None:
-    """Each row's first answer pays for lazy imports and allocations; its time is nobody's."""
+) -> dict:
+    """Each row's first answer pays for lazy imports and allocations; its time is nobody's.
+
+    Returns what the frames cost then: all there is to go by where no other pair needs new ones.
+    """
     pair = min((pair for pair, _ in reversed(found)), key=lambda pair: len(pair.target_frames))
     names = dict.fromkeys(name for _, names in found for name in names)
     evaluate_pair(pair, {name: rows[name] for name in names}, store, labels)
     store.forget_similarities()
+    spent = dict(store.spent)
     store.spent.clear()
+    return spent
 
 
 def _bytes(feature_map: FeatureMap) -> int:
