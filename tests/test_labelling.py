@@ -171,6 +171,8 @@ def test_a_guess_puts_the_picks_on_the_cloud(root):
     pick_all(labelling, "best", cloud[:5] + 1e-4)
     labelling.guess("a", Sim3.identity())
     np.testing.assert_array_equal(labelling.picks("a"), cloud[:5])
+    labelling.guess("a", Sim3(1e-3, np.eye(3), np.full(3, 50.0)))  # far off: all near one point of the cloud
+    assert len(np.unique(labelling.picks("a"), axis=0)) == 5
 
 
 def test_what_cannot_be_labelled_is_refused(root):

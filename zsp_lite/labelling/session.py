@@ -166,12 +166,20 @@ class Labelling:
         self._save()
 
     def guess(self, sequence: str, sim3: Sim3) -> None:
-        """Put a sequence's picks where `sim3` (reference world to its world) says, each on the nearest cloud point."""
+        """Put a sequence's picks where `sim3` (reference world to its world) says, each on the nearest cloud point.
+
+        No two on one point: a guess that is far off may lead several to the same.
+        """
         if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
             raise InputError(f"a guess for {sequence} needs {MIN_KEYPOINTS} keypoints on the reference first")
         cloud, moved = self.cloud(sequence)[0], sim3.apply(self.picks(self.reference))
         picks = self._editable(sequence)
-        picks[:] = [tuple(cloud[np.square(cloud - point).sum(axis=1).argmin()].tolist()) for point in moved]
+        taken: list[int] = []
+        for point in moved:
+            distance = np.square(cloud - point).sum(axis=1)
+            distance[taken] = np.inf
+            taken.append(int(distance.argmin()))
+        picks[:] = [tuple(cloud[index].tolist()) for index in taken]
         self._save()
 
     def move(self, sequence: str, index: int, point: Point) -> None:
