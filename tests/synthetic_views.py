@@ -4,7 +4,7 @@ The colours of the pictures are the object's own coordinates, so features made o
 error left is the pipeline's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,6 +33,17 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     rotation = np.stack([right, np.cross(forward, right), forward])
     middle = np.array([size[1], size[0]]) / 2
     return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
+
+
+# Two placements of the object, one from each end of a pair, and where the second one's cameras stand.
+AT_HOME = Sim3.identity()
+ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
+DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
+
+
+def turned(camera: Camera, turn: np.ndarray) -> Camera:
+    """The same camera in a world that was turned about its origin."""
+    return replace(camera, R=camera.R @ turn.T)
 
 
 def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:

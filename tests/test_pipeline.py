@@ -5,23 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
 
-from zsp_lite.alignment import Sim3, umeyama
-from zsp_lite.cameras import Camera
+from zsp_lite.alignment import umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, look, object_crop, patch_mask
-
-AT_HOME = Sim3.identity()
-ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
-DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
-
-
-def turned(camera: Camera, turn: np.ndarray) -> Camera:
-    """The same camera in a world that was turned about its origin."""
-    return replace(camera, R=camera.R @ turn.T)
 
 
 @pytest.fixture(scope="module")

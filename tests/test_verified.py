@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame
@@ -19,15 +18,6 @@ from zsp_lite.verified.hypotheses import equally_good
 from zsp_lite.verified.refinement import rotations
 from zsp_lite.verified.verification import TERMS, Weights
 from zsp_lite.views import look, object_crop
-
-AT_HOME = Sim3.identity()
-ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
-DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
-
-
-def turned(camera: Camera, turn: np.ndarray) -> Camera:
-    """The same camera in a world that was turned about its origin."""
-    return replace(camera, R=camera.R @ turn.T)
 
 
 @pytest.fixture(scope="module")
