@@ -37,8 +37,10 @@ demo: $(STAMP)
 	$(RUN) -m zsp_lite demo --out "$(OUT)"
 
 # One pytest run: the cells marked `# NBVAL_CHECK_OUTPUT` must reproduce their stored output, the others must run.
+# Two processes of one thread each; a file, and so a notebook, stays in one process.
 test: $(STAMP)
-	$(RUN) -m pytest --nbval-lax --nbval-current-env --nbval-cell-timeout=600 --durations=10 tests $(wildcard notebooks)
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --nbval-lax --nbval-current-env \
+	  --nbval-cell-timeout=600 --durations=10 tests $(wildcard notebooks)
 
 # Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs.
 lab: $(STAMP)

@@ -106,18 +106,35 @@ def open_notebook(page, lab: Lab, name: str) -> None:
 
 def run_all(page, patience: float) -> None:
     """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
-    page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
-    page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
     deadline = time.monotonic() + patience
+    while not _begun(page, patience=20):  # a notebook that has only just opened may not hear the menu
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
+        page.keyboard.press("Escape")
+        page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+        page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
     rest = 0
     while rest < 3:  # between two cells there is a moment in which none runs
-        prompts = page.locator(".jp-Notebook .jp-CodeCell .jp-InputPrompt").all_inner_texts()
-        running = [number for number, prompt in enumerate(prompts) if "*" in prompt]
-        rest = 0 if running or not any(prompt.strip("[]: ") for prompt in prompts) else rest + 1
+        running = [number for number, prompt in enumerate(_prompts(page)) if "*" in prompt]
+        rest = 0 if running else rest + 1
         if time.monotonic() > deadline:
-            raise TimeoutError(f"code cells {running} of {len(prompts)} had not run after {patience:.0f} s")
+            raise TimeoutError(f"code cells {running} had not run after {patience:.0f} s")
         time.sleep(1)
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=60_000)
+
+
+def _begun(page, patience: float) -> bool:
+    """Whether a code cell has a number or a star before `patience` seconds are over."""
+    deadline = time.monotonic() + patience
+    while time.monotonic() < deadline:
+        if any(prompt.strip("[]: ") for prompt in _prompts(page)):
+            return True
+        time.sleep(0.5)
+    return False
+
+
+def _prompts(page) -> list[str]:
+    return page.locator(".jp-Notebook .jp-CodeCell .jp-InputPrompt").all_inner_texts()
 
 
 def saved(page, lab: Lab, name: str) -> dict:
