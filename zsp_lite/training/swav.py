@@ -40,8 +40,8 @@ class SwavConfig:
     prototypes: int = 32  # SwAV has 3,000, for a thousand kinds of object
     large: int = 64
     small: int = 32
-    large_scale: tuple[float, float] = (0.25, 0.8)
-    small_scale: tuple[float, float] = (0.12, 0.35)
+    large_scale: tuple[float, float] = (0.4, 1.0)
+    small_scale: tuple[float, float] = (0.2, 0.4)
     temperature: float = 0.1
     regularisation: float = 0.05
     learning_rate: float = 1e-3
@@ -63,7 +63,8 @@ class Network(nn.Module):
         self.backbone = ResNet(TINY)
         dim = TINY.channels[-1]
         self.projection = nn.Sequential(
-            nn.Linear(dim, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, bottleneck)
+            nn.Linear(dim, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, bottleneck),
+            nn.BatchNorm1d(bottleneck, affine=False),  # or else all pictures look alike for long
         )
         self.prototypes = nn.Parameter(torch.randn(prototypes, bottleneck))
 
