@@ -1,21 +1,26 @@
 """The trainers of the small stand-ins: their pictures' poses are right, their losses do what the papers say."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import zsp_lite
 from zsp_lite.baselines.posecontrast import angles_of, load_posecontrast_tiny, rotation_of
 from zsp_lite.baselines.swav import load_swav_tiny
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
+from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training import object_crops as crops_module
 from zsp_lite.training import posecontrast, swav
 from zsp_lite.training.object_crops import SIZE, VIEWS, ObjectCrops, object_crops, render_object
 from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
 from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
+
+WEIGHTS = Path(zsp_lite.__file__).parent / "weights"
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +128,17 @@ def test_both_trainers_write_what_the_loaders_read(folder):
     assert row["step"] == 2 and 0 <= row["held_out_median"] <= 180 and len(lines) == 2
     config = json.loads((folder / "swav-tiny.json").read_text())
     assert config["steps"] == 2 and config["categories"] == list(TRAINING)
+
+
+@pytest.mark.parametrize("name, load", [("swav-tiny", load_swav_tiny), ("posecontrast-tiny", load_posecontrast_tiny)])
+def test_a_shipped_stand_in_loads_and_has_seen_no_evaluation_category(name, load):
+    config = json.loads((WEIGHTS / f"{name}.json").read_text())
+    assert config["categories"] and not set(config["categories"]) & set(EVALUATION)
+    assert (WEIGHTS / f"{name}.safetensors").stat().st_size < 3e6
+    log = [json.loads(line) for line in (WEIGHTS / f"{name}.jsonl").read_text().splitlines()]
+    assert log[-1]["step"] == config["steps"] and log[-1]["loss"] < log[0]["loss"]
+    weights = load().state_dict()
+    assert all(x.dtype == torch.float32 and x.isfinite().all() for x in weights.values() if x.is_floating_point())
 
 
 def test_settings_without_a_meaning_are_refused(tmp_path):
