@@ -74,6 +74,20 @@ def test_labels_and_pairs_come_from_a_clone(clone, root):
     assert not (root / "README.md").exists()
 
 
+def test_other_labels_are_replaced_only_when_that_is_said(clone, root):
+    bring_labels(clone, root)
+    bring_labels(clone, root)  # the same again loses nothing
+    mine = np.eye(4)
+    mine[:3, 3] = 0.1
+    write_label(root, "chair", PoseLabel(mine, "b", "a"))
+    before = everything(root)
+    with pytest.raises(InputError, match=r"b\.json would be replaced by other content, expected --replace"):
+        bring_labels(clone, root)
+    assert everything(root) == before
+    bring_labels(clone, root, replace=True)
+    assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
+
+
 @pytest.mark.parametrize("kind", ["zip", "tar.gz"])
 def test_and_from_an_archive_with_its_checksum(clone, root, kind):
     path, digest = packed(clone, kind)
@@ -271,3 +285,14 @@ def test_what_cannot_be_carried_is_refused(tmp_path):
     write_co3d(tmp_path / "v2b", "chair", [sequence_data("a")])
     with pytest.raises(InputError, match="no frames of a sequence 'b'"):
         carry_labels(tmp_path / "v1", tmp_path / "v2b", "chair", max_residual=10)
+
+
+def test_carried_labels_replace_others_only_when_that_is_said(tmp_path):
+    two_layouts(tmp_path)
+    mine = PoseLabel(np.eye(4), "b", "a")
+    path = write_label(tmp_path / "v2", "chair", mine)
+    with pytest.raises(InputError, match=r"b\.json would be replaced"):
+        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+    assert list(read_labels(tmp_path / "v2", "chair")) == ["b"] and "1.0" in path.read_text()
+    carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", replace=True)
+    assert not np.array_equal(read_labels(tmp_path / "v2", "chair")["b"].trans, mine.trans)

@@ -102,6 +102,7 @@ def add_data(commands) -> None:
     labels.add_argument("source", metavar="SOURCE", help="a local clone, an archive of it, or an archive's URL")
     labels.add_argument("--root", type=Path, required=True, metavar="DIR", help="the data folder")
     labels.add_argument("--sha256", metavar="DIGEST", help="of the archive; a URL needs it")
+    _may_replace(labels)
 
     carry = _command(
         parts, "carry", _carry, "carry labels made on CO3D v1 to v2 by the camera centres of the same frames",
@@ -114,6 +115,7 @@ def add_data(commands) -> None:
         "--max-residual", type=_positive, default=0.05, metavar="SHARE",
         help="refuse where the centres differ by more than this share of their spread (default: 0.05)",
     )  # fmt: skip
+    _may_replace(carry)
 
     bring = _command(
         parts, "import", _import, "import a capture as a sequence: tum, nerfstudio, open3d, or plain lists",
@@ -140,6 +142,10 @@ def add_data(commands) -> None:
         metavar="M",
         help="of plain lists: world units per stored value (default: 0.001)",
     )
+
+
+def _may_replace(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--replace", action="store_true", help="also labels that are there and say something else")
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -172,14 +178,16 @@ def _check(arguments: argparse.Namespace) -> int:
 def _bring(arguments: argparse.Namespace) -> None:
     from zsp_lite.data_labels import bring_labels
 
-    counts = bring_labels(arguments.source, arguments.root, arguments.sha256)
+    counts = bring_labels(arguments.source, arguments.root, arguments.sha256, arguments.replace)
     print(f"Written to {arguments.root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
 
 
 def _carry(arguments: argparse.Namespace) -> None:
     from zsp_lite.data_labels import carry_labels
 
-    residuals = carry_labels(arguments.source, arguments.target, arguments.category, arguments.max_residual)
+    residuals = carry_labels(
+        arguments.source, arguments.target, arguments.category, arguments.max_residual, arguments.replace
+    )
     for name, residual in residuals.items():
         print(f"{name:24} camera centres agree to {100 * residual:.2f} % of their spread")
     print(f"Written: {len(residuals)} labels of {arguments.category} in {arguments.target}")

@@ -17,7 +17,7 @@ from zsp_lite.download import cache_folder, fetch
 from zsp_lite.errors import InputError
 from zsp_lite.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import rigid_label
-from zsp_lite.labels import PoseLabel, label_folder, parse_label, read_labels, write_label
+from zsp_lite.labels import PoseLabel, label_file, label_folder, parse_label, read_labels
 from zsp_lite.pairs import check_upstream_pairs
 
 # Cameras of the same frames in v1 and v2 differ by a similarity, up to what the reconstruction was improved by.
@@ -30,14 +30,17 @@ _BROKEN = (
 )  # fmt: skip
 
 
-def bring_labels(source: str | Path, root: str | Path, sha256: str | None = None) -> dict[str, int]:
+def bring_labels(
+    source: str | Path, root: str | Path, sha256: str | None = None, replace: bool = False
+) -> dict[str, int]:
     """Bring labels and evaluation pairs from upstream's repository into the data folder `root`.
 
     source: a local clone (a folder), an archive of one (.zip, .tar, .tar.gz), or the URL of such an archive.  sha256:
     of the archive, required for a URL.  The files class_labels/CATEGORY/SEQ.json and determ_eval/SET/CATEGORY.pt are
-    taken, wherever these folders lie; all are checked before the first is written, nothing in them is executed. Returns
-    how many files of each kind came. Raises InputError where the checksum differs, a file is not what it should be, the
-    labels of a category would have two reference sequences, or there are none.
+    taken, wherever these folders lie; all are checked before the first is written, nothing in them is executed.
+    replace: even files of these names that say something else.  Returns how many files of each kind came. Raises
+    InputError where the checksum differs, a file is not what it should be, one would be lost, the labels of a category
+    would have two reference sequences, or there are none.
     """
     if not Path(root).is_dir():
         raise InputError(f"data folder {root} is not there, expected a folder with categories in CO3D's layout")
@@ -58,21 +61,20 @@ def bring_labels(source: str | Path, root: str | Path, sha256: str | None = None
         raise InputError(f"{source} holds no class_labels/CATEGORY/SEQ.json, expected a clone of the published code")
     for category, brought in labels.items():
         _check_one_reference(root, category, brought)
-    for (_, path), data in files.items():
-        write_atomic(path, data)
+    _write({path: data for (_, path), data in files.items()}, replace)
     kinds = [kind for kind, _ in files]
     return {kind: kinds.count(kind) for kind in ("class_labels", "determ_eval")}
 
 
 def carry_labels(
-    source: str | Path, target: str | Path, category: str, max_residual: float = MAX_RESIDUAL
+    source: str | Path, target: str | Path, category: str, max_residual: float = MAX_RESIDUAL, replace: bool = False
 ) -> dict[str, float]:
     """Labels made on `source` (CO3D v1) written for the same sequences of `target` (v2), whose worlds differ.
 
     The centres of the same frames' cameras are aligned by Umeyama with scale, sequence by sequence; labels are carried
     along. Returns the residual of each sequence: root mean square distance, a share of the centres' spread. Raises
     InputError, and writes nothing, where one exceeds `max_residual`, a sequence lacks in `target`, fewer than four
-    cameras are common, or `target` has labels of another reference sequence.
+    cameras are common, or `target` has labels of another reference sequence, or other ones and not `replace`.
     """
     labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
     if not labels:
@@ -95,8 +97,7 @@ def carry_labels(
         trans = rigid_label(worlds[name] @ rigid @ worlds[reference].inverse(), centre, name, reference)
         carried.append(PoseLabel(np.eye(4), name, reference) if name == reference else trans)
     _check_one_reference(target, category, {label.seq: label for label in carried})
-    for label in carried:
-        write_label(target, category, label)
+    _write({label_folder(target, category) / f"{label.seq}.json": label_file(label) for label in carried}, replace)
     return residuals
 
 
@@ -166,6 +167,19 @@ def _is_taken(path: str) -> bool:
     """Whether a file of an archive is a label or an evaluation set."""
     parts = PurePosixPath(path).parts
     return len(parts) >= 3 and parts[-3] in _KINDS and path.endswith(_KINDS[parts[-3]])
+
+
+def _write(files: dict[Path, bytes], replace: bool) -> None:
+    """Write all files, or none where one of them stands there with other content and may not be replaced."""
+    lost = [path for path, data in files.items() if path.exists() and path.read_bytes() != data]
+    if lost and not replace:
+        more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+        raise InputError(
+            f"{lost[0]}{more} would be replaced by other content, expected --replace where that is meant; "
+            "nothing was written"
+        )
+    for path, data in files.items():
+        write_atomic(path, data)
 
 
 def _check_one_reference(root: str | Path, category: str, new: dict[str, PoseLabel]) -> None:
