@@ -217,7 +217,7 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
 
     def pick(cloud, title):
         picked.append(title.split(":")[0])
-        assert any(cloud[0] is points for points in target.values())
+        assert len(cloud[0]) == len(target[picked[-1]])
         return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
 
     answers = iter(["seat", "", "back", "arm", "a", "r", "a", "q"])

@@ -22,6 +22,8 @@ Show = Callable[[np.ndarray, np.ndarray, str], None]
 Ask = Callable[[str], str]
 Guess = Callable[[str], None]
 
+# Open3D's windows look along -z with y up, cameras along z with y down.
+_WINDOW = np.diag([1.0, -1.0, -1.0])
 _BLUE, _ORANGE = (0.0, 0.45, 0.70), (0.90, 0.62, 0.0)
 
 
@@ -56,7 +58,7 @@ def label_category(
     reference = labelling.reference
     while len(labelling.names) < MIN_KEYPOINTS:
         say(f"Reference {reference}: pick {MIN_KEYPOINTS} or more keypoints that every object of the category has.")
-        indices = pick(labelling.cloud(reference), f"{reference}: keypoints")
+        indices = pick(_in_first_view(labelling, reference), f"{reference}: keypoints")
         if not indices and ask("Nothing picked. Quit? [y/n] ") == "y":
             return
         labelling.clear(reference)
@@ -89,7 +91,7 @@ def _label_sequence(
     while True:
         if _alignment(labelling, sequence, say) is None:
             say(f"{sequence}: pick, in this order, {', '.join(labelling.names)}.")
-            indices = pick(cloud, f"{sequence}: {', '.join(labelling.names)}")
+            indices = pick(_in_first_view(labelling, sequence), f"{sequence}: {', '.join(labelling.names)}")
             if len(indices) != len(labelling.names):
                 say(f"{len(indices)} picked, {len(labelling.names)} expected.")
                 if (answer := ask("Again, skip or quit? [a/s/q] ")) in ("s", "q"):
@@ -105,7 +107,9 @@ def _label_sequence(
             continue
         for name, residual in zip(labelling.names, alignment.residuals):
             say(f"  {name:20} {100 * residual:5.1f} % of the keypoints' spread")
-        show(alignment.sim3.apply(labelling.cloud(labelling.reference)[0]), cloud[0], f"{sequence}: is it right?")
+        turn = _WINDOW @ labelling.first_view(sequence)
+        both = (alignment.sim3.apply(labelling.cloud(labelling.reference)[0]), cloud[0])
+        show(*(points @ turn.T for points in both), f"{sequence}: is it right?")
         answer = ask("Accept, redo, skip or quit? [a/r/s/q] ")
         if answer == "a":
             say(f"Written: {labelling.accept(sequence)}")
@@ -115,6 +119,12 @@ def _label_sequence(
                 labelling.skip(sequence)
             return answer == "s"
         labelling.clear(sequence)
+
+
+def _in_first_view(labelling: Labelling, sequence: str) -> Cloud:
+    """A sequence's cloud, turned so that a window shows it as the first camera saw it."""
+    points, colours = labelling.cloud(sequence)
+    return points @ (_WINDOW @ labelling.first_view(sequence)).T, colours
 
 
 def _alignment(labelling: Labelling, sequence: str, say: Callable[[str], None]) -> Alignment | None:

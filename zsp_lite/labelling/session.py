@@ -114,6 +114,13 @@ class Labelling:
             self._clouds[sequence] = points, colours
         return self._clouds[sequence]
 
+    def first_view(self, sequence: str) -> Float[np.ndarray, "3 3"]:
+        """World directions right, down and away, as rows, of a sequence's first camera; the world's own without one."""
+        for frame in self.dataset.frames(self.category, self._known(sequence)):
+            if frame.viewpoint is not None:
+                return self.dataset.camera(frame).R
+        return np.eye(3)
+
     def pick(self, sequence: str, point: Point, name: str | None = None) -> None:
         """Add the next keypoint of a sequence: `point` (3,) in its world.
 

@@ -390,7 +390,7 @@ class _Desk:
         points, colours = self.labelling.cloud(sequence)
         alt = f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, the arrow keys turn it."
         overlay = None if on_top is None else (on_top, _rgb(BLUE), _rgb(ORANGE))
-        view = _first_view(self.labelling, sequence) if before[0] != sequence else None
+        view = self.labelling.first_view(sequence) if before[0] != sequence else None
         try:
             self.views[place].show(points, colours, view, alt, overlay)
         except InputError as error:
@@ -429,14 +429,6 @@ class _Desk:
         place = [row.sequence for row in rows].index(sequence)
         following = rows[place + 1 :] + rows[:place]
         return next((row.sequence for row in following if row.state == OPEN), sequence)
-
-
-def _first_view(labelling: Labelling, sequence: str) -> np.ndarray:
-    """The directions right, down and away of the sequence's first camera; the world's own where it has none."""
-    for frame in labelling.dataset.frames(labelling.category, sequence):
-        if frame.viewpoint is not None:
-            return labelling.dataset.camera(frame).R
-    return np.eye(3)
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
