@@ -100,3 +100,19 @@ def test_the_target_view_of_a_true_pair_shares_the_most_places(dataset, pair):
 def test_a_folder_that_is_not_synthetic_is_refused(tmp_path, dataset):
     with pytest.raises(InputError, match="only they have exact places"):
         object_frames(Co3D(tmp_path), "chair")
+
+
+@pytest.mark.parametrize(
+    "file, content, message",
+    [
+        ("synthetic.json", '{"preset": "eval"}', "synthetic.json: .*`seed`"),
+        ("synthetic.json", '{"seed": "one"}', "synthetic.json: Expected `int`"),
+        ("chair/object_poses.json", '{"a": {"trans": []}}', "object_poses.json: .*trans"),
+    ],
+)
+def test_a_synthetic_folder_with_a_wrong_file_is_named(tmp_path, file, content, message):
+    (tmp_path / "chair").mkdir()
+    for path, text in {"synthetic.json": '{"seed": 0}', "chair/object_poses.json": "{}", file: content}.items():
+        (tmp_path / path).write_text(text)
+    with pytest.raises(InputError, match=message):
+        object_frames(Co3D(tmp_path), "chair")

@@ -194,6 +194,39 @@ def slider_moves_picture(output, patience: float = 90) -> bool:
     return False
 
 
+def label_by_clicks(page) -> None:
+    """Label a sequence as a person does: four keypoints on the reference, one taken back, four on the next, accept."""
+    box = page.locator(".zsp-label")
+    _pick_outermost(page, "reference")
+    box.locator("button.zsp-undo").click()
+    _await_marks(page, "reference", 3)
+    _pick_outermost(page, "reference", first=3)
+    box.locator("button.zsp-next").click()
+    _pick_outermost(page, "sequence")
+    box.locator("button.zsp-accept:enabled").click()
+    box.locator(".zsp-progress td", has_text="accepted").wait_for()
+
+
+def _pick_outermost(page, cloud: str, first: int = 0) -> None:
+    """Click on the points of a cloud that are furthest left, right, up and down on the screen, from the `first` on."""
+    canvas = page.locator(f".zsp-cloud-{cloud} canvas")
+    canvas.scroll_into_view_if_needed()
+    page.wait_for_function("name => +document.querySelector(`.zsp-cloud-${name} canvas`).dataset.points > 0", arg=cloud)
+    places = canvas.evaluate("c => [...Array(+c.dataset.points).keys()].map(i => c.place(i))")
+    across, down = (lambda place: place[0]), (lambda place: place[1])
+    ends = [min(places, key=across), max(places, key=across), min(places, key=down), max(places, key=down)]
+    for number, (x, y) in list(enumerate(ends, 1))[first:]:
+        canvas.click(position={"x": x, "y": y})
+        _await_marks(page, cloud, number)
+
+
+def _await_marks(page, cloud: str, number: int) -> None:
+    page.wait_for_function(
+        "([name, n]) => document.querySelector(`.zsp-cloud-${name} canvas`).dataset.marks == n",
+        arg=[cloud, str(number)],
+    )
+
+
 def photograph(page, path: Path, width: int = 1300, highest: int = 15_000) -> None:
     """The whole notebook as a picture; what Chromium cannot draw at once goes into further ones, NAME-2.png etc."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ import pytest
 from lab_in_browser import (
     REPOSITORY,
     errors,
+    label_by_clicks,
     open_notebook,
     photograph,
     run_all,
@@ -20,6 +21,7 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = REPOSITORY / "outputs" / "browser"
+LABELLING = {"08_label_poses.ipynb", "10_your_own_objects.ipynb"}  # have a 3D view to click on
 MINUTES = 20  # a notebook may take on a busy machine
 
 BROKEN = """\
@@ -29,14 +31,6 @@ plt.figure(figsize=(1, 1)).savefig(drawn, format="png")
 plt.close("all")
 display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.getvalue())]))
 """
-
-CLICKS = """\
-from zsp_lite.widgets.latency import build_example
-box = build_example("label_poses")
-box.controls["sequence"].value = box.controls["sequence"].options[2][1]
-box
-"""
-
 
 def chromium(playwright) -> str | None:
     """The system's Chromium or Chrome, or else the one that Playwright has installed."""
@@ -79,8 +73,6 @@ def lab(browser, tmp_path_factory):
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     broken = new_notebook(cells=cells, metadata=python)
     nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
-    clicks = new_notebook(cells=[new_code_cell(CLICKS)], metadata=python)
-    nbformat.write(clicks, folder / "notebooks" / "clicks.ipynb")
     with serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 
@@ -105,23 +97,6 @@ def test_a_broken_notebook_is_found_out(page, lab):
     assert not slider_moves_picture(output, patience=3)
 
 
-def test_clicks_on_a_point_cloud_pick_keypoints(page, lab):
-    open_notebook(page, lab, "clicks.ipynb")
-    run_all(page, patience=300)
-    cloud = page.locator(".zsp-cloud-sequence canvas")
-    cloud.scroll_into_view_if_needed()
-    nearest = "c => [...Array(+c.dataset.points).keys()].map(i => c.place(i))"
-    for number, share in enumerate((0.1, 0.9), 1):
-        places = sorted(cloud.evaluate(nearest))
-        x, y = places[int(share * len(places))]
-        cloud.click(position={"x": x, "y": y})
-        page.wait_for_function(
-            "n => document.querySelector('.zsp-cloud-sequence canvas').dataset.marks == n", arg=str(number)
-        )
-    page.locator("button.zsp-undo").click()
-    page.wait_for_function("() => document.querySelector('.zsp-cloud-sequence canvas').dataset.marks == '1'")
-
-
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
     open_notebook(page, lab, name)
@@ -131,5 +106,7 @@ def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
         assert not wrong
         silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]
         assert not silent, f"pictures of widgets {silent} of {name} did not change when their sliders were moved"
+        if name in LABELLING:
+            label_by_clicks(page)
     finally:
         photograph(page, PICTURES / f"{Path(name).stem}.png")

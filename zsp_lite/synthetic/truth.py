@@ -11,6 +11,7 @@ box: coordinates run from 0 (rear, right, bottom) to 1 (front, left, top) along 
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.neighbors import NearestNeighbors
@@ -28,6 +29,18 @@ from zsp_lite.views import object_crop, patch_mask
 _MARGIN = 0.05  # outside the box by more than this is no point of the object, but of the room
 
 _SURE = 0.8  # masks are soft, and right to a pixel or two
+
+
+_Row = tuple[float, float, float, float]
+
+
+class _Settings(msgspec.Struct):
+    seed: int
+
+
+class _Placement(msgspec.Struct):
+    trans: tuple[_Row, _Row, _Row, _Row]
+    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +79,18 @@ class TruePair:
 def object_frames(dataset: Co3D, category: str) -> dict[str, ObjectFrame]:
     """The frame of each sequence's object, by the sequence's name; the box is that of the object's exact mesh.
 
-    Raises InputError where the folder is no synthetic one.
+    Raises InputError where the folder is no synthetic one, or one of its two files says something else.
     """
     settings, poses = dataset.root / SETTINGS_FILE, dataset.root / category / POSES_FILE
     for path in (settings, poses):
         if not path.is_file():
             raise InputError(f"{path} is missing, expected a folder of synthetic objects: only they have exact places")
-    seed = decode(read_bytes(settings, "settings"), dict, settings)["seed"]
+    seed = decode(read_bytes(settings, "settings"), _Settings, settings).seed
     frames = {}
-    for sequence, pose in decode(read_bytes(poses, "object poses"), dict, poses).items():
-        trans, vertices = np.array(pose["trans"]), make_object(category, sequence, seed).vertices
+    for sequence, pose in decode(read_bytes(poses, "object poses"), dict[str, _Placement], poses).items():
+        trans, vertices = np.array(pose.trans), make_object(category, sequence, seed).vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-        frames[sequence] = ObjectFrame(trans[:3, :3], trans[:3, 3], pose["scale"], low, high)
+        frames[sequence] = ObjectFrame(trans[:3, :3], trans[:3, 3], pose.scale, low, high)
     return frames
 
 

@@ -1,5 +1,7 @@
 """Umeyama and RANSAC, to be played with: one outlier moved away, and trials and threshold with the inliers redrawn."""
 
+from typing import TYPE_CHECKING
+
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Real
@@ -12,6 +14,9 @@ from zsp_lite.plots import BLUE, ORANGE, VERMILLION
 from zsp_lite.widgets.common import example_pair, explorer, load_ipywidgets, slider
 from zsp_lite.widgets.views import match_canvas
 
+if TYPE_CHECKING:
+    from ipywidgets import VBox
+
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _SCALES = (0.2, 5.0)  # as `ZeroShotPose` allows
 
@@ -21,7 +26,7 @@ def ransac_settings(
     pixels: tuple[Real[np.ndarray, "n 2"], Real[np.ndarray, "n 2"]],
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
-):
+) -> "VBox":
     """Widget: RANSAC on the matches of two images, with its trials, its threshold and its draw on sliders.
 
     images: of one size.  pixels, points: of each match in both, (x, y) and camera-frame 3D in scene units.
@@ -74,7 +79,7 @@ def ransac_settings(
     return explorer(figure, controls, update, alt)
 
 
-def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
+def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> "VBox":
     """Widget: least squares on n corresponding points of which the last is moved away from where it belongs.
 
     Seen from the front, x to the right and y down.  The rotation is compared with that of the fit before the move.
@@ -110,7 +115,7 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
     return explorer(figure, {"distance": slider("moved by", 0.0, 6.0, 0.0, 0.1)}, update, alt)
 
 
-def example_ransac_settings():
+def example_ransac_settings() -> "VBox":
     """`ransac_settings` on a pair of sample views."""
     from zsp_lite.matching import match
     from zsp_lite.pipeline import match_points
@@ -124,7 +129,7 @@ def example_ransac_settings():
     return ransac_settings(images, tuple(pixels), match_points(*views, matches))
 
 
-def example_one_outlier():
+def example_one_outlier() -> "VBox":
     """`one_outlier` on points drawn at random."""
     points = np.random.default_rng(0).normal(size=(12, 3))
     return one_outlier(points, points)

@@ -230,8 +230,10 @@ class _SimilarityPanels:
 
 
 def _first_patch(found: Bool[np.ndarray, "rows cols"]) -> tuple[int, int]:
-    """A patch with a known partner, near the middle of all that have one."""
+    """A patch with a known partner, near the middle of all that have one.  Raises InputError where none has."""
     cells = np.argwhere(found)
+    if not len(cells):
+        raise InputError("no patch of the reference has a true partner in the target, expected at least one")
     row, col = cells[np.abs(cells - np.median(cells, axis=0)).sum(axis=1).argmin()]
     return int(row), int(col)
 

@@ -1,6 +1,7 @@
 """What a measured accuracy says, to be played with: how far apart methods must be, and what symmetry does to errors."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +11,9 @@ from sklearn.neighbors import NearestNeighbors
 from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, ORANGE
 from zsp_lite.widgets.common import choice, explorer, slider
+
+if TYPE_CHECKING:
+    from ipywidgets import VBox
 
 _STEP = 5  # degrees between the turns whose distances are worked out beforehand
 
@@ -37,7 +41,7 @@ def order_chances(n: int, first: float, second: float) -> tuple[float, float]:
     return float(b @ below), float(b @ above)
 
 
-def measured_accuracy():
+def measured_accuracy() -> "VBox":
     """Widget: how Acc30 of two methods scatters, measured on so many pairs each, and how often their order is right.
 
     Controls: pairs, the first method's true accuracy, and what the second has more.
@@ -87,7 +91,7 @@ def turned_distance(
     return np.array([search.kneighbors(_turn(cloud, angle))[0].mean() for angle in np.asarray(degrees, np.float64)])
 
 
-def symmetry_turn(clouds: Mapping[str, Float[np.ndarray, "n 3"]]):
+def symmetry_turn(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
     """Widget: an object turned by a wrong angle over itself, its rotation error and its closest-point distance.
 
     clouds: by name, centred, z up, in scene units; a thousand points each are plenty.  Controls: which, and the turn.
@@ -136,12 +140,12 @@ def _turn(points: np.ndarray, degrees: float) -> np.ndarray:
     return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
-def example_measured_accuracy():
+def example_measured_accuracy() -> "VBox":
     """`measured_accuracy`; it needs no data."""
     return measured_accuracy()
 
 
-def example_symmetry_turn():
+def example_symmetry_turn() -> "VBox":
     """`symmetry_turn` on a sheet and a cross, seen from above."""
     along = np.linspace(-1, 1, 400)
     sheet = np.column_stack([along, 0.1 * along, 0 * along])

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,6 +17,9 @@ from zsp_lite.errors import InputError
 from zsp_lite.plots import BLUE, CHOSEN, patch_centres
 from zsp_lite.views import View
 from zsp_lite.widgets.common import choice, explorer, slider
+
+if TYPE_CHECKING:
+    from ipywidgets import VBox
 
 _GAP = 16  # pixels between the two images of a `MatchCanvas`
 
@@ -97,7 +101,7 @@ def best_view(
     comparisons: Sequence[Comparison],
     places: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
     angles: Float[np.ndarray, "n"],
-):
+) -> "VBox":
     """Widget: which of N target views each of the four scores chooses, and the matches that it goes on with.
 
     targets, comparisons: n views in the order of the walk, each compared with the reference.  places: where they and
@@ -179,7 +183,7 @@ def _match_pixels(reference: View, target: View, comparison: Comparison) -> tupl
     )
 
 
-def example_best_view():
+def example_best_view() -> "VBox":
     """`best_view` on sample data: one object against four views of another."""
     from zsp_lite.backbones import load_backbone
     from zsp_lite.co3d import Co3D
