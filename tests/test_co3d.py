@@ -200,7 +200,10 @@ def test_a_matrix_that_is_no_rotation_is_refused_with_its_frame(root):
         Co3D(root).load(first(root))
 
 
-@pytest.mark.parametrize("data", [b"", b"no gzip", gzip.compress(b"[{]"), gzip.compress(b"[1, 2]"), "cut"])
+@pytest.mark.parametrize(
+    "data", [b"", b"no gzip", gzip.compress(b"[{]"), gzip.compress(b"[1, 2]"), "cut"],
+    ids=["empty", "no gzip", "no JSON", "no annotations", "cut"],
+)  # fmt: skip
 def test_broken_annotation_files_are_refused_by_name(root, data):
     path = frames_file(root)
     path.write_bytes(path.read_bytes()[:-40] if data == "cut" else data)

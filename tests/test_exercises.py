@@ -71,6 +71,7 @@ MISTAKES = {
         "self_fit": {
             "turned about the origin": ("points - points.mean(axis=0)", "points"),
             "each point against itself": ("distances.min(axis=1)", "np.diag(distances)"),
+            "turned the other way round": ("rotation.T", "rotation"),
         },
     },
     "04_umeyama_ransac": {
