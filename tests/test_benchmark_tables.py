@@ -4,6 +4,7 @@ import csv
 import gzip
 import io
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -27,7 +28,15 @@ from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, read_results, write_results
 from zsp_lite.benchmark.storage import RunFolder
 from zsp_lite.benchmark.summary import summarise_run
-from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, all_rows, category_tables, every_table, paper_tables
+from zsp_lite.benchmark.tables import (
+    OTHER_DATA,
+    THIS_RUN,
+    all_rows,
+    by_category,
+    category_tables,
+    every_table,
+    paper_tables,
+)
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import paired_test
 from zsp_lite.pairs import Pair
@@ -241,11 +250,24 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
     assert found["icp"].acc30[1] - found["icp"].acc30[0] == pytest.approx(test["accuracy_gain"])
     (mixed,) = compare(first, first, [("ours", "icp")])
     table = comparison_table([mixed], "a", "b")
-    assert table.rows[0][0] == "ours | icp" and len(table.rows[0][1]) == len(table.columns)
+    assert table.rows[0][0] == "ours:icp" and len(table.rows[0][1]) == len(table.columns)
+    heading, rule, line = as_markdown(replace(table, rows=(("a|b", table.rows[0][1]),))).splitlines()[2:5]
+    assert len({text.replace("\\|", "").count("|") for text in (heading, rule, line)}) == 1
     with pytest.raises(InputError, match="pair in common"):
         compare(first, second, [("ours-n1", "ours")])
     with pytest.raises(InputError, match="row in common"):
         compare(Results({}, {}, [], {"x": {}}), second)
+
+
+def test_rows_by_category_for_a_terminal(run):
+    summary = run[1]
+    table = by_category(summary, ["ours", "icp"])
+    assert [label for label, _ in table.rows] == list(CATEGORIES)
+    for category, cells in table.rows:
+        found = [summary["methods"][name]["per_category"][category]["acc30"] for name in ("ours", "icp")]
+        assert [cell.value for cell in cells] == found
+    with pytest.raises(InputError, match="no row nobody, expected some of icp"):
+        by_category(summary, ["nobody"])
 
 
 def test_a_run_against_itself_shows_no_difference(run):

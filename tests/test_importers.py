@@ -370,3 +370,22 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
     with pytest.raises(InputError, match="mine is there already, expected another sequence name"):
         import_capture(capture, tmp_path / "data", "teapot", "mine")
+
+
+def test_an_import_that_was_interrupted_is_done_by_doing_it_again(tmp_path, views, monkeypatch):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, views)
+    capture, data = READERS["nerfstudio"](folder), tmp_path / "data"
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("zsp_lite.co3d.write_ply", full)
+        with pytest.raises(OSError, match="no space"):
+            import_capture(capture, data, "teapot", "mine")
+    assert not (data / "teapot" / "sequence_annotations.jgz").exists()
+    import_capture(capture, data, "teapot", "mine")
+    assert len(Co3D(data).frames("teapot", "mine")) == len(views)
+    assert not [path for path in (data / "teapot" / "mine").iterdir() if path.name.startswith(".")]

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from co3d_folders import sequence_data
+from co3d_folders import edit_json, sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.annotations import FRAMES_FILE
 from zsp_lite.co3d import Co3D, write_co3d
 from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks, rigid_label
@@ -217,16 +218,28 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
 
     def pick(cloud, title):
         picked.append(title.split(":")[0])
-        assert len(cloud[0]) == len(target[picked[-1]])
+        # As the first camera saw it, in a window that looks along -z with y up.
+        turn = np.diag([1, -1, -1]) @ labelling.dataset.camera(labelling.dataset.frames("chair", picked[-1])[0]).R
+        np.testing.assert_allclose(cloud[0], target[picked[-1]] @ turn.T)
         return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
 
-    answers = iter(["seat", "", "back", "arm", "a", "r", "a", "q"])
-    label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x[2]))
-    assert labelling.names == ("seat", "keypoint 2", "back", "arm")
+    answers = iter(["Seat", "", "back", "arm", "a", "what", "R", "", "a", "q"])
+    label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x))
+    assert labelling.names == ("Seat", "keypoint 2", "back", "arm")
+    np.testing.assert_array_equal(labelling.picks("a"), target["a"][:4])  # in the world, whatever the window showed
+    for reference, sequence, title in shown:
+        turn = np.diag([1, -1, -1]) @ labelling.first_view(title.split(":")[0])
+        np.testing.assert_allclose(sequence, target[title.split(":")[0]] @ turn.T)
+        assert reference.shape == target["best"].shape
     assert picked == ["best", "a", "a", "a", "b"] and len(shown) == 3
     assert list(read_labels(root, "chair")) == ["a", "best"]
     assert "0 picked, 4 expected." in said
     assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
+
+
+def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
+    edit_json(root / "chair" / FRAMES_FILE, lambda frames: [frame.pop("viewpoint") for frame in frames] and None)
+    np.testing.assert_array_equal(Labelling(root, "chair").first_view("a"), np.eye(3))
 
 
 def test_the_desktop_says_what_picks_are_bad_and_asks_for_them_anew(root):

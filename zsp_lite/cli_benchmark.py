@@ -6,6 +6,8 @@ from pathlib import Path
 from zsp_lite.cli import _add_backbone, _add_data, _backbone, _command, _count, _names, _seed
 from zsp_lite.errors import InputError
 
+_SHOWN = 4  # rows of the table by category that a terminal has room for
+
 
 def add_benchmark(commands) -> None:
     parser = _command(
@@ -63,7 +65,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     from zsp_lite.benchmark.formats import as_rich
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate
-    from zsp_lite.benchmark.tables import all_rows, paper_tables
+    from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
     from zsp_lite.doctor import data_folders
 
     root = data_folders(arguments.data)[0][1]
@@ -91,7 +93,8 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     title = f"{root}, backbone {summary['backbone']}, {arguments.targets} target views"
     console.print(title, soft_wrap=True, highlight=False)
     tables = paper_tables(summary)
-    for table in [all_rows(summary), *(tables if len(summary["methods"]) > 3 else [])]:
+    shown = [all_rows(summary), *(tables if len(summary["methods"]) > 3 else [])]
+    for table in [*shown, by_category(summary, list(summary["methods"])[:_SHOWN])]:
         console.print(as_rich(table))
     if cost := summary.get("cost"):
         console.print(
@@ -140,6 +143,10 @@ def add_tables(commands) -> None:
     parser.add_argument("source", type=Path, help="a run's folder, or its results.json.gz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: where the run is")
     parser.add_argument(
+        "--rows", type=_names, metavar="ROW,...",
+        help=f"rows of the table by category in the terminal (default: the first {_SHOWN}; files have all)",
+    )  # fmt: skip
+    parser.add_argument(
         "--into", type=Path, metavar="FILE",
         help="do nothing but put the tables that a Markdown document has marks for in their places",
     )  # fmt: skip
@@ -157,11 +164,12 @@ def _tables(arguments: argparse.Namespace) -> None:
 
     from zsp_lite.benchmark.formats import as_rich
     from zsp_lite.benchmark.reports import write_reports
-    from zsp_lite.benchmark.tables import all_rows, paper_tables
+    from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
 
     results = write_reports(arguments.source, arguments.out)
-    console = Console()
-    for table in [all_rows(results.summary), *paper_tables(results.summary)]:
+    summary, console = results.summary, Console()
+    rows = arguments.rows or list(summary["methods"])[:_SHOWN]
+    for table in [all_rows(summary), *paper_tables(summary), by_category(summary, rows)]:
         console.print(as_rich(table))
     return None
 

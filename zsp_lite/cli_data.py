@@ -71,7 +71,7 @@ def _label(arguments: argparse.Namespace) -> None:
 
 def _ask(question: str) -> str:
     try:
-        return input(question).strip().lower()
+        return input(question)
     except EOFError as error:
         raise InputError("no terminal to answer in, expected one") from error
 
@@ -145,7 +145,7 @@ def add_data(commands) -> None:
 
 
 def _may_replace(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--replace", action="store_true", help="also labels that are there and say something else")
+    parser.add_argument("--replace", action="store_true", help="replace files that are there with other content")
 
 
 def _check(arguments: argparse.Namespace) -> int:

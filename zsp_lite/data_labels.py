@@ -17,7 +17,7 @@ from zsp_lite.download import cache_folder, fetch
 from zsp_lite.errors import InputError
 from zsp_lite.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import rigid_label
-from zsp_lite.labels import PoseLabel, label_file, label_folder, parse_label, read_labels
+from zsp_lite.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels
 from zsp_lite.pairs import check_upstream_pairs
 
 # Cameras of the same frames in v1 and v2 differ by a similarity, up to what the reconstruction was improved by.
@@ -97,7 +97,7 @@ def carry_labels(
         trans = rigid_label(worlds[name] @ rigid @ worlds[reference].inverse(), centre, name, reference)
         carried.append(PoseLabel(np.eye(4), name, reference) if name == reference else trans)
     _check_one_reference(target, category, {label.seq: label for label in carried})
-    _write({label_folder(target, category) / f"{label.seq}.json": label_file(label) for label in carried}, replace)
+    _write({label_folder(target, category) / f"{label.seq}.json": label_bytes(label) for label in carried}, replace)
     return residuals
 
 
@@ -171,7 +171,7 @@ def _is_taken(path: str) -> bool:
 
 def _write(files: dict[Path, bytes], replace: bool) -> None:
     """Write all files, or none where one of them stands there with other content and may not be replaced."""
-    lost = [path for path, data in files.items() if path.exists() and path.read_bytes() != data]
+    lost = [path for path, data in files.items() if path.exists() and read_bytes(path, "file") != data]
     if lost and not replace:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         raise InputError(

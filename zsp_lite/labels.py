@@ -95,11 +95,11 @@ def parse_label(data: bytes, where: str) -> PoseLabel:
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
     """Write one label in one step, over an earlier one of the same sequence; returns the file's path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
-    write_atomic(path, label_file(label))
+    write_atomic(path, label_bytes(label))
     return path
 
 
-def label_file(label: PoseLabel) -> bytes:
+def label_bytes(label: PoseLabel) -> bytes:
     """What a label's file holds, in the upstream JSON form."""
     content = {"trans": label.trans.tolist(), "seq": label.seq, "reference_seq": label.reference_seq}
     return json.dumps(content).encode()

@@ -107,12 +107,13 @@ def open_notebook(page, lab: Lab, name: str) -> None:
 def run_all(page, patience: float) -> None:
     """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
     deadline = time.monotonic() + patience
-    while not _begun(page, patience=20):  # a notebook that has only just opened may not hear the menu
+    begun = False
+    while not begun:  # a notebook that has only just opened may not hear the menu
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        page.keyboard.press("Escape")
         page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
         page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
+        begun = _begun(page, patience=20)
     rest = 0
     while rest < 3:  # between two cells there is a moment in which none runs
         running = [number for number, prompt in enumerate(_prompts(page)) if "*" in prompt]

@@ -22,6 +22,7 @@ from nbformat.v4 import new_code_cell, new_notebook
 NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = REPOSITORY / "outputs" / "browser"
 LABELLING = {"08_label_poses.ipynb", "10_your_own_objects.ipynb"}  # have a 3D view to click on
+WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 
 BROKEN = """\
@@ -102,8 +103,12 @@ def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
     open_notebook(page, lab, name)
     run_all(page, patience=60 * MINUTES)
     try:
-        wrong = errors(page, saved(page, lab, name))
+        notebook = saved(page, lab, name)
+        wrong = errors(page, notebook)
         assert not wrong
+        widgets = sum(WIDGET in output.get("data", {}) for cell in notebook["cells"] for output in cell.get("outputs", []))
+        shown = page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".jupyter-widgets"))
+        assert shown.count() >= widgets, f"{shown.count()} widgets in the page, expected {widgets}"
         silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]
         assert not silent, f"pictures of widgets {silent} of {name} did not change when their sliders were moved"
         if name in LABELLING:

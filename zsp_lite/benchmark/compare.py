@@ -70,7 +70,7 @@ def comparison_table(differences: list[Difference], first: str, second: str) -> 
         cells = [Cell(one.n, decimals=0), *map(Cell, one.acc30), Cell(one.accuracy_gain),
                  Cell(one.accuracy_p, decimals=4), *map(Cell, one.median), Cell(one.error_drop),
                  Cell(one.error_p, decimals=4)]  # fmt: skip
-        label = one.first if one.first == one.second else f"{one.first} | {one.second}"
+        label = one.first if one.first == one.second else f"{one.first}:{one.second}"
         rows.append((label, tuple(cells)))
     note = (
         "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians, "

@@ -3,7 +3,7 @@
 import csv
 import html
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -14,6 +14,11 @@ from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, Cell, Table
 from zsp_lite.files import write_atomic
 
 _NOTHING = "–"
+_LATEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "%_&#{}$"}
+    | {"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"}
+    | {"°": "$^\\circ$", "–": "--"}
+)
 
 
 def as_rich(table: Table) -> RichTable:
@@ -54,10 +59,15 @@ def as_csv(table: Table) -> str:
 
 def as_markdown(table: Table) -> str:
     """A pipe table under its title."""
-    titles = [title.replace("|", "\\|") for title in _flat_titles(table, ": ")]
-    lines = [f"**{table.title}**", "", f"| | {' | '.join(titles)} |", "|---|" + "---:|" * len(titles)]
-    lines += [f"| {label} | {' | '.join(map(_text, cells))} |" for label, cells in table.rows]
+    titles = _flat_titles(table, ": ")
+    lines = [f"**{table.title}**", "", _piped(["", *titles]), "|---|" + "---:|" * len(titles)]
+    lines += [_piped([label, *map(_text, cells)]) for label, cells in table.rows]
     return "\n".join([*lines, *(["", table.note] if table.note else [])]) + "\n"
+
+
+def _piped(cells: Sequence[str]) -> str:
+    """A line of a Markdown table."""
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def as_latex(table: Table) -> str:
@@ -145,7 +155,4 @@ def _text(cell: Cell | str | None) -> str:
 
 
 def _latex(text: str) -> str:
-    for plain, escaped in (("\\", "\\textbackslash "), ("%", "\\%"), ("_", "\\_"), ("&", "\\&"), ("#", "\\#"),
-                           ("°", "$^\\circ$"), ("–", "--")):  # fmt: skip
-        text = text.replace(plain, escaped)
-    return text
+    return text.translate(_LATEX)

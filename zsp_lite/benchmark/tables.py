@@ -10,6 +10,7 @@ from typing import Any
 
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.published import Printed
+from zsp_lite.errors import InputError
 
 THIS_RUN = "this run"
 OTHER_DATA = "published on CO3D (other data)"
@@ -151,6 +152,23 @@ def category_tables(summary: Mapping[str, Any]) -> list[Table]:
         )
         tables.append(Table(f"categories_{stem}", f"By category: {_TITLES[figure]}", columns, rows, NOTE))
     return tables
+
+
+def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
+    """Acc30 of some rows, a line for each category: narrow enough for a terminal.
+
+    Raises InputError where the run has no such row.
+    """
+    methods = summary["methods"]
+    if lacking := [name for name in names if name not in methods]:
+        raise InputError(f"the run has no row {', '.join(lacking)}, expected some of {', '.join(methods)}")
+    categories = list(dict.fromkeys(c for name in names for c in methods[name]["per_category"]))
+    rows = tuple(
+        (category, tuple(_figure(methods[name]["per_category"].get(category), "acc30") for name in names))
+        for category in categories
+    )
+    columns = tuple(Column(name) for name in names)
+    return Table("by_category", f"By category: {_TITLES['acc30']}", columns, rows, NOTE)
 
 
 def every_table(summary: Mapping[str, Any]) -> list[Table]:

@@ -47,13 +47,15 @@ def import_capture(
     """Write a capture as `root/category/sequence`: masks, a fused cloud, all scaled as CO3D's are.
 
     box: of the object in the first frame (top, left, height, width), for GrabCut; or masks: a folder of mask files;
-    neither: the capture's own masks. Frames whose mask is empty are left out. Raises InputError, before anything is
-    written, on what cannot be read, masked or fused, and where the folder has a sequence of that name already: labels
-    may belong to it.
+    neither: the capture's own masks. Frames whose mask is empty are left out. The same import goes on where
+    one was interrupted. Raises InputError, before anything is written, on what cannot be read, masked or
+    fused, and where the folder has a sequence of that name already: labels may belong to it.
     """
     plain_name(category, "category"), plain_name(sequence, "sequence")
-    if (Path(root) / category / sequence).exists():
-        raise InputError(f"{Path(root) / category / sequence} is there already, expected another sequence name")
+    folder = Path(root) / category / sequence
+    unfinished = folder / ".unfinished"
+    if folder.exists() and not unfinished.is_file():
+        raise InputError(f"{folder} is there already, expected another sequence name")
     capture = capture.thinned(max_frames)
     frames = [shot.load() for shot in capture.shots]
     if box is not None and masks is not None:
@@ -75,5 +77,8 @@ def import_capture(
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
     times = [capture.shots[index].time - capture.shots[0].time for index in seen]
     data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished.touch()
     write_co3d(root, category, [data])
+    unfinished.unlink()
     return Imported(len(frames), empty, len(points), scale)

@@ -59,7 +59,7 @@ def label_category(
     while len(labelling.names) < MIN_KEYPOINTS:
         say(f"Reference {reference}: pick {MIN_KEYPOINTS} or more keypoints that every object of the category has.")
         indices = pick(_in_first_view(labelling, reference), f"{reference}: keypoints")
-        if not indices and ask("Nothing picked. Quit? [y/n] ") == "y":
+        if not indices and _choice(ask, "Nothing picked. Quit?", "yn") == "y":
             return
         labelling.clear(reference)
         for index in indices:
@@ -94,7 +94,7 @@ def _label_sequence(
             indices = pick(_in_first_view(labelling, sequence), f"{sequence}: {', '.join(labelling.names)}")
             if len(indices) != len(labelling.names):
                 say(f"{len(indices)} picked, {len(labelling.names)} expected.")
-                if (answer := ask("Again, skip or quit? [a/s/q] ")) in ("s", "q"):
+                if (answer := _choice(ask, "Again, skip or quit?", "asq")) != "a":
                     if answer == "s":
                         labelling.skip(sequence)
                     return answer == "s"
@@ -110,7 +110,7 @@ def _label_sequence(
         turn = _WINDOW @ labelling.first_view(sequence)
         both = (alignment.sim3.apply(labelling.cloud(labelling.reference)[0]), cloud[0])
         show(*(points @ turn.T for points in both), f"{sequence}: is it right?")
-        answer = ask("Accept, redo, skip or quit? [a/r/s/q] ")
+        answer = _choice(ask, "Accept, redo, skip or quit?", "arsq")
         if answer == "a":
             say(f"Written: {labelling.accept(sequence)}")
             return True
@@ -119,6 +119,13 @@ def _label_sequence(
                 labelling.skip(sequence)
             return answer == "s"
         labelling.clear(sequence)
+
+
+def _choice(ask: Ask, question: str, answers: str) -> str:
+    """One of the letters `answers`; asked again until it is one."""
+    while (answer := ask(f"{question} [{'/'.join(answers)}] ").strip().lower()) not in tuple(answers):
+        pass
+    return answer
 
 
 def _in_first_view(labelling: Labelling, sequence: str) -> Cloud:
