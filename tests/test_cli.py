@@ -213,7 +213,7 @@ def test_a_run_is_planned_tabulated_and_compared(ellipsoids, tmp_path, monkeypat
     assert tables[0] == tables[1] == tables[2]
     assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
-    assert "ours | ours-globalsim" in capsys.readouterr().out
+    assert "ours:ours-globalsim" in capsys.readouterr().out
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
     assert "nowhere" in assert_one_line(capsys)
 

@@ -192,6 +192,23 @@ def test_a_view_without_depth_is_left_out_and_said_so(method, views, frames):
     assert error(found, frames) < 10
 
 
+def test_a_view_without_foreground_is_left_out_and_said_so(method, views, frames):
+    empty = replace(views[1], foreground=torch.zeros_like(views[1].foreground))
+    found = method.estimate_from_features(views[0], [empty, *views[2:]])
+    assert "target 0 left out: no foreground" in found.flags and not found.reliable
+    assert error(found, frames) < 8
+
+
+@pytest.mark.parametrize("sides", [[(-1, -0.2, -0.1)], [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]])
+def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
+    cameras = [turned(look_at(side, distance=4.5), ELSEWHERE.R) for side in sides]
+    frames = [render(look_at((1, 0.2, 0.1)), AT_HOME, "reference")]
+    frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
+    reference, *targets = look(method.backbone, [object_crop(frame) for frame in frames])
+    found = method.estimate_from_features(reference, targets)
+    assert "does not look alike" in found.note and not found.reliable
+
+
 def test_where_nothing_can_be_known_one_line_says_so(method, views, frames):
     blind = [changed(view, depth=np.zeros_like(view.frame.depth)) for view in views]
     with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no known depth"):

@@ -106,7 +106,8 @@ def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
         notebook = saved(page, lab, name)
         wrong = errors(page, notebook)
         assert not wrong
-        widgets = sum(WIDGET in output.get("data", {}) for cell in notebook["cells"] for output in cell.get("outputs", []))
+        outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+        widgets = sum(WIDGET in output.get("data", {}) for output in outputs)
         shown = page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".jupyter-widgets"))
         assert shown.count() >= widgets, f"{shown.count()} widgets in the page, expected {widgets}"
         silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]

@@ -37,6 +37,9 @@ _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
 EQUALLY_GOOD = 1.0
 # Share of the points below which nothing of the pose was confirmed.
 _NOTHING_SEEN = 0.05
+# Similarity (above that of any two places) of what lies on each other; right and wrong answers alike have 0.06 and more,
+# views that share no side of the object 0.01.
+_NOTHING_ALIKE = 0.02
 
 
 @dataclass(frozen=True)
@@ -193,6 +196,8 @@ def _doubts(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[str, ...]:
         )
     if max(best.terms["f_seen"], best.terms["r_seen"]) < _NOTHING_SEEN:
         flags.append("no view confirms the pose: hardly a point falls on a surface that was seen")
+    if max(best.terms["f_sim"], best.terms["r_sim"]) < _NOTHING_ALIKE:
+        flags.append("no view confirms the pose: what falls on each other does not look alike")
     return tuple(flags)
 
 
