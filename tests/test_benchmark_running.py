@@ -1,5 +1,6 @@
 """A run's results: the same whoever computes them, in whatever order, however often it is killed."""
 
+import io
 import json
 import os
 import signal
@@ -25,7 +26,7 @@ from zsp_lite.benchmark.jobs import Job, frame_keys, records_of, run_job, split,
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, resolve
 from zsp_lite.benchmark.plan import Plan, duration, frames_at_once, size
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, plan_run, read_records, work_of_categories
-from zsp_lite.benchmark.storage import PartReader, RunFolder, part_writer
+from zsp_lite.benchmark.storage import PartReader, RunFolder, _append, part_writer
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
@@ -397,3 +398,12 @@ def test_groups_are_made_of_rows_and_rows_of_known_features():
     assert set(GROUPS["paper"]) | set(GROUPS["verified-views"]) <= set(GROUPS["all"])
     assert {METHODS[name].targets for name in GROUPS["verified-views"]} == {None, 1, 3, 10}
     assert run_module.GROUPS["default"] == ("ours", "ours-bv", "rootsift")
+
+
+def test_a_record_that_found_no_room_is_an_error_and_not_a_torn_line_for_the_next(tmp_path):
+    class Full(io.FileIO):
+        def write(self, data):
+            return super().write(data[: len(data) // 2])
+
+    with Full(tmp_path / "pairs.jsonl", "w") as file, pytest.raises(OSError, match="No space left"):
+        _append(file, {"key": "a"})

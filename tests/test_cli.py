@@ -12,7 +12,8 @@ from zsp_lite.backbones import BackboneChoice
 from zsp_lite.co3d import Co3D
 
 COMMANDS = (
-    "demo", "benchmark", "tables", "compare", "synth", "weights", "train", "train-baseline", "profile", "doctor",
+    "demo", "benchmark", "tables", "compare", "synth", "weights", "train", "train-baseline", "label", "data", "profile",
+    "doctor",
 )  # fmt: skip
 
 

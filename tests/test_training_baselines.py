@@ -1,6 +1,7 @@
 """The trainers of the small stand-ins: their pictures' poses are right, their losses do what the papers say."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -130,9 +131,16 @@ def test_both_trainers_write_what_the_loaders_read(folder):
     assert config["steps"] == 2 and config["categories"] == list(TRAINING)
 
 
-@pytest.mark.parametrize("name, load", [("swav-tiny", load_swav_tiny), ("posecontrast-tiny", load_posecontrast_tiny)])
-def test_a_shipped_stand_in_loads_and_has_seen_no_evaluation_category(name, load):
+@pytest.mark.parametrize(
+    "name, load, recipe",
+    [
+        ("swav-tiny", load_swav_tiny, SwavConfig()),
+        ("posecontrast-tiny", load_posecontrast_tiny, PoseContrastConfig()),
+    ],
+)
+def test_a_shipped_stand_in_loads_and_has_seen_no_evaluation_category(name, load, recipe):
     config = json.loads((WEIGHTS / f"{name}.json").read_text())
+    assert config == json.loads(json.dumps(asdict(recipe))) | {"categories": list(TRAINING)}
     assert config["categories"] and not set(config["categories"]) & set(EVALUATION)
     assert (WEIGHTS / f"{name}.safetensors").stat().st_size < 3e6
     log = [json.loads(line) for line in (WEIGHTS / f"{name}.jsonl").read_text().splitlines()]

@@ -9,6 +9,8 @@
 Lines are only ever appended, each in one write, so that a killed run leaves at most its last line incomplete.
 """
 
+import errno
+import io
 import json
 import os
 import platform
@@ -74,7 +76,7 @@ class RunFolder:
         """Keep a finished pair; False where all of its rows were known already."""
         if not self.wanted(record["key"], list(record["methods"])):
             return False
-        self._lines.write(json.dumps(record).encode() + b"\n")
+        _append(self._lines, record)
         merge(self.records.setdefault(record["key"], {}), record)
         return True
 
@@ -239,6 +241,13 @@ def _lock(path: Path):
     return file
 
 
+def _append(file: io.FileIO, record: Mapping[str, Any]) -> None:
+    """A line with one record; OSError where not all of it found room."""
+    line = json.dumps(record).encode() + b"\n"
+    if file.write(line) != len(line):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+
+
 @contextmanager
 def part_writer(path: Path) -> Iterator[Any]:
     """A function that appends a record to a worker's own file; it does nothing where that cannot be opened.
@@ -255,6 +264,6 @@ def part_writer(path: Path) -> Iterator[Any]:
             file.write(b"\n")  # closes what a killed predecessor left of a line
 
         def write(record: Mapping[str, Any]) -> None:
-            file.write(json.dumps(record).encode() + b"\n")
+            _append(file, record)
 
         yield write
