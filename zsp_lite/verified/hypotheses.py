@@ -37,8 +37,8 @@ _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
 EQUALLY_GOOD = 1.0
 # Share of the points below which nothing of the pose was confirmed.
 _NOTHING_SEEN = 0.05
-# Similarity (above that of any two places) of what lies on each other. Right and wrong answers alike have 0.06 and more;
-# where the views share no side of the object it is 0.01.
+# Similarity (above that of any two places) of what lies on each other. Right and wrong answers alike have 0.06 and
+# more; where the views share no side of the object it is 0.01.
 _NOTHING_ALIKE = 0.02
 
 
