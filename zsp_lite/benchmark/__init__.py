@@ -14,7 +14,7 @@ Several processes of one machine: `--workers 2`. A Dask cluster (extra `cluster`
 the same path for all, one thread per worker):
 
     dask scheduler                                            # says its address
-    dask worker HOST:8786 --nworkers 16 --nthreads 1          # on every machine
+    dask worker HOST:8786 --no-nanny --nthreads 1             # on every machine, once per core
     zsp-lite benchmark --executor dask://HOST:8786 ...
 
 MPI needs nothing of ours: mpi4py has an executor.
