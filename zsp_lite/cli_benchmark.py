@@ -62,7 +62,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from tqdm import tqdm
 
-    from zsp_lite.benchmark.formats import as_rich
+    from zsp_lite.benchmark.formats import print_tables
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate
     from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
@@ -94,8 +94,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     console.print(title, soft_wrap=True, highlight=False)
     tables = paper_tables(summary)
     shown = [all_rows(summary), *(tables if len(summary["methods"]) > 3 else [])]
-    for table in [*shown, by_category(summary, list(summary["methods"])[:_SHOWN])]:
-        console.print(as_rich(table))
+    print_tables([*shown, by_category(summary, list(summary["methods"])[:_SHOWN])])
     if cost := summary.get("cost"):
         console.print(
             f'Work: {cost["all_rows"]:.0f} s for all rows, {cost["ratio"]:.2f} times what "ours" alone would take '
@@ -143,7 +142,7 @@ def add_tables(commands) -> None:
     parser.add_argument("source", type=Path, help="a run's folder, or its results.json.gz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: where the run is")
     parser.add_argument(
-        "--rows", type=_names, metavar="ROW,...",
+        "--by-category", type=_names, metavar="ROW,...",
         help=f"rows of the table by category in the terminal (default: the first {_SHOWN}; files have all)",
     )  # fmt: skip
     parser.add_argument(
@@ -160,17 +159,14 @@ def _tables(arguments: argparse.Namespace) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from rich.console import Console
-
-    from zsp_lite.benchmark.formats import as_rich
+    from zsp_lite.benchmark.formats import print_tables
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
 
     results = write_reports(arguments.source, arguments.out)
-    summary, console = results.summary, Console()
-    rows = arguments.rows or list(summary["methods"])[:_SHOWN]
-    for table in [all_rows(summary), *paper_tables(summary), by_category(summary, rows)]:
-        console.print(as_rich(table))
+    summary = results.summary
+    rows = arguments.by_category or list(summary["methods"])[:_SHOWN]
+    print_tables([all_rows(summary), *paper_tables(summary), by_category(summary, rows)])
     return None
 
 
@@ -199,10 +195,8 @@ def add_compare(commands) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from rich.console import Console
-
     from zsp_lite.benchmark.compare import compare, comparison_table
-    from zsp_lite.benchmark.formats import as_rich, write_tables
+    from zsp_lite.benchmark.formats import print_tables, write_tables
     from zsp_lite.benchmark.results import read_results
 
     rows = None
@@ -213,7 +207,7 @@ def _compare(arguments: argparse.Namespace) -> None:
         rows = [(parts[0], parts[-1]) for parts in split]
     found = compare(read_results(arguments.first), read_results(arguments.second), rows)
     table = comparison_table(found, str(arguments.first), str(arguments.second))
-    Console().print(as_rich(table))
+    print_tables([table])
     if arguments.out:
         write_tables([table], arguments.out)
 

@@ -64,7 +64,7 @@ def comparison_table(differences: list[Difference], first: str, second: str) -> 
     """For people to read; `first` and `second` name the runs."""
     columns = [Column("pairs"), Column("A", "Acc30 (%)"), Column("B", "Acc30 (%)"), Column("B - A", "Acc30 (%)"),
                Column("p", "Acc30 (%)"), Column("A", "error (°)"), Column("B", "error (°)"),
-               Column("mean drop", "error (°)"), Column("p", "error (°)")]  # fmt: skip
+               Column("B less by, mean", "error (°)"), Column("p", "error (°)")]  # fmt: skip
     rows = []
     for one in differences:
         cells = [Cell(one.n, decimals=0), *map(Cell, one.acc30), Cell(one.accuracy_gain),
@@ -73,7 +73,8 @@ def comparison_table(differences: list[Difference], first: str, second: str) -> 
         label = one.first if one.first == one.second else f"{one.first}:{one.second}"
         rows.append((label, tuple(cells)))
     note = (
-        "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians, "
-        "and a permutation test of the mean difference. Of twenty rows that do not differ, one has p < 0.05 by chance."
+        "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians over "
+        "all pairs, and a permutation test of the mean difference. Of twenty rows that do not differ, one has p < 0.05 "
+        "by chance."
     )
     return Table("compare", f"A = {first}, B = {second}", tuple(columns), tuple(rows), note)

@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table as RichTable
 
 from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, Cell, Table
@@ -30,12 +31,22 @@ def as_rich(table: Table) -> RichTable:
     made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
     for column in table.columns:
         group = column.group.removeprefix(THIS_RUN).removeprefix(": ")
-        title = column.title.replace(" (", "\n(")
+        title = column.title.replace(" (", "\n(").replace(" Acc30", "\nAcc30")
+        group = group.replace(" on ", "\non ").replace(" (", "\n(")
         style = "dim" if column.group == OTHER_DATA else None
         made.add_column(f"{group}\n{title}" if group else title, justify="right", style=style, header_style=style)
     for label, cells in table.rows:
         made.add_row(label, *(_text(cell).replace(" [", "\n[") for cell in cells))
     return made
+
+
+def print_tables(tables: Iterable[Table]) -> None:
+    """To the terminal; what is wider than it goes on in the next line, and no figure is cut."""
+    console = Console()
+    for table in tables:
+        made = as_rich(table)
+        needed = console.measure(made, options=console.options.update(max_width=1000)).maximum
+        Console(width=max(console.width, needed)).print(made)
 
 
 def as_csv(table: Table) -> str:

@@ -15,8 +15,8 @@ from zsp_lite.errors import InputError
 THIS_RUN = "this run"
 OTHER_DATA = "published on CO3D (other data)"
 NOTE = (
-    "Intervals: 95 %, bootstrap over pairs. Published figures are the paper's, on CO3D with DINO ViT-S/8: other data, "
-    "and another backbone unless the run says otherwise."
+    "Med. err.: mean of the categories' medians. Intervals: 95 %, bootstrap over pairs. Published figures are the "
+    "paper's, on CO3D with DINO ViT-S/8: other data, and another backbone unless the run says otherwise."
 )
 _TITLES = {"med": "Med. err. (°)", "acc30": "Acc30 (%)", "acc15": "Acc15 (%)"}
 _FEATURED = {
@@ -136,7 +136,10 @@ def all_rows(summary: Mapping[str, Any]) -> Table:
                  Cell(row["flagged"], decimals=0), Cell(row["failed"], decimals=0),
                  None if test is None else Cell(test["accuracy_p"], decimals=3)]  # fmt: skip
         rows.append((name, tuple(cells)))
-    note = 'p: sign test of Acc30 against "ours" on the same pairs. Intervals: 95 %, bootstrap over pairs.'
+    note = (
+        "Med. err.: mean of the categories' medians. flagged: the method itself warned; its answer counts as it is. "
+        'p: sign test of Acc30 against "ours" on the same pairs. Intervals: 95 %, bootstrap over pairs.'
+    )
     return Table("all_rows", "All rows", tuple(map(Column, columns)), tuple(rows), note)
 
 
