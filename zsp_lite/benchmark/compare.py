@@ -73,8 +73,8 @@ def comparison_table(differences: list[Difference], first: str, second: str) -> 
         label = one.first if one.first == one.second else f"{one.first}:{one.second}"
         rows.append((label, tuple(cells)))
     note = (
-        "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians over "
-        "all pairs, and a permutation test of the mean difference. Of twenty rows that do not differ, one has p < 0.05 "
-        "by chance."
+        "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians "
+        "over all pairs, and a permutation test of the mean difference. Of twenty rows that do not differ, one has "
+        "p < 0.05 by chance."
     )
     return Table("compare", f"A = {first}, B = {second}", tuple(columns), tuple(rows), note)
