@@ -214,14 +214,16 @@ def test_a_killed_run_resumes_to_the_same_weights_and_log(tmp_path):
     assert {"held_out_accuracy", "held_out_view_accuracy", "held_out_iou"} <= rows[-1].keys()
     grid = load_backbone(whole, "cpu")([np.zeros((40, 40, 3), np.uint8)])[0].grid
     assert grid == (28, 28)
-    with pytest.raises(InputError, match="another shape"):
-        distil(config, replace(SHAPE, depth=3), tmp_path / "killed", log=lambda line: None, **options)
+    for other in (dict(depth=3), dict(num_heads=4), dict(objects=9), dict(seed=1)):
+        with pytest.raises(InputError, match="another configuration"):
+            distil(config, replace(SHAPE, **other), tmp_path / "killed", log=lambda line: None, **options)
 
 
 def test_both_trainers_are_measured_alike(tmp_path):
     """A trainee's own backbone, put in another trainee's place, is the same one to `held_out_accuracy`."""
     training, held_out = training_and_held_out(tmp_path, SHAPE.objects)
-    assert (len(training), len(held_out)) == (7, 1)
+    assert (len(training), len(held_out)) == (8, 1)
+    assert not any(np.array_equal(held_out.rgb[0], pictures) for pictures in training.rgb)
     model = Trainee(SHAPE)
     initialise(model, training, 0)
     model.key_mean.copy_(as_trainee(model.backbone, SHAPE, training).key_mean)
@@ -236,6 +238,9 @@ def test_bad_settings_and_foreign_checkpoints_are_refused_in_one_line(backbone, 
             replace(TINY, **changes)
     run = Distillation(TINY, backbone)
     run.save(tmp_path / "run.pt")
+    wider = VisionTransformer(32, 8, 2 * backbone.embed_dim, backbone.depth, backbone.num_heads)
+    with pytest.raises(InputError, match="another shape"):
+        Distillation(TINY, wider).restore(tmp_path / "run.pt")
     with pytest.raises(InputError, match="another configuration"):
         Distillation(replace(TINY, images=7), backbone).restore(tmp_path / "run.pt")
     (tmp_path / "run.pt").write_bytes(b"cut off")

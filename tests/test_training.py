@@ -1,7 +1,8 @@
-"""The trainer: renders of one object at a time, three objectives, exact export, resumption."""
+"""The trainer: renders of one build at a time, four objectives, exact export, resumption."""
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,14 +10,24 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
 
+from zsp_lite import cli
 from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, load_backbone
 from zsp_lite.errors import InputError
+from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_sibling
-from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.training.batches import MEAN, STD, sample_batch
+from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
+from zsp_lite.training.batches import MEAN, STD, _crop_grids, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet, load_render_set, render_object, render_set
-from zsp_lite.training.train import Stage, Trainee, TrainingConfig, export_checkpoint, initialise, train
+from zsp_lite.training.train import (
+    CONTINUATION,
+    Stage,
+    Trainee,
+    TrainingConfig,
+    export_checkpoint,
+    initialise,
+    train,
+)
 
 TINY = TrainingConfig(
     objects=4, embed_dim=24, depth=2, num_heads=2, key_block=0,
@@ -75,7 +86,7 @@ def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
 
 
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
-    """A patch's surface point must be one that the uncropped view shows, and flips turn whole objects."""
+    """A patch's surface point must be one that the uncropped view shows."""
     batch = sample_batch(renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2]))
     crops = 3 * VIEWS
     assert batch.images.shape == (crops, 3, 96, 96) and batch.surface.shape == (crops, 144, 3)
@@ -86,6 +97,22 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
         assert {tuple(point) for point in points} <= known
     covered = batch.coverage > 0.99
     assert not batch.surface[..., 0].isnan()[covered].any()
+
+
+def test_normals_turn_and_flip_with_the_crop(renders):
+    grid, turn = _crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
+    batch = sample_batch(renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
+    assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
+    for crop in range(3 * VIEWS):
+        right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
+        axes = torch.stack([right / right.norm(), down / down.norm()])  # of the crop, in the uncropped view
+        torch.testing.assert_close(turn[crop], axes, atol=0.15, rtol=0)  # a crop that is not square leans a little
+        on_object = ~batch.surface[crop, :, 0].isnan()
+        before = batch.geometry[crop, on_object, :3].clone()
+        before[:, :2] = before[:, :2] @ turn[crop]
+        view = renders.geometry[crop // VIEWS, crop % VIEWS].reshape(-1, 4)[:, :3].astype(np.float32)
+        nearest = torch.cdist(before, torch.from_numpy(view)).amin(1)
+        assert nearest.max() < 1e-3
 
 
 def test_perfect_descriptors_match_and_random_ones_do_not(renders):
@@ -113,37 +140,73 @@ def test_no_object_is_compared_with_another(renders):
     torch.testing.assert_close(both, torch.stack(alone).mean())
 
 
+def view_loss_of(keys, on_object, objects, temperature, queries=10**6):
+    return view_loss(keys, on_object, objects, temperature, queries, torch.Generator().manual_seed(0))
+
+
 def test_the_view_loss_asks_for_the_partner_and_takes_the_opposite_side_for_wrong():
-    """Two objects x 8 views; a pair shares its patches' descriptors, the others have their own."""
-    sides = F.normalize(torch.randn(2, 4, 9, 32, generator=torch.Generator().manual_seed(0)), dim=-1)
+    """Two objects x 8 views; a pair shares its patches' keys, the others have their own."""
+    sides = torch.randn(2, 4, 3, 3, 32, generator=torch.Generator().manual_seed(0))
     on_object = torch.ones(16, 9, dtype=torch.bool)
-    right, hits = view_loss(sides.repeat_interleave(2, 1).flatten(0, 1), on_object, 2, 0.03)
+    right, hits = view_loss_of(sides.repeat_interleave(2, 1).flatten(0, 1), on_object, 2, 0.03)
     assert right < 1e-3 and hits == 1
     # View 2k looks like view 2k + 5 of the opposite side: the partner never wins.
-    wrong, hits = view_loss(sides[:, [0, 2, 1, 3, 2, 0, 3, 1]].flatten(0, 1), on_object, 2, 0.03)
+    wrong, hits = view_loss_of(sides[:, [0, 2, 1, 3, 2, 0, 3, 1]].flatten(0, 1), on_object, 2, 0.03)
     assert wrong > 5 and hits == 0
 
 
-def test_the_view_loss_sees_the_object_only():
-    z = F.normalize(torch.randn(8, 9, 16, generator=torch.Generator().manual_seed(1)), dim=-1)
-    on_object = torch.zeros(8, 9, dtype=torch.bool)
-    on_object[:, :5] = True
-    background = torch.where(on_object[..., None], z, z.flip(0))
-    torch.testing.assert_close(view_loss(z, on_object, 1, 0.1)[0], view_loss(background, on_object, 1, 0.1)[0])
-    highest = (z[0, :5] @ z[1, :5].T).amax(1).mean(), (z[1, :5] @ z[0, :5].T).amax(1).mean()
-    alone = view_loss(z[:2], on_object[:2], 1, 0.1)  # one partner, nothing to confuse it with
-    assert alone[0] == 0 and alone[1] == 1 and all(value <= 1 for value in highest)
+def test_the_view_loss_scores_by_the_methods_similarity_on_the_object():
+    generator = torch.Generator().manual_seed(1)
+    keys = torch.randn(8, 7, 6, 16, generator=generator)
+    on_object = torch.rand(8, 42, generator=generator) < 0.4
+    on_object[5] = False  # this side shows no patch of the object
+    score = torch.full((8, 8), -1.0)
+    for a in range(8):
+        for b, product in enumerate(similarities(keys[a], list(keys))):
+            if b != 5 and a != 5:
+                score[a, b] = product[on_object[a]][:, on_object[b]].amax(1).mean()
+    logits = ((score + score.T) / 2 / 0.1).fill_diagonal_(-1e4)
+    logits[:, 5] = -1e4
+    partner = torch.arange(8) ^ 1
+    rest = (torch.arange(8) != 5) & (partner != 5)  # view 4 is not asked for a partner that shows nothing
+    loss, hits = view_loss_of(keys, on_object, 1, 0.1)
+    torch.testing.assert_close(loss, F.cross_entropy(logits[rest], partner[rest]))
+    assert hits == pytest.approx(float((logits.argmax(1) == partner)[rest].float().mean()))
+    assert view_loss_of(keys, torch.zeros_like(on_object), 1, 0.1) == (0, 0)
+
+
+def test_the_view_loss_averages_over_as_many_patches_as_it_is_told():
+    keys = torch.randn(8, 6, 6, 16, generator=torch.Generator().manual_seed(2))
+    on_object = torch.ones(8, 36, dtype=torch.bool)
+    whole = view_loss_of(keys, on_object, 1, 0.1)[0]
+    assert view_loss_of(keys, on_object, 1, 0.1, queries=36)[0] == pytest.approx(float(whole), rel=1e-6)
+    assert view_loss_of(keys, on_object, 1, 0.1, queries=5)[0] != pytest.approx(float(whole), rel=1e-3)
+
+
+def test_losses_of_crops_without_an_object_are_zero_not_nan():
+    generator, nothing = torch.Generator().manual_seed(0), torch.zeros(8, 9, dtype=torch.bool)
+    keys, nowhere = torch.randn(8, 3, 3, 4, requires_grad=True), torch.full((8, 9, 3), torch.nan)
+    found = [
+        view_loss_of(keys, nothing, 1, 0.1),
+        correspondence_loss(keys.flatten(1, 2), nowhere, 1, 0.15, 0.1, 9, generator),
+        attention_loss(keys.flatten(1, 2)[:, None, :, 0], torch.zeros(8, 8)),
+    ]
+    for loss, share in found:
+        assert loss == 0 and share == 0
+        loss.backward()
+    assert keys.grad.isfinite().all()
 
 
 def test_siblings_keep_the_build_and_change_the_proportions():
     """Vertex i of a sibling is the same place of the same part, so that correspondence is known."""
-    for generator in TRAINING.values():
-        first = make_shape(generator, 5)
-        other = make_sibling(generator, 5, np.random.default_rng(1))
+    builds = [(generator, 5) for generator in TRAINING.values()] + [(random_assembly, seed) for seed in range(30)]
+    for generator, seed in builds:
+        first = make_shape(generator, seed)
+        other = make_sibling(generator, seed, np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
         np.testing.assert_array_equal(first.part, other.part)
         assert np.abs(first.vertices - other.vertices).max() > 0.02
-    same = make_sibling(generator, 5, np.random.default_rng(1), amount=0.0)
+    same = make_sibling(generator, seed, np.random.default_rng(1), amount=0.0)
     np.testing.assert_allclose(same.vertices, first.vertices)
 
 
@@ -180,6 +243,12 @@ def test_the_exported_checkpoint_sees_the_same_with_imagenet_statistics(renders,
         theirs = exported.extract((image - mean) / std, 0)
     difference = ours.keys - theirs.keys
     assert (difference - difference.mean((0, 1))).abs().max() < 0.02  # float16 weights
+    seen = torch.from_numpy(renders.rgb[:, ::3].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2) / 255
+    seen = F.interpolate(seen, (224, 224), mode="bilinear")
+    with torch.no_grad():
+        before, after = (m.extract(x, 0).keys.mean((0, 1)).norm() for m, x in
+                         ((model.backbone, (seen - MEAN) / STD), (exported, (seen - mean) / std)))  # fmt: skip
+    assert after < 0.02 < 0.2 < before
     torch.testing.assert_close(ours.cls, theirs.cls, atol=0.05, rtol=0.02)
     torch.testing.assert_close(ours.attention, theirs.attention, atol=1e-3, rtol=0.05)
 
@@ -199,9 +268,12 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
     resumed = train(TINY, tmp_path / "killed", folder, log=lambda line: None, **options)
     expected, got = load_file(whole), load_file(resumed)
     assert all(torch.equal(expected[name], got[name]) for name in expected | got)
+    logs = []
     for run in ("whole", "killed"):
         rows = [json.loads(line) for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
         assert [row["step"] for row in rows] == [1, 2, 3, 4]
+        logs.append([{name: value for name, value in row.items() if name != "seconds"} for row in rows])
+    assert logs[0] == logs[1]
     assert "held_out_accuracy" in rows[-1] and np.isfinite(rows[-1]["loss"])
 
 
@@ -214,9 +286,13 @@ def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
     before = torch.load(tmp_path / "first" / "checkpoint.pt", **load)["average"]
     after = torch.load(tmp_path / "second" / "checkpoint.pt", **load)["model"]
     torch.testing.assert_close(after["backbone.pos_embed"], before["backbone.pos_embed"])
-    with pytest.raises(InputError, match="of another configuration"):
+    with pytest.raises(InputError, match="of another shape, expected one of 2 blocks, 32 wide"):
         wider = replace(TINY, embed_dim=32)
         train(wider, tmp_path / "third", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
+    with pytest.raises(InputError, match="no such file"):
+        train(TINY, tmp_path / "fourth", folder, start_from=tmp_path / "lost.pt", **quiet)
+    (tmp_path / "first" / "checkpoint.pt").unlink()  # no longer needed
+    train(still, tmp_path / "second", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
 
 
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):
@@ -225,12 +301,47 @@ def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_pat
         train(TINY, tmp_path, folder, log=lambda line: None)
 
 
-def test_a_damaged_run_and_a_single_object_are_refused_in_one_line(folder, renders, tmp_path):
-    with pytest.raises(InputError, match="expected at least 2"):
-        train(replace(TINY, objects=1), tmp_path, folder, log=lambda line: None)
+def test_a_run_that_diverges_says_so(folder, renders, tmp_path):
+    with pytest.raises(InputError, match="step 2 has gradients of size nan; expected a lower learning rate"):
+        train(replace(TINY, learning_rate=float("inf")), tmp_path, folder, log=lambda line: None)
+
+
+def test_shards_that_are_damaged_or_of_another_renderer_are_refused(tmp_path):
+    path = tmp_path / "shard.npz"
+    path.write_bytes(b"cut off")
+    with pytest.raises(InputError, match="shard.npz are damaged or something else"):
+        load_render_set([path])
+    np.savez(path, rgb=np.zeros((1, 6, 9, 9, 3)), surface=np.zeros((1, 6, 3, 3, 3)), geometry=np.zeros((1, 6, 3, 3, 4)))
+    with pytest.raises(InputError, match="rgb has shape .1, 6, 9, 9, 3., expected .1, 8, 192, 192, 3.; remove it"):
+        load_render_set([path])
+
+
+def test_a_damaged_run_and_no_objects_are_refused_in_one_line(folder, renders, tmp_path):
+    with pytest.raises(InputError, match="expected at least 1"):
+        train(replace(TINY, objects=0), tmp_path, folder, log=lambda line: None)
     (tmp_path / "checkpoint.pt").write_bytes(b"cut off")
     with pytest.raises(InputError, match="checkpoint.pt: damaged"):
         train(TINY, tmp_path, folder, log=lambda line: None)
     (tmp_path / "config.json").write_text('{"seed": ')
     with pytest.raises(InputError, match="config.json are not valid JSON"):
         train(TINY, tmp_path, folder, log=lambda line: None)
+
+
+def test_the_command_trains_goes_on_and_distils(tmp_path, capsys):
+    """Each stage of the real recipes once, on four objects."""
+    renders = tmp_path / "renders"
+    common = ["--objects", "4", "--shorten", "0.0001", "--renders", str(renders)]
+
+    def run(name, *options):
+        cli.main(["train", "--out", str(tmp_path / name), *common, *options])
+        rows = [json.loads(line) for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
+        weights = capsys.readouterr().out.rpartition("Written: ")[2].strip()
+        assert load_backbone(weights, "cpu").name == Path(weights).stem
+        return rows[-1], Path(weights).name
+
+    first, name = run("first")
+    assert name == "zsp-tiny.safetensors" and first["step"] == len(TrainingConfig().stages) and "view" not in first
+    second, _ = run("second", "--start-from", str(tmp_path / "first" / "checkpoint.pt"))
+    assert second["step"] == len(CONTINUATION.stages) and second["view"] > 0
+    third, name = run("third", "--self-distillation")
+    assert name == "dino-tiny.safetensors" and third["teacher_entropy"] > 0

@@ -1,8 +1,12 @@
-"""Files on disk: atomic writes, and paths that must stay inside a folder."""
+"""Files on disk: atomic writes, reads that say what is wrong, and paths that must stay inside a folder."""
 
 import os
 import secrets
+import zipfile
+import zlib
 from pathlib import Path
+
+import numpy as np
 
 from zsp_lite.errors import InputError
 
@@ -31,6 +35,15 @@ def read_bytes(path: str | Path, what: str) -> bytes:
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"{what} {path} cannot be read: {reason.lower()}") from error
+
+
+def read_arrays(path: str | Path, names: tuple[str, ...], what: str) -> list[np.ndarray]:
+    """The arrays `names` of an .npz file; InputError naming `what` it should be where it is not, or is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return [file[name] for name in names]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{what} {path} are damaged or something else: {error}; remove it to make it anew") from error
 
 
 def path_inside(root: str | Path, relative: str) -> Path:

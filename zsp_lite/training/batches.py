@@ -27,7 +27,10 @@ class Batch:
 
 
 def _crop_grids(rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]):
-    """Sampling grids (n, side, side, 2) of random, slightly turned crops, and the flips (n,), one per object."""
+    """Sampling grids (n, side, side, 2) of random, slightly turned crops, and how directions turn with them (n, 2, 2).
+
+    All crops of an object are mirrored, or none.
+    """
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
     width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
@@ -40,7 +43,8 @@ def _crop_grids(rng: np.random.Generator, n: int, per_object: int, side: int, sc
         np.stack([height * s * flip, height * c, y], 1),
     ], 1).astype(np.float32)  # fmt: skip
     grid = F.affine_grid(torch.from_numpy(affine), (n, 1, side, side), align_corners=False)
-    return grid, torch.from_numpy(flip.astype(np.float32))
+    turn = np.stack([np.stack([flip * c, flip * s], 1), np.stack([-s, c], 1)], 1).astype(np.float32)
+    return grid, torch.from_numpy(turn)
 
 
 def _recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
@@ -67,18 +71,19 @@ def sample_batch(
 ) -> Batch:  # fmt: skip
     """Draw a batch of square crops of `side` pixels whose width is a fraction `scale` (low, high) of the render's.
 
-    views is 8, all of them, or 2, a pair from one side of the object. `members` fixes the objects by index.
+    views is 8, all of them, 4, two pairs a quarter turn apart, or 2, a pair from one side. `members` fixes the
+    objects by index.
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
-    if views == 2:
-        chosen = 2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(2)
+    if views < VIEWS:
+        chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
     pick = (index[:, None], chosen)
     rgb = torch.from_numpy(renders.rgb[pick].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2).float() / 255
     maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
             for m in (renders.surface, renders.geometry)]  # fmt: skip
     n, patches = objects * views, side // patch_size
-    grid, flip = _crop_grids(rng, n, views, side, scale)
+    grid, turn = _crop_grids(rng, n, views, side, scale)
     images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
 
     def at(resolution):
@@ -94,5 +99,5 @@ def sample_batch(
     surface = sample(surface.nan_to_num(nan=-99.0), centres).flatten(2).transpose(1, 2)
     surface[surface < -50] = float("nan")
     geometry = sample(geometry, centres).flatten(2).transpose(1, 2)
-    geometry[..., 0] *= flip[:, None]
+    geometry[..., :2] = geometry[..., :2] @ turn.transpose(1, 2)
     return Batch(_recolour(rng, images), surface, geometry, coverage, objects)

@@ -22,6 +22,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from zsp_lite.errors import InputError
+from zsp_lite.files import write_atomic
 from zsp_lite.training.batches import _crop_grids as crop_grids
 from zsp_lite.training.batches import _recolour as recolour
 from zsp_lite.training.batches import sample_batch
@@ -30,6 +31,7 @@ from zsp_lite.training.train import (
     Trainee,
     TrainingConfig,
     _log_until,
+    claim_folder,
     export_checkpoint,
     held_out_accuracy,
     initialise,
@@ -249,7 +251,7 @@ def as_trainee(backbone: VisionTransformer, shape: TrainingConfig, renders: Rend
     trainee.backbone = backbone
     crops = sample_batch(renders, np.random.default_rng(7), min(6, len(renders)), VIEWS, side, (0.85, 1.0)).images
     with torch.no_grad():
-        trainee.descriptors(trainee(crops.to(device)).keys, update_mean=True)
+        trainee.centred(trainee(crops.to(device)).keys, update_mean=True)
     return trainee
 
 
@@ -261,13 +263,14 @@ def distil(
     """Run DINO from random weights, or resume from `folder`/checkpoint.pt, and export `folder`/dino-tiny.safetensors.
 
     Of `shape` the backbone's size and key block, the number of objects and their seed count. folder receives
-    log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line before, and in every
-    tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees. `renders` is where the
-    training set is kept or made (default `folder`/renders); `progress` wraps the rendering of its shards.
+    config.json and log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line before,
+    and in every tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees. `renders` is
+    where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of its shards.
     Raises InputError where `folder` holds a run of another configuration or a damaged one.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "key_block")}
+    claim_folder(folder, dict(asdict(config), objects=shape.objects, pictures_seed=shape.seed, network=network))
     training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, progress)
     start = Trainee(shape)
     initialise(start, training, shape.seed)
@@ -275,9 +278,9 @@ def distil(
     if (checkpoint := folder / "checkpoint.pt").exists():
         run.restore(checkpoint)
     earlier = _log_until(folder / "log.jsonl", run.steps_done)
+    write_atomic(folder / "log.jsonl", "".join(earlier).encode())
     rows: list[dict[str, float]] = []
-    with (folder / "log.jsonl").open("w") as log_file:
-        log_file.writelines(earlier)
+    with (folder / "log.jsonl").open("a") as log_file:
         while run.steps_done < config.steps:
             rows.append(run.step(training.rgb))
             step = run.steps_done

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.errors import InputError
+from zsp_lite.files import read_arrays
 from zsp_lite.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import make_shape
@@ -78,8 +79,7 @@ def object_crops(
         paths = list(progress(pool.map(partial(_shard, count=shard, folder=folder, seed=seed), starts), len(starts)))
     columns = []
     for path in paths:
-        with np.load(path) as file:
-            columns.append([file[name] for name in ("rgb", "aspect", "rotation")])
+        columns.append(read_arrays(path, ("rgb", "aspect", "rotation"), "crops"))
     return ObjectCrops(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 

@@ -1,13 +1,15 @@
 """What the backbone is asked for: correspondence on one surface, geometry per patch, attention on the object.
 
-All three use only what a renderer, or structure from motion, knows about ONE object at a time. No loss compares two
-objects; none sees a category or a pose.
+All four use what a renderer knows about the views of ONE build, whose proportions differ from view to view: which
+places correspond, and which views look from the same side. No loss compares two builds, none sees a category's name.
 """
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from zsp_lite.features import log_bin
 
 
 def correspondence_loss(
@@ -16,9 +18,10 @@ def correspondence_loss(
 ) -> tuple[Tensor, float]:  # fmt: skip
     """InfoNCE between the views of each object, with soft targets by distance on its surface.
 
-    A query patch must find, among the patches of the object's other views, those within about `radius` (object
-    units) of its own surface point. Descriptors are unit vectors. Returns the loss, as the divergence from the soft
-    target so that 0 is perfect, and the share of queries whose nearest descriptor is a true neighbour.
+    A query patch must find, among the patches of the object's other views, those near its own surface point: the
+    target falls with distance as a Gaussian of standard deviation `radius` (object units), up to 2.4 of these, and
+    is 0 beyond. Descriptors are unit vectors. Returns the loss, as the divergence from the soft target so that 0 is
+    perfect, and the share of queries whose nearest descriptor lies where the target is not 0.
     """
     crops, n, dim = descriptors.shape
     views = crops // objects
@@ -50,28 +53,42 @@ def correspondence_loss(
 
 
 def view_loss(
-    descriptors: Float[Tensor, "crops n dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float
-) -> tuple[Tensor, float]:
+    keys: Float[Tensor, "crops h w dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float,
+    queries: int, generator: torch.Generator, log_binned: bool = True,
+) -> tuple[Tensor, float]:  # fmt: skip
     """Which of the object's other views looks from the same side? Cross-entropy over the best-view score.
 
     Views come in pairs (2k, 2k + 1). The score of two views is what the method chooses the best view by, in a form
-    with gradients: the mean over one view's object patches of the highest similarity in the other. Opposite sides,
-    front and back, are among the wrong answers. Returns the loss and the share of views whose partner scores highest.
+    with gradients: the mean over one view's object patches, at most `queries` of them, of the highest similarity of
+    their log-binned descriptors (or bare keys) in the other. Opposite sides, front and back, are among the wrong
+    answers. Returns the loss and the share of views whose partner scores highest.
     """
-    crops, n, dim = descriptors.shape
+    crops = len(keys)
     views = crops // objects
-    z, on = descriptors.reshape(objects, views * n, dim), on_object.reshape(objects, views, n)
-    product = (z @ z.transpose(1, 2)).view(objects, views, n, views, n)
-    highest = product.masked_fill(~on[:, None, None], -1).amax(-1)  # (objects, views, n, views)
-    score = (highest * on[..., None]).sum(2) / on.sum(2).clamp_min(1)[..., None]
-    score = (score + score.transpose(1, 2)) / 2
-    itself = torch.eye(views, dtype=torch.bool, device=z.device)
-    logits = (score / temperature).masked_fill(itself, -1e4).flatten(0, 1)
-    partner = (torch.arange(views, device=z.device) ^ 1).repeat(objects)
-    seen = (on.sum(2) > 3).flatten()
-    loss = F.cross_entropy(logits[seen], partner[seen]) if seen.any() else descriptors.sum() * 0
-    hits = (logits.argmax(1) == partner)[seen].float().mean().item() if seen.any() else 0.0
-    return loss, hits
+    partner = torch.arange(views, device=keys.device) ^ 1
+    scores = []
+    for k in range(objects):
+        part = slice(k * views, (k + 1) * views)
+        on = on_object[part]
+        described = log_bin(keys[part]) if log_binned else keys[part]
+        z = F.normalize(described.flatten(1, 2)[on], dim=1)
+        counts = on.sum(1).tolist()
+        chosen = [torch.randperm(n, generator=generator)[:queries] for n in counts]
+        starts = [sum(counts[:v]) for v in range(views)]
+        query = torch.cat([rows + start for rows, start in zip(chosen, starts, strict=True)]).to(z.device)
+        similar = (z[query] @ z.T).split(counts, 1)
+        highest = torch.stack([s.amax(1) if s.shape[1] else s.new_full(s.shape[:1], -1.0) for s in similar], 1)
+        taken = highest.split([len(rows) for rows in chosen])
+        score = torch.stack([rows.mean(0) if len(rows) else rows.new_full((views,), -1.0) for rows in taken])
+        scores.append((score + score.T) / 2)
+    seen = on_object.view(objects, views, -1).sum(2) > 3
+    out_of_question = torch.eye(views, dtype=torch.bool, device=keys.device) | ~seen[:, None]
+    asked = seen & seen[:, partner]
+    if not asked.any():
+        return keys.sum() * 0, 0.0
+    logits = (torch.stack(scores) / temperature).masked_fill(out_of_question, -1e4)[asked]
+    answer = partner.expand(objects, -1)[asked]
+    return F.cross_entropy(logits, answer), (logits.argmax(1) == answer).float().mean().item()
 
 
 def geometry_loss(
@@ -98,6 +115,8 @@ def attention_loss(
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
     visible = coverage.sum(1) > 2
+    if not visible.any():
+        return cls_logits.sum() * 0, 0.0
     attention, coverage = attention[visible].clamp_min(1e-8), coverage[visible]
     target = coverage / coverage.sum(1, keepdim=True)
     spread = F.kl_div(attention.log(), target, reduction="batchmean")

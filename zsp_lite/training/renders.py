@@ -1,4 +1,4 @@
-"""The training set: several views of one object at a time, with what a renderer knows about each."""
+"""The training set: several views of one build at a time, with what a renderer knows about each."""
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.errors import InputError
+from zsp_lite.files import read_arrays
 from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_sibling
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
@@ -17,14 +19,15 @@ VIEWS = 8
 SIZE = 192
 GRID = 48
 SHARD = 200
+HELD_OUT = 9_000_000  # the number of the first object that is never trained on
 
 
 @dataclass(frozen=True)
 class RenderSet:
-    """Views of n objects.
+    """Views of n builds.
 
-    `surface` holds the object coordinates of every fourth pixel, NaN on the background: two views of ONE object
-    correspond where these agree. They are never compared between objects. `geometry` holds the normal in the camera
+    `surface` holds the object coordinates of every fourth pixel, NaN on the background: two views of ONE build
+    correspond where these agree. They are never compared between builds. `geometry` holds the normal in the camera
     frame and the depth, standardised over the object's pixels of that view.
     """
 
@@ -36,14 +39,16 @@ class RenderSet:
         return len(self.rgb)
 
 
-def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one training object; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
+def render_object(
+    seed: int, generators=None, proportions: float = 0.3, deformation: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render one build; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
 
-    Half of the objects come from the named training categories, half are random assemblies. Views come in four pairs,
+    Half of the builds come from the named training categories, half are random assemblies. Views come in four pairs,
     a quarter turn apart: the two of a pair look from nearly the same side, and every side's opposite is there too.
-    Every view shows a copy with other proportions (`make_sibling`), gently deformed, now and then without one of its
-    parts, under its own materials, light and room, so that only what all views share, the object's build, can tell
-    one place from another.
+    Every view shows a copy with other proportions (`make_sibling`, by that amount), gently deformed (`deform`), now and
+    then without one of its parts, under its own materials, light and room, so that only what all views share, the
+    object's build, can tell one place from another.
     """
     rng = np.random.default_rng([seed, 0])
     generators = list(TRAINING.values()) if generators is None else generators
@@ -58,7 +63,7 @@ def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, n
         if view % 2 == 0:
             azimuth = start + (view // 2) * np.pi / 2 + rng.normal(0, 0.2)
             elevation = rng.uniform(-0.05, 0.9)
-        scene = _altered(shape, make_sibling(generator, [seed, 1], rng), rng)
+        scene = _altered(shape, make_sibling(generator, [seed, 1], rng, proportions), rng, deformation)
         R, t = orbit_pose(
             azimuth + rng.normal(0, 0.2), np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
             rng.uniform(5, 10), scene.centre,
@@ -74,10 +79,11 @@ def render_object(seed: int, generators=None) -> tuple[np.ndarray, np.ndarray, n
     return rgb, surface, geometry
 
 
-def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator) -> Scene:
+def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation: float) -> Scene:
     """The scene of a deformed copy of `sibling` whose pixels keep the surface coordinates of `shape`."""
-    same_build = np.array_equal(shape.faces, sibling.faces)
-    vertices = deform(sibling if same_build else shape, rng)
+    if not np.array_equal(shape.faces, sibling.faces):
+        raise ValueError("a sibling has other parts than its object: its generator chose them by a proportion")
+    vertices = deform(sibling, rng, deformation)
     part = shape.part[shape.faces[:, 0]]
     size = np.bincount(part)
     gone = (rng.random(len(size)) < 0.06) & (size < 0.3 * len(part))
@@ -85,10 +91,11 @@ def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator) -> Scene:
     return Scene(replace(shape, faces=shape.faces[kept], material=shape.material[kept]), vertices)
 
 
-def _render_shard(first: int, count: int, folder: Path, seed: int) -> Path:
+def _render_shard(first: int, count: int, folder: Path, seed: int, proportions: float, deformation: float) -> Path:
     path = folder / f"objects-{seed}-{first:06d}-{first + count:06d}.npz"
     if not path.exists():
-        rows = [render_object(seed * 10_000_000 + first + i) for i in range(count)]
+        numbers = range(seed * 10_000_000 + first, seed * 10_000_000 + first + count)
+        rows = [render_object(number, None, proportions, deformation) for number in numbers]
         rgb, surface, geometry = (np.stack(column) for column in zip(*rows, strict=True))
         unfinished = path.with_suffix(".part.npz")
         np.savez(unfinished, rgb=rgb, surface=surface, geometry=geometry)
@@ -97,26 +104,34 @@ def _render_shard(first: int, count: int, folder: Path, seed: int) -> Path:
 
 
 def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, workers: int = 2,
-               progress=lambda iterable, total: iterable) -> list[Path]:  # fmt: skip
-    """Render `objects` objects (rounded up to whole shards) into `folder`, or reuse what is there.
+               progress=lambda iterable, total: iterable, first: int = 0, proportions: float = 0.3,
+               deformation: float = 1.0) -> list[Path]:  # fmt: skip
+    """Render `objects` objects (rounded up to whole shards), from number `first` on, into `folder`, or reuse them.
 
     Returns the shard paths; a killed run continues with the first missing shard. About 1.1 MB per object.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    starts = range(0, objects, shard)
+    starts = range(first, first + objects, shard)
     with ProcessPoolExecutor(workers) as pool:
-        paths = pool.map(partial(_render_shard, count=shard, folder=folder, seed=seed), starts)
+        how = dict(count=shard, folder=folder, seed=seed, proportions=proportions, deformation=deformation)
+        paths = pool.map(partial(_render_shard, **how), starts)
         return list(progress(paths, len(starts)))
 
 
 def load_render_set(paths: list[Path]) -> RenderSet:
-    """Read shards into memory, one at a time: joining them afterwards would need all of it twice."""
+    """Read shards into memory, one at a time: joining them afterwards would need all of it twice.
+
+    Raises InputError where a file is no shard, or one of another renderer.
+    """
     joined: list[np.ndarray] = []
     for index, path in enumerate(paths):
-        with np.load(path) as file:
-            shard = [file[name] for name in ("rgb", "surface", "geometry")]
+        shard = read_arrays(path, ("rgb", "surface", "geometry"), "training renders")
         count = len(shard[0])  # all shards have as many objects
+        expected = (count, VIEWS, SIZE, SIZE, 3), (count, VIEWS, GRID, GRID, 3), (count, VIEWS, GRID, GRID, 4)
+        for name, part, shape in zip(("rgb", "surface", "geometry"), shard, expected, strict=True):
+            if part.shape != shape:
+                raise InputError(f"{path}: {name} has shape {part.shape}, expected {shape}; remove it to render anew")
         if not joined:
             joined = [np.empty((count * len(paths), *part.shape[1:]), part.dtype) for part in shard]
         for whole, part in zip(joined, shard, strict=True):
@@ -127,6 +142,10 @@ def load_render_set(paths: list[Path]) -> RenderSet:
 def training_and_held_out(
     folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable
 ) -> tuple[RenderSet, RenderSet]:
-    """All shards but the last to train on, and the last one, an eighth of few objects, which no step sees."""
-    shards = render_set(folder, objects, seed, min(SHARD, max(1, objects // 8)), progress=progress)
-    return load_render_set(shards[:-1]), load_render_set(shards[-1:])
+    """`objects` objects to train on, and others to watch the training by: an eighth as many, at most `SHARD`.
+
+    The others have numbers that no training set reaches, so runs that go on from one another can share them.
+    """
+    shard = min(SHARD, max(1, objects // 8))
+    held_out = render_set(folder, shard, seed, shard, first=HELD_OUT)
+    return load_render_set(render_set(folder, objects, seed, shard, progress=progress)), load_render_set(held_out)

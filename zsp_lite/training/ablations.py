@@ -1,0 +1,83 @@
+"""What each part of the training is worth: short runs that go on from one checkpoint, each without one part.
+
+    python -m zsp_lite.training.ablations outputs/first/checkpoint.pt outputs/ablations
+
+renders 800 new objects in three ways, trains every variant for as many steps on 128 px crops, and prints a table of
+what is found on TRAINING-category objects that no run sees. Everything is kept in the folder and reused.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from zsp_lite.training.batches import sample_batch
+from zsp_lite.training.renders import HELD_OUT, SHARD, VIEWS, RenderSet, load_render_set, render_set
+from zsp_lite.training.train import Stage, Trainee, TrainingConfig, held_out_accuracy, keep_freed_memory, train
+
+SIDE = 128
+FULL = Stage(250, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
+BASE = TrainingConfig(seed=1, objects=800, learning_rate=3e-4, average=0.98, stages=(FULL,))
+RENDERS = {"siblings": {}, "deformed": dict(proportions=0.0), "rigid": dict(proportions=0.0, deformation=0.0)}
+
+# name: how the objects are rendered, the configuration
+VARIANTS = {
+    "all of it": ("siblings", BASE),
+    "views of one deformed instance, no siblings": ("deformed", BASE),
+    "views of one rigid instance": ("rigid", BASE),
+    "no view loss": ("siblings", replace(BASE, stages=(replace(FULL, view=0.0),))),
+    "view loss on bare keys": ("siblings", replace(BASE, log_binned=False)),
+    "view loss without opposite sides": ("siblings", replace(BASE, stages=(replace(FULL, objects=6, views=4),))),
+    "no geometry, no attention": ("siblings", replace(BASE, stages=(replace(FULL, helpers=0.0),))),
+}
+
+
+def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
+    """The mean key at each place of the grid, over crops of training objects: what a key says about where it is."""
+    rng, total = np.random.default_rng(0), 0.0
+    for _ in range(60):
+        images = sample_batch(renders, rng, 1, VIEWS, SIDE, (0.85, 1.0)).images
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            total = total + model(images).keys.float().mean(0)
+    return total / 60
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
+    parser.add_argument("start_from", type=Path, help="checkpoint of the first run")
+    parser.add_argument("out", type=Path, help="folder for renders and runs")
+    arguments = parser.parse_args()
+    keep_freed_memory()
+    unseen = load_render_set(render_set(arguments.out / "held-out", SHARD, 0, first=HELD_OUT))
+    rows = {"before": measured(load(arguments.start_from, "average"), unseen)}
+    for name, (how, config) in VARIANTS.items():
+        renders = arguments.out / how
+        render_set(renders, config.objects, config.seed, min(SHARD, config.objects // 8), **RENDERS[how])
+        run = arguments.out / "".join(letter if letter.isalnum() else "-" for letter in name)
+        train(config, run, renders, log=lambda line: print(line, flush=True), start_from=arguments.start_from)
+        rows[name] = measured(load(run / "checkpoint.pt", "average"), unseen)
+        if name == "all of it":
+            rows["no average of the weights"] = measured(load(run / "checkpoint.pt", "model"), unseen)
+            model = load(run / "checkpoint.pt", "average")
+            model.key_mean = positional_mean(model, load_render_set(sorted(renders.glob("*.npz"))[:1]))
+            rows["the keys' mean at each place removed"] = measured(model, unseen)
+    print("| | matches (%) | view (%) | IoU |\n|---|---|---|---|")
+    for name, (matches, view, iou) in rows.items():
+        print(f"| {name} | {100 * matches:.1f} | {100 * view:.1f} | {iou:.3f} |")
+
+
+def load(path: Path, part: str) -> Trainee:
+    model = Trainee(BASE)
+    model.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)[part])
+    return model
+
+
+def measured(model: nn.Module, unseen: RenderSet) -> tuple[float, float, float]:
+    return tuple(held_out_accuracy(model, unseen, SIDE, len(unseen)).values())
+
+
+if __name__ == "__main__":
+    main()
