@@ -76,7 +76,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, capsys):
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--preset", "samples", "--frames", "3", "--out", "x"], "--category"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["train", "--objects", "1", "--out", "x"], "at least 2"),
+        (["train", "--start-from", "lost.pt", "--out", "x"], "lost.pt: no such file"),
         (["train", "--shorten", "1e308", "--out", "x"], "1e+308"),
         (["train", "--self-distillation", "--start-from", "a", "--out", "x"], "--start-from"),
         (["weights", "fetch"], "expected one of zsp-tiny"),

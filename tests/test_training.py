@@ -291,6 +291,7 @@ def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
         train(wider, tmp_path / "third", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
     with pytest.raises(InputError, match="no such file"):
         train(TINY, tmp_path / "fourth", folder, start_from=tmp_path / "lost.pt", **quiet)
+    assert not (tmp_path / "fourth").exists()
     (tmp_path / "first" / "checkpoint.pt").unlink()  # no longer needed
     train(still, tmp_path / "second", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
 
@@ -327,8 +328,9 @@ def test_a_damaged_run_and_no_objects_are_refused_in_one_line(folder, renders, t
         train(TINY, tmp_path, folder, log=lambda line: None)
 
 
-def test_the_command_trains_goes_on_and_distils(tmp_path, capsys):
+def test_the_command_trains_goes_on_and_distils(tmp_path, capsys, monkeypatch):
     """Each stage of the real recipes once, on four objects."""
+    monkeypatch.setattr("zsp_lite.training.train.keep_freed_memory", lambda: None)  # this process lives on
     renders = tmp_path / "renders"
     common = ["--objects", "4", "--shorten", "0.0001", "--renders", str(renders)]
 

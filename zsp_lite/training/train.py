@@ -251,10 +251,11 @@ def train(
     not fit, and where the loss is no longer finite.
     """
     folder = Path(folder)
-    claim_folder(folder, asdict(config))
     checkpoint_file = folder / "checkpoint.pt"
-    resumed = _load(config, checkpoint_file) if checkpoint_file.exists() else None
-    start = _load(config, start_from)["average"] if start_from is not None and resumed is None else None
+    first_time = not checkpoint_file.exists()
+    start = _load(config, start_from)["average"] if start_from is not None and first_time else None
+    claim_folder(folder, asdict(config))
+    resumed = None if first_time else _load(config, checkpoint_file)
     training, held_out = training_and_held_out(renders or folder / "renders", config.objects, config.seed, progress)
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
