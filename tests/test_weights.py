@@ -1,6 +1,7 @@
 """The shipped backbone: what is in the package, and how it was made."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def test_it_loads_strictly_into_a_plain_dino_transformer():
 
 def test_its_runs_are_of_one_network_and_their_logs_complete():
     configs = sorted(TINY.parent.glob("config-*.json"))
-    assert len(configs) >= 2
+    assert len(configs) == 3
     for path in configs:
         config = json.loads(path.read_text())
         for name in ("embed_dim", "depth", "num_heads", "key_block"):
@@ -43,6 +44,7 @@ def test_its_runs_are_of_one_network_and_their_logs_complete():
         rows = [json.loads(line) for line in log.read_text().splitlines()]
         assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
         assert rows[-1]["held_out_accuracy"] > rows[9]["held_out_accuracy"] > 0
+    assert json.loads(configs[-1].read_text()) == json.loads(json.dumps(asdict(CONTINUATION)))
 
 
 def test_it_was_trained_on_none_of_the_evaluated_categories():
