@@ -1,7 +1,6 @@
 """The shipped backbone: what is in the package, and how it was made."""
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -44,7 +43,6 @@ def test_its_runs_are_of_one_network_and_their_logs_complete():
         rows = [json.loads(line) for line in log.read_text().splitlines()]
         assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
         assert rows[-1]["held_out_accuracy"] > rows[9]["held_out_accuracy"] > 0
-    assert json.loads(configs[-1].read_text()) == json.loads(json.dumps(asdict(CONTINUATION)))
 
 
 def test_it_was_trained_on_none_of_the_evaluated_categories():

@@ -19,7 +19,7 @@ from zsp_lite.training.renders import HELD_OUT, SHARD, VIEWS, RenderSet, load_re
 from zsp_lite.training.train import Stage, Trainee, TrainingConfig, held_out_accuracy, keep_freed_memory, train
 
 SIDE = 128
-FULL = Stage(250, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
+FULL = Stage(160, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
 BASE = TrainingConfig(seed=1, objects=800, learning_rate=3e-4, average=0.98, stages=(FULL,))
 RENDERS = {"siblings": {}, "deformed": dict(proportions=0.0), "rigid": dict(proportions=0.0, deformation=0.0)}
 
@@ -49,10 +49,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
     parser.add_argument("start_from", type=Path, help="checkpoint of the first run")
     parser.add_argument("out", type=Path, help="folder for renders and runs")
+    parser.add_argument("--also", type=Path, nargs="*", default=[], help="checkpoints of other runs, measured beside")
     arguments = parser.parse_args()
     keep_freed_memory()
     unseen = load_render_set(render_set(arguments.out / "held-out", SHARD, 0, first=HELD_OUT))
-    rows = {"before": measured(load(arguments.start_from, "average"), unseen)}
+    rows = {str(path): measured(load(path, "average"), unseen) for path in (arguments.start_from, *arguments.also)}
     for name, (how, config) in VARIANTS.items():
         renders = arguments.out / how
         render_set(renders, config.objects, config.seed, min(SHARD, config.objects // 8), **RENDERS[how])

@@ -19,6 +19,7 @@ VIEWS = 8
 SIZE = 192
 GRID = 48
 SHARD = 200
+APART = np.radians((5, 45))  # of the two views of a pair: at most half of what lies between two pairs
 HELD_OUT = 9_000_000  # the number of the first object that is never trained on
 
 
@@ -45,7 +46,8 @@ def render_object(
     """Render one build; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
 
     Half of the builds come from the named training categories, half are random assemblies. Views come in four pairs,
-    a quarter turn apart: the two of a pair look from nearly the same side, and every side's opposite is there too.
+    a quarter turn from one another: the two of a pair are as far apart as a reference is from the nearest of a few
+    target views, yet nearer than any two of different pairs, and every side's opposite is there too.
     Every view shows a copy with other proportions (`make_sibling`, by that amount), gently deformed (`deform`), now and
     then without one of its parts, under its own materials, light and room, so that only what all views share, the
     object's build, can tell one place from another.
@@ -61,11 +63,11 @@ def render_object(
     step = SIZE // GRID
     for view in range(VIEWS):
         if view % 2 == 0:
-            azimuth = start + (view // 2) * np.pi / 2 + rng.normal(0, 0.2)
+            azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*APART)
             elevation = rng.uniform(-0.05, 0.9)
         scene = _altered(shape, make_sibling(generator, [seed, 1], rng, proportions), rng, deformation)
         R, t = orbit_pose(
-            azimuth + rng.normal(0, 0.2), np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
+            azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
             rng.uniform(5, 10), scene.centre,
         )  # fmt: skip
         camera = framed_camera(scene.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))

@@ -100,12 +100,12 @@ class TrainingConfig:
 
 # A further run, which starts from the weights of an earlier one: now the choice of the view counts most.
 CONTINUATION = TrainingConfig(
-    learning_rate=4e-4,
+    learning_rate=3e-4,
     stages=(
-        Stage(1400, 128, 3, 8, (0.6, 1.0), view=2.0),
-        Stage(900, 160, 3, 8, (0.7, 1.0), view=2.0),
-        Stage(700, 184, 2, 8, (0.8, 1.0), radius=0.12, view=2.0),
-        Stage(550, 224, 2, 8, (0.9, 1.0), radius=0.12, view=2.0),
+        Stage(400, 128, 3, 8, (0.6, 1.0), view=2.0),
+        Stage(500, 160, 3, 8, (0.7, 1.0), view=2.0),
+        Stage(500, 184, 2, 8, (0.8, 1.0), radius=0.12, view=2.0),
+        Stage(900, 224, 2, 8, (0.9, 1.0), radius=0.12, view=2.0),
     ),
 )
 
