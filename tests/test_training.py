@@ -15,6 +15,7 @@ from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_sibling
+from zsp_lite.synthetic.render import orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 from zsp_lite.training.batches import MEAN, STD, _crop_grids, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
@@ -60,6 +61,19 @@ def test_an_object_is_rendered_the_same_twice_and_differs_from_the_next():
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(first[0], other[0])
+
+
+def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
+    azimuths = []
+    monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", lambda *a: azimuths.append(a[0]) or orbit_pose(*a))
+    render_object(3)
+    turns = np.subtract.outer(azimuths, azimuths)
+    apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
+    partner = np.arange(8) ^ 1
+    found = apart[np.arange(8), partner]
+    assert ((5 <= found) & (found <= 45)).all()
+    apart[np.arange(8), partner] = apart[np.arange(8), np.arange(8)] = 360
+    assert (apart.min(1) >= 45).all()
 
 
 def test_render_set_continues_where_it_stopped(folder, renders):

@@ -47,13 +47,14 @@ def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
-    parser.add_argument("start_from", type=Path, help="checkpoint of the first run")
+    parser.add_argument("start_from", type=Path, help="checkpoint that every variant goes on from")
     parser.add_argument("out", type=Path, help="folder for renders and runs")
     parser.add_argument("--also", type=Path, nargs="*", default=[], help="checkpoints of other runs, measured beside")
     arguments = parser.parse_args()
     keep_freed_memory()
     unseen = load_render_set(render_set(arguments.out / "held-out", SHARD, 0, first=HELD_OUT))
-    rows = {str(path): measured(load(path, "average"), unseen) for path in (arguments.start_from, *arguments.also)}
+    rows = {"before": measured(load(arguments.start_from, "average"), unseen)}
+    rows |= {str(path): measured(load(path, "average"), unseen) for path in arguments.also}
     for name, (how, config) in VARIANTS.items():
         renders = arguments.out / how
         render_set(renders, config.objects, config.seed, min(SHARD, config.objects // 8), **RENDERS[how])

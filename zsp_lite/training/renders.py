@@ -19,7 +19,7 @@ VIEWS = 8
 SIZE = 192
 GRID = 48
 SHARD = 200
-APART = np.radians((5, 45))  # of the two views of a pair: at most half of what lies between two pairs
+APART = np.radians((5, 45))  # in azimuth, of the two views of a pair: never farther than views of two pairs
 HELD_OUT = 9_000_000  # the number of the first object that is never trained on
 
 
@@ -46,8 +46,9 @@ def render_object(
     """Render one build; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
 
     Half of the builds come from the named training categories, half are random assemblies. Views come in four pairs,
-    a quarter turn from one another: the two of a pair are as far apart as a reference is from the nearest of a few
-    target views, yet nearer than any two of different pairs, and every side's opposite is there too.
+    a quarter turn from one another: the two of a pair are 5 to 45 degrees of azimuth apart, about as far as a reference
+    is from the nearest of a few target views, and never farther than two of different pairs; every side's opposite is
+    there too.
     Every view shows a copy with other proportions (`make_sibling`, by that amount), gently deformed (`deform`), now and
     then without one of its parts, under its own materials, light and room, so that only what all views share, the
     object's build, can tell one place from another.
@@ -124,7 +125,7 @@ def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, wo
 def load_render_set(paths: list[Path]) -> RenderSet:
     """Read shards into memory, one at a time: joining them afterwards would need all of it twice.
 
-    Raises InputError where a file is no shard, or one of another renderer.
+    Raises InputError where a file is no shard, or one of other sizes.
     """
     joined: list[np.ndarray] = []
     for index, path in enumerate(paths):

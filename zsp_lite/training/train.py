@@ -229,10 +229,14 @@ def _to(batch: Batch, device) -> Batch:
 
 
 def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
-    """Warm-up over 150 steps, constant for a third of the run, then a cosine to 1 %; less for large crops."""
+    """Warm-up over 150 steps, or a quarter of a short run, constant for a third, then a cosine to 1 %.
+
+    Less for large crops.
+    """
+    warm_up = max(1, min(150, config.steps // 4))
     progress = max(0.0, (step / config.steps - 0.35) / 0.65)
     decay = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
-    return config.learning_rate * min(1, (step + 1) / 150) * decay * (0.7 if side > 128 else 1.0)
+    return config.learning_rate * min(1, (step + 1) / warm_up) * decay * (0.7 if side > 128 else 1.0)
 
 
 def train(
