@@ -84,11 +84,13 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, capsys):
         (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(arguments, names, capsys, ellipsoids):
+def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys, ellipsoids, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     takes_data = arguments[0] in ("demo", "benchmark") and "--data" not in arguments
     data = ["--data", str(ellipsoids.root)] if takes_data else []
     assert cli.main(arguments + data) == 2
     assert names in assert_one_line(capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_category_that_is_not_there_is_named_with_those_that_are(capsys, ellipsoids):

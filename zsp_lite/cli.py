@@ -168,10 +168,10 @@ def _demo(arguments: argparse.Namespace) -> None:
     from zsp_lite.synthetic.export import SETTINGS_FILE
 
     console = Console()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     folder = arguments.data or sample_data()
     note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
     dataset, backbone = Co3D(folder), load_backbone(_backbone(arguments))
+    arguments.out.mkdir(parents=True, exist_ok=True)
     name = getattr(backbone, "name", arguments.backbone)
     table = Table(title=f"One pair of each category in {folder}, backbone {name}")
     for column in ("category", "chosen view", "inliers", "rotation error", "time"):
