@@ -1,6 +1,7 @@
 """The procedural world: exports read like CO3D; labels, cameras and depth agree with the geometry."""
 
 import inspect
+import itertools
 import types
 from dataclasses import fields
 from pathlib import Path
@@ -11,17 +12,20 @@ import pytest
 
 from zsp_lite.alignment import umeyama
 from zsp_lite.benchmark.published import CATEGORIES
+from zsp_lite.cli import main
 from zsp_lite.co3d import Co3D
 from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
 from zsp_lite.frames import crop_to_object
 from zsp_lite.labels import read_labels, relative_pose
 from zsp_lite.pairs import read_upstream_pairs, upstream_pairs_path
-from zsp_lite.synthetic import evaluation_categories, export, training_categories
+from zsp_lite.synthetic import evaluation_categories, export, training_categories, validation_categories
 from zsp_lite.synthetic.assembly import make_shape, surface_spread
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.export import (
+    GENERATORS,
     PRESETS,
+    SPLITS,
     Preset,
     export_categories,
     make_sequence,
@@ -31,6 +35,7 @@ from zsp_lite.synthetic.export import (
 from zsp_lite.synthetic.sensor import soft_mask
 from zsp_lite.synthetic.sequences import handheld_sweep, rescaled
 from zsp_lite.synthetic.training_categories import TRAINING
+from zsp_lite.synthetic.validation_categories import VALIDATION
 
 PAPER_CATEGORIES = set(
     "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse remote "
@@ -83,22 +88,33 @@ def test_evaluation_names_are_the_papers():
     assert len(TRAINING) >= 12
 
 
-def test_no_training_category_is_evaluated():
-    assert not set(EVALUATION) & set(TRAINING)
-    generators = {inspect.unwrap(generator) for generator in EVALUATION.values()}
-    assert not generators & {inspect.unwrap(generator) for generator in TRAINING.values()}
+MODULES = {"training": training_categories, "validation": validation_categories, "evaluation": evaluation_categories}
 
 
-def test_the_two_sides_share_no_code():
-    evaluation, training = code_of(evaluation_categories), code_of(training_categories)
-    assert len(evaluation) > len(EVALUATION) and len(training) >= len(TRAINING)
-    assert all(any(name.endswith(f".{category}") for name in evaluation) for category in EVALUATION)
-    assert not {code.co_code for code in evaluation.values()} & {code.co_code for code in training.values()}
+@pytest.mark.parametrize(("one", "other"), list(itertools.combinations(SPLITS, 2)))
+def test_no_category_is_in_two_splits(one, other):
+    assert not set(SPLITS[one]) & set(SPLITS[other])
+    generators = {inspect.unwrap(generator) for generator in SPLITS[one].values()}
+    assert not generators & {inspect.unwrap(generator) for generator in SPLITS[other].values()}
 
 
-@pytest.mark.parametrize("category", sorted(EVALUATION))
+@pytest.mark.parametrize(("one", "other"), list(itertools.combinations(MODULES, 2)))
+def test_no_two_splits_share_code(one, other):
+    found = {split: code_of(MODULES[split]) for split in (one, other)}
+    for split, code in found.items():
+        assert all(any(name.endswith(f".{category}") for name in code) for category in SPLITS[split])
+    assert not {code.co_code for code in found[one].values()} & {code.co_code for code in found[other].values()}
+
+
+def test_a_split_can_be_made_by_its_name(tmp_path):
+    main(["synth", "--category", "validation", "--category", "drill", "--sequences", "1", "--frames", "1",
+          "--out", str(tmp_path)])  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir() and path.name in GENERATORS} == set(VALIDATION)
+
+
+@pytest.mark.parametrize("category", sorted(GENERATORS))
 def test_objects_of_a_category_are_unit_sized_and_vary(category):
-    shapes = [make_shape(EVALUATION[category], seed) for seed in range(4)]
+    shapes = [make_shape(GENERATORS[category], seed) for seed in range(4)]
     for shape in shapes:
         assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
         assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
@@ -107,10 +123,10 @@ def test_objects_of_a_category_are_unit_sized_and_vary(category):
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
 
 
-@pytest.mark.parametrize("category", sorted(EVALUATION))
+@pytest.mark.parametrize("category", sorted(GENERATORS))
 def test_front_and_back_of_an_object_differ(category):
     """Turned by half a turn about z, no object coincides with itself, or its pose would have two answers."""
-    shape = make_shape(EVALUATION[category], 3)
+    shape = make_shape(GENERATORS[category], 3)
     turned = shape.vertices * [-1, -1, 1]
     nearest = np.linalg.norm(shape.vertices[:, None] - turned[None, ::3], axis=-1).min(0)
     assert nearest.max() > 0.2

@@ -197,6 +197,7 @@ def _add_synth(commands) -> None:
             "synth --preset eval --out outputs/eval",
             "synth --preset paper --out outputs/paper",
             "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
+            "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
         ],
     )  # fmt: skip
     what = parser.add_mutually_exclusive_group(required=True)
@@ -205,7 +206,10 @@ def _add_synth(commands) -> None:
         help="samples (what data_samples/ holds), eval, or paper: 20 categories of 10 sequences of 100 frames, about "
         "half an hour and 2 GB; a folder that is there is continued",
     )  # fmt: skip
-    what.add_argument("--category", action="append", metavar="NAME", help="a category; may be given more than once")
+    what.add_argument(
+        "--category", action="append", metavar="NAME",
+        help="a category, or training, validation or evaluation: all of that split; may be given more than once",
+    )  # fmt: skip
     parser.add_argument("--sequences", type=_count, metavar="N", help="with --category: sequences of each (default: 4)")
     parser.add_argument("--frames", type=_count, metavar="N", help="with --category: frames per sequence (default: 24)")
     parser.add_argument("--seed", type=_seed, default=0, help="default: 0")
@@ -215,7 +219,7 @@ def _add_synth(commands) -> None:
 def _synth(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
-    from zsp_lite.synthetic.export import export_categories, export_preset
+    from zsp_lite.synthetic.export import SPLITS, export_categories, export_preset
 
     out, seed, sequences, frames = arguments.out, arguments.seed, arguments.sequences, arguments.frames
     if arguments.preset:
@@ -223,7 +227,8 @@ def _synth(arguments: argparse.Namespace) -> None:
             raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
         export_preset(arguments.preset, out, seed, progress=tqdm)
     else:
-        export_categories(arguments.category, out, sequences or 4, frames or 24, seed, progress=tqdm)
+        names = [name for given in arguments.category for name in SPLITS.get(given, [given])]
+        export_categories(list(dict.fromkeys(names)), out, sequences or 4, frames or 24, seed, progress=tqdm)
     print(f"Written: {out}")
 
 

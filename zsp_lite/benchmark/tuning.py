@@ -2,7 +2,7 @@
 
     python -m zsp_lite.benchmark.tuning ROOT --pairs N
 
-ROOT holds objects of training categories (`zsp-lite synth --categories ...`); evaluation categories are refused, for
+ROOT holds objects of training categories (`zsp-lite synth --category training`); evaluation categories are refused, for
 a solver fitted to them could not be judged by them. The weights are a conditional logit: the chance that of a pair's
 hypotheses one is right is in proportion to e^score, and the pairs seen are to be as likely as can be. Weights under
 which the search would have found other hypotheses ask for another round.

@@ -1,6 +1,7 @@
 """The categories that methods are evaluated on: names of the paper's twenty, generators of their own.
 
-No backbone is trained on any of them; `training_categories` shares neither a name nor a generator with them.
+No backbone is trained on any of them; `training_categories` and `validation_categories` share neither a name nor a
+generator with them.
 """
 
 from zsp_lite.synthetic.evaluation_appliances import hairdryer, laptop, mouse, toaster

@@ -20,7 +20,10 @@ from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.sensor import observe
 from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
 from zsp_lite.synthetic.training_categories import TRAINING
+from zsp_lite.synthetic.validation_categories import VALIDATION
 
+SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATION}
+GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: what it was made with
 POSES_FILE = "object_poses.json"  # in each category: where each sequence's object stands in its world
 JPEG_QUALITY = 88
@@ -94,10 +97,9 @@ def export_categories(
     first sequence of a category is its labels' reference. Raises InputError on unknown categories or layouts,
     and on a folder that was made with other settings.
     """
-    generators = TRAINING | EVALUATION
     for category in categories:
-        if category not in generators:
-            raise InputError(f"category is {category!r}, expected one of {', '.join(sorted(generators))}")
+        if category not in GENERATORS:
+            raise InputError(f"category is {category!r}, expected one of {', '.join(sorted(GENERATORS))}")
     if layout not in LAYOUTS:
         raise InputError(f"layout is {layout!r}, expected one of {', '.join(LAYOUTS)}")
     if min(sequences, frames) < 1 or image_size < 32:
@@ -139,13 +141,13 @@ def make_object(category: str, sequence: str, seed: int) -> Shape:
     Raises InputError where no such sequence is exported with that seed.
     """
     index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
-    if category not in TRAINING | EVALUATION or index < 0 or sequence != sequence_name(seed, category, index):
+    if category not in GENERATORS or index < 0 or sequence != sequence_name(seed, category, index):
         raise InputError(f"sequence {category}/{sequence} is none of an export with seed {seed}")
     return _make_object(category, _stable_hash(seed, category, index))
 
 
 def _make_object(category: str, key: int) -> Shape:
-    return make_shape((TRAINING | EVALUATION)[category], [key, 0])
+    return make_shape(GENERATORS[category], [key, 0])
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:

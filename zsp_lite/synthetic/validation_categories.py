@@ -1,0 +1,157 @@
+"""The categories by which trained backbones are compared: none of them is trained on, none is evaluated.
+
+Whether training helps on categories that it has not seen cannot be asked of the training categories, and may not be
+asked of the evaluation categories. Each generator builds one object from the draws of its Assembly: front +x, up +z.
+"""
+
+import numpy as np
+
+from zsp_lite.synthetic.assembly import Assembly
+from zsp_lite.synthetic.primitives import box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+
+_TURN = np.pi / 2
+
+
+def _wheel(a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True) -> None:
+    """A wheel that stands on the ground and turns about y."""
+    a.add(cylinder(radius, radius, width, 20).turned("x", _TURN).moved((x, y, radius)), 3, mirror)
+    a.add(cylinder(radius * 0.5, radius * 0.5, width * 1.2, 12).turned("x", _TURN).moved((x, y, radius)), 4, mirror)
+
+
+def helicopter(a: Assembly) -> None:
+    length, r, z = a.u(0.6, 0.9), a.u(0.35, 0.5), a.u(0.6, 0.8)
+    a.add(ellipsoid((length, r, r * a.u(0.9, 1.2)), (0, 0, z)), 0)
+    a.add(ellipsoid((length * 0.5, r * 0.85, r * 0.7), (length * 0.55, 0, z + 0.05)), 4)
+    tail = np.array([-length - a.u(0.6, 1.0), 0, z + a.u(0.1, 0.3)])
+    a.add(rod((-length * 0.7, 0, z + 0.05), tail, r * 0.4, 0.07), 0)
+    a.add(extrusion([[0.1, 0], [-0.12, 0], [-0.25, 0.4], [-0.1, 0.4]], 0.05).moved(tail), 1)
+    blades, phase, reach = 2 + a.pick(3), a.u(0, 3), a.u(0.9, 1.3)
+    top = z + r * 1.2 + 0.2
+    a.add(rod((0, 0, z), (0, 0, top), 0.05), 2)
+    for k in range(blades):
+        blade = box((reach, 0.11, 0.03), (reach / 2, 0, top)).turned("z", phase + 2 * np.pi * k / blades)
+        a.add(blade, 2)
+    a.add(torus(0.2, 0.025, (0, 1, 0), tail + [0, 0.08, 0.05]), 3)
+    if a.chance(0.7):
+        a.add(rod((-length * 0.6, r * 0.8, 0.05), (length * 0.9, r * 0.8, 0.05), 0.035), 3, mirror=True)
+        for x in (-0.3, 0.35):
+            a.add(rod((x * length, r * 0.4, z - r * 0.7), (x * length, r * 0.8, 0.05), 0.03), 3, mirror=True)
+    else:
+        _wheel(a, length * 0.4, r * 0.7, 0.14, 0.1)
+        _wheel(a, -length * 0.6, 0, 0.1, 0.1, mirror=False)
+
+
+def wheelbarrow(a: Assembly) -> None:
+    length, w, wheel = a.u(0.9, 1.2), a.u(0.55, 0.8), a.u(0.2, 0.32)
+    z, depth = wheel + a.u(0.15, 0.3), a.u(0.25, 0.45)
+    side = [[-length / 2, z + depth], [-length * 0.3, z], [length * 0.25, z], [length * a.u(0.55, 0.75), z + depth]]
+    a.add(extrusion(side, 0.05).moved((0, w / 2, 0)), 0, mirror=True)
+    a.add(box((length * 0.6, w, 0.05), (0, 0, z)), 0)
+    a.add(rod((length * 0.3, 0, z + 0.02), (length * 0.6, 0, z + depth * 0.9), w * 0.45, w * 0.5), 0)
+    grip = np.array([-length / 2 - a.u(0.4, 0.7), w * 0.4, z + a.u(0.1, 0.4)])
+    a.add(rod((length * 0.6, w * 0.15, wheel), grip, 0.04), 1, mirror=True)
+    a.add(capsule(grip, grip + [-0.15, 0, 0.02], 0.06), 2, mirror=True)
+    a.add(rod((-length * 0.2, w * 0.35, z), (-length * 0.35, w * 0.4, 0), 0.035), 1, mirror=True)
+    _wheel(a, length * 0.65, 0, wheel, a.u(0.08, 0.16), mirror=False)
+
+
+def watering_can(a: Assembly) -> None:
+    r, h = a.u(0.4, 0.55), a.u(0.6, 1.0)
+    a.add(lathe([[0.001, 0], [r, 0], [r * a.u(0.75, 1), h], [0.001, h * 0.97]]), 0)
+    tip = np.array([r + a.u(0.5, 0.9), 0, h * a.u(0.95, 1.3)])
+    a.add(rod((r * 0.8, 0, h * 0.2), tip, 0.09, 0.05), 0)
+    rose = tip - [r * 0.8, 0, h * 0.2]
+    a.add(rod(tip, tip + 0.2 * rose / np.linalg.norm(rose), 0.05, a.u(0.12, 0.2)), 1)
+    a.add(rod((r * 0.7, 0, h), tip * [0.8, 1, 1] - [0, 0, 0.15], 0.025), 2)
+    a.add(torus(h * a.u(0.3, 0.4), 0.05, (0, 1, 0), (-r * 0.85, 0, h * 0.55), np.pi * 0.95, np.pi * 2.05), 2)
+    if a.chance(0.5):
+        a.add(cylinder(r * 1.05, r * 1.05, 0.08, 20).moved((0, 0, h * a.u(0.3, 0.7))), 3)
+
+
+def vacuum_cleaner(a: Assembly) -> None:
+    length, r = a.u(0.5, 0.75), a.u(0.28, 0.4)
+    a.add(capsule((-length, 0, r + 0.08), (length * 0.6, 0, r + 0.05), r, r * a.u(0.7, 0.95)), 0)
+    a.add(box((length * 0.8, r * 1.1, 0.12), (-length * 0.4, 0, 2 * r + 0.05)), 1)
+    a.add(cylinder(0.12, 0.12, 0.1).moved((length * 0.1, 0, 2 * r + 0.08)), 2)
+    _wheel(a, -length * 0.9, r * 0.95, a.u(0.2, 0.32), 0.1)
+    hose = np.array([length * 0.6 + r + 0.3, 0, r + a.u(0.3, 0.6)])
+    a.add(rod((length * 0.6, 0, r), hose, 0.07), 3)
+    wand = np.array([hose[0] + a.u(0.2, 0.5), a.u(-0.1, 0.1), 0.08])
+    a.add(rod(hose, wand, 0.06), 3)
+    a.add(box((0.22, a.u(0.5, 0.8), 0.1), wand), 2)
+    if a.chance(0.5):
+        a.add(torus(0.16, 0.035, (0, 1, 0), (-length * 0.2, 0, 2 * r + 0.1), 0, np.pi), 4)
+
+
+def drill(a: Assembly) -> None:
+    length, r, z = a.u(0.8, 1.1), a.u(0.2, 0.28), a.u(0.8, 1.0)
+    a.add(rod((-length * 0.45, 0, z), (length * 0.35, 0, z), r, r * a.u(0.8, 1)), 0)
+    a.add(rod((length * 0.35, 0, z), (length * 0.6, 0, z), r * 0.7, r * 0.45), 1)
+    a.add(rod((length * 0.6, 0, z), (length * 0.6 + a.u(0.3, 0.7), 0, z), 0.05, 0.02), 3)
+    lean = a.u(-0.25, 0.05)
+    a.add(capsule((-length * 0.15, 0, z), (-length * 0.15 + lean, 0, 0.2), 0.16, 0.14), 0)
+    a.add(box((a.u(0.35, 0.5), 0.3, a.u(0.15, 0.25)), (-length * 0.12 + lean, 0, 0.1)), 2)
+    a.add(box((0.1, 0.1, 0.18), (length * 0.03, 0, z - r - 0.08)), 2)
+    for x in (-0.35, -0.22):
+        a.add(torus(r, 0.025, (1, 0, 0), (x * length, 0, z)), 4)
+    if a.chance(0.4):
+        a.add(rod((length * 0.25, 0, z), (length * 0.25, a.u(0.4, 0.6), z), 0.07), 2)
+
+
+def dinosaur(a: Assembly) -> None:
+    length, r, leg = a.u(0.5, 0.8), a.u(0.28, 0.4), a.u(0.4, 0.7)
+    z = leg + r * 0.5
+    hip, chest = np.array([-length * 0.4, 0, z]), np.array([length * 0.5, 0, z + a.u(0, 0.3)])
+    a.add(capsule(hip, chest, r, r * 0.75), 0)
+    tail = hip - [a.u(0.5, 0.8), 0, a.u(-0.1, 0.2)]
+    a.add(rod(hip, tail, r * 0.8, r * 0.4), 0)
+    a.add(rod(tail, tail - [a.u(0.4, 0.7), 0, a.u(-0.2, 0.25)], r * 0.4, 0.03), 0)
+    head = chest + [a.u(0.3, 0.6), 0, a.u(0.2, 0.7)]
+    a.add(rod(chest, head, r * 0.6, r * 0.35), 0)
+    a.add(capsule(head, head + [a.u(0.2, 0.4), 0, -0.05], r * 0.45, r * 0.28), 1)
+    a.add(ellipsoid((0.05, 0.04, 0.05), head + [0.06, r * 0.4, 0.08]), 3, mirror=True)
+    a.add(capsule(hip + [0, r * 0.7, 0], (hip[0] + 0.05, r * 0.9, 0.08), 0.17, 0.1), 1, mirror=True)
+    upright = a.chance(0.5)
+    foot = chest + [0.3, r * 0.5, -0.3] if upright else np.array([chest[0], r * 0.8, 0.08])
+    a.add(capsule(chest + [0, r * 0.5, -0.05], foot, 0.1, 0.06), 1, mirror=True)
+    for k in range(5):
+        x = hip[0] - 0.3 + 0.25 * k
+        a.add(extrusion([[x - 0.1, z + r * 0.6], [x + 0.1, z + r * 0.6], [x - 0.05, z + r + a.u(0.15, 0.35)]], 0.05), 2)
+
+
+def mailbox(a: Assembly) -> None:
+    length, r, h = a.u(0.8, 1.2), a.u(0.25, 0.38), a.u(0.7, 1.1)
+    a.add(box((length, 2 * r, r), (0, 0, h + r / 2)), 0)
+    a.add(rod((-length / 2, 0, h + r), (length / 2, 0, h + r), r, sides=18), 0)
+    a.add(box((0.04, r * 1.6, r * 1.3), (length / 2 + 0.02, 0, h + r * 0.8)), 1)
+    a.add(box((0.08, 0.12, 0.06), (length / 2 + 0.06, 0, h + r * 1.4)), 3)
+    a.add(rod((0, 0, 0), (a.u(-0.1, 0.1), 0, h), a.u(0.06, 0.1)), 2)
+    a.add(cylinder(a.u(0.2, 0.4), 0.15, 0.1).moved((0, 0, 0.05)), 2)
+    flag = a.u(-0.1, 0.3) * length
+    a.add(rod((flag, r, h + r), (flag, r + 0.05, h + 2 * r + 0.2), 0.025), 3)
+    a.add(box((0.22, 0.03, 0.16), (flag - 0.1, r + 0.05, h + 2 * r + 0.2)), 4)
+
+
+def excavator(a: Assembly) -> None:
+    length, w = a.u(0.9, 1.2), a.u(0.6, 0.8)
+    for y in (w / 2,):
+        a.add(capsule((-length / 2, y, 0.16), (length / 2, y, 0.16), 0.16), 3, mirror=True)
+    a.add(box((length * 0.9, w * 0.9, a.u(0.25, 0.4)), (-0.08, 0, 0.5)), 0)
+    side = a.u(0.1, 0.2) * (1 if a.chance(0.5) else -1)
+    a.add(box((0.4, w * 0.45, a.u(0.4, 0.55)), (length * 0.15, side, 0.9)), 4)
+    a.add(box((0.3, w * 0.8, 0.25), (-length * 0.42, 0, 0.75)), 1)
+    elbow = np.array([length * 0.45 + a.u(0.3, 0.6), -side * 0.6, a.u(1.1, 1.5)])
+    wrist = np.array([elbow[0] + a.u(0.3, 0.6), -side * 0.6, a.u(0.5, 0.9)])
+    a.add(rod((length * 0.35, -side * 0.6, 0.6), elbow, 0.1, 0.08), 0)
+    a.add(rod(elbow, wrist, 0.08, 0.06), 0)
+    scoop = [[0.12, 0.05], [-0.15, -0.05], [-0.22, -0.35], [0.02, -0.4]]
+    a.add(extrusion(scoop, w * a.u(0.35, 0.55)).moved(wrist), 2)
+    a.add(rod((-length * 0.3, w * 0.25, 0.8), (-length * 0.3, w * 0.25, 1.1), 0.05), 3)
+
+
+VALIDATION = {
+    generator.__name__: generator
+    for generator in (
+        helicopter, wheelbarrow, watering_can, vacuum_cleaner, drill, dinosaur, mailbox, excavator,
+    )
+}  # fmt: skip
