@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+import sys
 import types
 from dataclasses import fields
 from pathlib import Path
@@ -70,7 +71,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def code_of(module: types.ModuleType) -> dict[str, types.CodeType]:
     """Code of every function of the module's side: its own, and those of its siblings that it imports."""
-    side = module.__name__.split(".")[-1].split("_")[0]  # "evaluation" or "training"
+    side = module.__name__.split(".")[-1].split("_")[0]  # the split's name
     found, queue = {}, [module]
     while queue:
         here = queue.pop()
@@ -106,10 +107,20 @@ def test_no_two_splits_share_code(one, other):
     assert not {code.co_code for code in found[one].values()} & {code.co_code for code in found[other].values()}
 
 
+@pytest.mark.parametrize("split", SPLITS)
+def test_no_split_borrows_from_another(split):
+    assert MODULES.keys() == SPLITS.keys()
+    modules = {name.rpartition(".")[0] for name in code_of(MODULES[split])}
+    homes = {getattr(thing, "__module__", "") for name in modules for thing in vars(sys.modules[name]).values()}
+    others = tuple(f"zsp_lite.synthetic.{other}_" for other in SPLITS if other != split)
+    assert not [home for home in homes if home and home.startswith(others)]
+
+
 def test_a_split_can_be_made_by_its_name(tmp_path):
-    main(["synth", "--category", "validation", "--category", "drill", "--sequences", "1", "--frames", "1",
-          "--out", str(tmp_path)])  # fmt: skip
-    assert {path.name for path in tmp_path.iterdir() if path.is_dir() and path.name in GENERATORS} == set(VALIDATION)
+    main(["synth", "--category", "validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
+    made = Co3D(tmp_path)
+    assert sorted(made.categories()) == sorted(VALIDATION)
+    assert all(len(made.sequences(category)) == 1 for category in VALIDATION)
 
 
 @pytest.mark.parametrize("category", sorted(GENERATORS))

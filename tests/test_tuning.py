@@ -101,8 +101,10 @@ def test_the_report_says_what_was_learnt():
     assert all(name in text for name in TERMS) and "left-out category" in text
 
 
-def test_evaluation_categories_are_refused_by_name(tmp_path, capsys):
+def test_validation_and_evaluation_categories_are_refused_by_name(tmp_path, capsys):
     check_training(["camera", "ellipsoid"])
+    with pytest.raises(InputError, match="category drill is for validation"):
+        check_training(["camera", "drill"])
     with pytest.raises(InputError, match="category toyplane is for evaluation"):
         check_training(["camera", "toyplane"])
     folder = tmp_path / "toyplane"

@@ -219,7 +219,7 @@ def _add_synth(commands) -> None:
 def _synth(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
-    from zsp_lite.synthetic.export import SPLITS, export_categories, export_preset
+    from zsp_lite.synthetic.export import export_categories, export_preset
 
     out, seed, sequences, frames = arguments.out, arguments.seed, arguments.sequences, arguments.frames
     if arguments.preset:
@@ -227,8 +227,7 @@ def _synth(arguments: argparse.Namespace) -> None:
             raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
         export_preset(arguments.preset, out, seed, progress=tqdm)
     else:
-        names = [name for given in arguments.category for name in SPLITS.get(given, [given])]
-        export_categories(list(dict.fromkeys(names)), out, sequences or 4, frames or 24, seed, progress=tqdm)
+        export_categories(arguments.category, out, sequences or 4, frames or 24, seed, progress=tqdm)
     print(f"Written: {out}")
 
 

@@ -2,10 +2,10 @@
 
     python -m zsp_lite.benchmark.tuning ROOT --pairs N
 
-ROOT holds objects of training categories (`zsp-lite synth --category training`); evaluation categories are refused, for
-a solver fitted to them could not be judged by them. The weights are a conditional logit: the chance that of a pair's
-hypotheses one is right is in proportion to e^score, and the pairs seen are to be as likely as can be. Weights under
-which the search would have found other hypotheses ask for another round.
+ROOT holds objects of training categories (`zsp-lite synth --category training`); validation and evaluation categories
+are refused, for a solver fitted to them could not be judged by them. The weights are a conditional logit: the chance
+that of a pair's hypotheses one is right is in proportion to e^score, and the pairs seen are to be as likely as can be.
+Weights under which the search would have found other hypotheses ask for another round.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from zsp_lite.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pairs import Pair, sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.synthetic.export import SPLITS
 from zsp_lite.verified import solve
 from zsp_lite.verified.confidence import MODES_APART, Calibration, fit_calibration, margins, reliability
 from zsp_lite.verified.verification import TERMS, Weights
@@ -66,7 +66,7 @@ def collect(root: str, pairs: int, backbone: Any, n_targets: int = 5, seed: int 
             said: Callable[[str], None] = lambda line: None) -> list[Outcome]:  # fmt: skip
     """The verified solver's outcomes on `pairs` pairs of each category in a folder.  said: is told each category.
 
-    Raises InputError where the folder holds an evaluation category, or a sequence without a pose label.
+    Raises InputError where the folder holds a validation or evaluation category, or a sequence without a pose label.
     """
     dataset = Co3D(root)
     categories = dataset.categories()
@@ -82,10 +82,11 @@ def collect(root: str, pairs: int, backbone: Any, n_targets: int = 5, seed: int 
 
 
 def check_training(categories: Sequence[str]) -> None:
-    """Raises InputError where one of the categories is for evaluation."""
+    """Raises InputError where one of the categories is for validation or evaluation."""
     for category in categories:
-        if category in EVALUATION:
-            raise InputError(f"category {category} is for evaluation, expected training categories alone to tune on")
+        for split in ("validation", "evaluation"):
+            if category in SPLITS[split]:
+                raise InputError(f"category {category} is for {split}, expected training categories alone to tune on")
 
 
 def outcome(pair: Pair, store: FrameStore, labels: Mapping[str, PoseLabel]) -> Outcome:

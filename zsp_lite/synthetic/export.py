@@ -92,14 +92,15 @@ def export_categories(
 ) -> None:
     """Write `sequences` sequences of `frames` frames of each category to the folder `out`, with pose labels.
 
-    The shorter image side has `image_size` pixels. A sequence depends on the seed, its category and its index
-    alone, so any part of an export can be made again; sequences that are complete already are left alone. The
-    first sequence of a category is its labels' reference. Raises InputError on unknown categories or layouts,
-    and on a folder that was made with other settings.
+    The name of a split stands for all its categories. The shorter image side has `image_size` pixels. A sequence
+    depends on the seed, its category and its index alone, so any part of an export can be made again; sequences that
+    are complete already are left alone. The first sequence of a category is its labels' reference. Raises InputError
+    on unknown categories or layouts, and on a folder that was made with other settings.
     """
+    categories = [name for given in categories for name in SPLITS.get(given, [given])]
     for category in categories:
         if category not in GENERATORS:
-            raise InputError(f"category is {category!r}, expected one of {', '.join(sorted(GENERATORS))}")
+            raise InputError(f"category is {category!r}, expected one of {', '.join([*SPLITS, *sorted(GENERATORS)])}")
     if layout not in LAYOUTS:
         raise InputError(f"layout is {layout!r}, expected one of {', '.join(LAYOUTS)}")
     if min(sequences, frames) < 1 or image_size < 32:

@@ -1,7 +1,8 @@
-"""The categories by which trained backbones are compared: none of them is trained on, none is evaluated.
+"""The categories by which trained backbones are compared: none is trained on, none is part of the benchmark.
 
-Whether training helps on categories that it has not seen cannot be asked of the training categories, and may not be
-asked of the evaluation categories. Each generator builds one object from the draws of its Assembly: front +x, up +z.
+Which of several backbones is best on categories that it has not seen cannot be asked of the training categories, and
+must not be chosen by the evaluation categories. Each generator builds one object from the draws of its Assembly:
+front +x, up +z, left +y.
 """
 
 import numpy as np
@@ -9,13 +10,14 @@ import numpy as np
 from zsp_lite.synthetic.assembly import Assembly
 from zsp_lite.synthetic.primitives import box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
-_TURN = np.pi / 2
+_QUARTER_TURN = np.pi / 2
 
 
 def _wheel(a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True) -> None:
     """A wheel that stands on the ground and turns about y."""
-    a.add(cylinder(radius, radius, width, 20).turned("x", _TURN).moved((x, y, radius)), 3, mirror)
-    a.add(cylinder(radius * 0.5, radius * 0.5, width * 1.2, 12).turned("x", _TURN).moved((x, y, radius)), 4, mirror)
+    a.add(cylinder(radius, radius, width, 20).turned("x", _QUARTER_TURN).moved((x, y, radius)), 3, mirror)
+    hub = cylinder(radius * 0.5, radius * 0.5, width * 1.2, 12)
+    a.add(hub.turned("x", _QUARTER_TURN).moved((x, y, radius)), 4, mirror)
 
 
 def helicopter(a: Assembly) -> None:
@@ -80,7 +82,7 @@ def vacuum_cleaner(a: Assembly) -> None:
     a.add(rod(hose, wand, 0.06), 3)
     a.add(box((0.22, a.u(0.5, 0.8), 0.1), wand), 2)
     if a.chance(0.5):
-        a.add(torus(0.16, 0.035, (0, 1, 0), (-length * 0.2, 0, 2 * r + 0.1), 0, np.pi), 4)
+        a.add(torus(0.16, 0.035, (0, 1, 0), (-length * 0.2, 0, 2 * r + 0.1), -_QUARTER_TURN, _QUARTER_TURN), 4)
 
 
 def drill(a: Assembly) -> None:
@@ -134,8 +136,7 @@ def mailbox(a: Assembly) -> None:
 
 def excavator(a: Assembly) -> None:
     length, w = a.u(0.9, 1.2), a.u(0.6, 0.8)
-    for y in (w / 2,):
-        a.add(capsule((-length / 2, y, 0.16), (length / 2, y, 0.16), 0.16), 3, mirror=True)
+    a.add(capsule((-length / 2, w / 2, 0.16), (length / 2, w / 2, 0.16), 0.16), 3, mirror=True)
     a.add(box((length * 0.9, w * 0.9, a.u(0.25, 0.4)), (-0.08, 0, 0.5)), 0)
     side = a.u(0.1, 0.2) * (1 if a.chance(0.5) else -1)
     a.add(box((0.4, w * 0.45, a.u(0.4, 0.55)), (length * 0.15, side, 0.9)), 4)
