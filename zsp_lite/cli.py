@@ -204,7 +204,7 @@ def _add_synth(commands) -> None:
     what.add_argument(
         "--preset", metavar="NAME",
         help="samples (what data_samples/ holds), eval, or paper: 20 categories of 10 sequences of 100 frames, about "
-        "half an hour and 2 GB; a folder that is there is continued",
+        "half an hour and 1.4 GB; a folder that is there is continued",
     )  # fmt: skip
     what.add_argument(
         "--category", action="append", metavar="NAME",

@@ -97,7 +97,7 @@ def export_categories(
     are complete already are left alone. The first sequence of a category is its labels' reference. Raises InputError
     on unknown categories or layouts, and on a folder that was made with other settings.
     """
-    categories = [name for given in categories for name in SPLITS.get(given, [given])]
+    categories = list(dict.fromkeys(name for given in categories for name in SPLITS.get(given, [given])))
     for category in categories:
         if category not in GENERATORS:
             raise InputError(f"category is {category!r}, expected one of {', '.join([*SPLITS, *sorted(GENERATORS)])}")
