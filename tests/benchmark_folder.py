@@ -46,12 +46,12 @@ def small_folder() -> Path:
 
 @dataclass(frozen=True)
 class SlowBackbone(CoordinateBackbone):
-    """Takes its time, so that a test can come in between."""
+    """Takes its time, so that a test can come in between. (How much does not make it another backbone.)"""
 
-    seconds: float = 0.05
+    _seconds: float = 0.05
 
     def __call__(self, images):
-        time.sleep(self.seconds * len(images))
+        time.sleep(self._seconds * len(images))
         return super().__call__(images)
 
 

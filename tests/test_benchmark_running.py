@@ -3,12 +3,14 @@
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -22,14 +24,18 @@ from zsp_lite.backbones import Backbone
 from zsp_lite.benchmark import run as run_module
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.execution import open_crew
+from zsp_lite.benchmark.extractors import fingerprint as extractor_fingerprint
 from zsp_lite.benchmark.jobs import Job, frame_keys, records_of, run_job, split, worker_extractors
-from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, resolve
+from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, fingerprint, resolve
 from zsp_lite.benchmark.plan import Plan, duration, frames_at_once, size
+from zsp_lite.benchmark.problem import Answer, as_answer
+from zsp_lite.benchmark.results import read_results
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, plan_run, read_records, work_of_categories
 from zsp_lite.benchmark.storage import PartReader, RunFolder, _append, part_writer
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
+from zsp_lite.labels import read_labels, write_label
 from zsp_lite.pairs import sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.vit import VisionTransformer
@@ -43,7 +49,7 @@ TESTS = Path(__file__).parent
 def undisturbed(tmp_path_factory):
     """The run of `benchmark_folder`'s main, in this process."""
     out = tmp_path_factory.mktemp("undisturbed")
-    return out, evaluate(small_folder(), SlowBackbone(seconds=0), ROWS, 6, 3, out=out)
+    return out, evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, 6, 3, out=out)
 
 
 def start(out: Path) -> subprocess.Popen:
@@ -67,7 +73,7 @@ def test_a_run_killed_again_and_again_ends_with_the_same_tables(undisturbed, tmp
         process.wait()
         lines = (tmp_path / "pairs.jsonl").read_bytes().count(b"\n")
     assert 4 <= lines < 12
-    summary = evaluate(small_folder(), SlowBackbone(seconds=0), ROWS, 6, 3, out=tmp_path)
+    summary = evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, 6, 3, out=tmp_path)
     assert summary["methods"] == undisturbed[1]["methods"]
     # Nothing was done twice.
     assert (tmp_path / "pairs.jsonl").read_bytes().count(b"\n") == 12
@@ -116,7 +122,7 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
 
 def test_any_executor_will_do(undisturbed, tmp_path):
     with ThreadPoolExecutor(1) as executor:
-        summary = evaluate(small_folder(), SlowBackbone(seconds=0), ROWS, 6, 3, out=tmp_path, executor=executor)
+        summary = evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, 6, 3, out=tmp_path, executor=executor)
     assert summary["methods"] == undisturbed[1]["methods"]
 
 
@@ -218,22 +224,22 @@ def test_parts_that_a_killed_run_left_are_taken_up(undisturbed, tmp_path):
     (tmp_path / "pairs.jsonl").write_bytes(b"".join(lines[:2]))
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "lump-0000.jsonl").write_bytes(lines[1] + lines[2] + b"{torn\n" + lines[3] + lines[4][:20])
-    with RunFolder(tmp_path, _settings(out), {}) as folder:
+    with RunFolder(tmp_path, _settings(out)) as folder:
         assert len(folder.records) == 4
     assert (tmp_path / "pairs.jsonl").read_bytes() == b"".join(lines[:4])
     assert not list((tmp_path / "parts").iterdir())
-    assert evaluate(small_folder(), SlowBackbone(seconds=0), ROWS, 6, 3, out=tmp_path)["methods"] == summary["methods"]
+    assert evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, 6, 3, out=tmp_path)["methods"] == summary["methods"]
 
 
 def _settings(out: Path) -> dict:
-    return {key: value for key, value in json.loads((out / "run.json").read_text()).items() if key != "methods"}
+    return json.loads((out / "run.json").read_text())
 
 
 def test_a_folder_takes_one_run_at_a_time(undisturbed):
     out, _ = undisturbed
-    with RunFolder(out, _settings(out), {}), pytest.raises(InputError, match="another run is writing"):
-        RunFolder(out, _settings(out), {})
-    with RunFolder(out, _settings(out), {}):
+    with RunFolder(out, _settings(out)), pytest.raises(InputError, match="another run is writing"):
+        RunFolder(out, _settings(out))
+    with RunFolder(out, _settings(out)):
         pass
 
 
@@ -242,7 +248,7 @@ def test_a_runs_folder_says_how_it_came_about(undisturbed):
     begun, ended = (json.loads(line) for line in (out / "invocations.jsonl").read_text().splitlines())
     assert begun["versions"]["torch"] and begun["machine"]["cores"] and begun["rows"] == list(ROWS)
     assert begun["workers"] == 1 and begun["threads"] >= 1 and ended["seconds"] > 0
-    assert _settings(out)["seed"] == 0 and set(json.loads((out / "run.json").read_text())["methods"]) == set(ROWS)
+    assert _settings(out)["seed"] == 0 and set(_settings(out)["methods"]) == set(ROWS)
     for record in read_records(out / "pairs.jsonl").values():
         assert record["seed"] > 0 and record["seconds"] > 0
 
@@ -277,27 +283,33 @@ def test_the_points_behind_a_frames_patches_are_worked_out_once():
     assert store.view("other", ("100_a", 1), "mask", 0.05).patch_points is not points
 
 
-def test_frames_are_forgotten_after_their_last_pair():
+def test_frames_are_forgotten_after_their_last_pair(monkeypatch):
     root, rows = small_folder(), resolve(["ours"])
     work = list(work_of_categories(pairs_of_rows(root, rows, 6, 2, categories=["lump"]))["lump"])
     (chunk,) = split([(pair, ["ours"]) for pair in work], 1)
     job = Job(str(root), "lump", chunk, rows, BACKBONE)
     most, every = frames_at_once([pair for pair, _ in chunk]), {key for pair in work for key in frame_keys(pair)}
-    assert 3 <= most <= len(every)
+    assert 3 <= most < len(every)
+    held, release = [], FrameStore.release
+
+    def watched(store, keys):
+        held.append(len(store._frames))
+        release(store, keys)
+
+    monkeypatch.setattr(FrameStore, "release", watched)
     assert len(list(records_of(job, worker_extractors(job)))) == 6
+    assert 3 <= max(held) <= most
     assert frames_at_once(work[:1]) == 3
 
 
-def test_a_cache_keeps_features_for_other_runs_and_changes_nothing(undisturbed, tmp_path):
-    @dataclass(frozen=True)
-    class Never(CoordinateBackbone):
-        def __call__(self, images):
-            raise AssertionError("all is in the cache")
+def test_a_cache_keeps_features_for_other_runs_and_changes_nothing(undisturbed, tmp_path, monkeypatch):
+    def never(self, images):
+        raise AssertionError("all is in the cache")
 
-    Never.__name__ = "SlowBackbone"
     arguments = {"pairs": 6, "targets": 3, "cache": tmp_path / "cache"}
-    first = evaluate(small_folder(), SlowBackbone(seconds=0), ROWS, out=tmp_path / "a", **arguments)
-    second = evaluate(small_folder(), Never(), ROWS, out=tmp_path / "b", **arguments)
+    first = evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, out=tmp_path / "a", **arguments)
+    monkeypatch.setattr(SlowBackbone, "__call__", never)
+    second = evaluate(small_folder(), SlowBackbone(_seconds=0), ROWS, out=tmp_path / "b", **arguments)
     assert first["methods"] == second["methods"] == undisturbed[1]["methods"]
 
 
@@ -330,6 +342,8 @@ def test_a_plan_counts_what_the_run_then_does(tmp_path):
     assert made.results_bytes / 3 < size_found < made.results_bytes * 3
     left = plan_run(small_folder(), BACKBONE, rows, 3, 2, out=tmp_path / "run", seed=1)
     assert left.pairs == left.frames == 0 and left.described == "nothing is left to do"
+    with pytest.raises(InputError, match="other settings .backbone"):
+        plan_run(small_folder(), CoordinateBackbone(frequencies=8), rows, 3, 2, out=tmp_path / "run", seed=1)
 
 
 def test_a_plan_shares_the_work_out():
@@ -374,16 +388,129 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
         evaluate(small_folder(), BACKBONE, {"mine": lambda problem: np.eye(3)}, **settings)
 
 
+def one_way(similarity, on_reference, on_target):
+    score, partner = similarity.max(dim=1)
+    return partner, score.double()
+
+
+def turned_by(angle):
+    return lambda problem: angle * np.eye(3)
+
+
+class OwnEstimator:
+    def __init__(self, k, weights=None):
+        self.k, self.weights, self._cache = k, weights, object()
+
+    def estimate(self, reference, targets):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda k: Method(settings={"matcher": one_way, "k": k}),
+        lambda k: Method(solve=partial(own_method, k=k)),
+        lambda k: turned_by(k),
+        lambda k: OwnEstimator(k),
+        lambda k: OwnEstimator(1, np.arange(k)),
+        lambda k: ZeroShotPose(BACKBONE, k=k),
+        lambda k: ZeroShotPose(CoordinateBackbone(frequencies=k)),
+    ],
+)
+def test_a_row_of_ones_own_is_known_by_all_of_its_settings(make):
+    first, again, other = (fingerprint(resolve({"mine": make(k)})["mine"]) for k in (30, 30, 70))
+    assert first == again != other
+
+
+def test_a_backbone_of_ones_own_is_known_by_more_than_its_name():
+    def grey(images):
+        return BACKBONE([image // 2 for image in images])
+
+    first, again, other = (extractor_fingerprint(one) for one in (BACKBONE, CoordinateBackbone(), grey))
+    assert first == again != other
+    assert len({extractor_fingerprint(CoordinateBackbone(frequencies=n)) for n in (8, 32)}) == 2
+
+
+def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
+    root = shutil.copytree(small_folder(), tmp_path / "data")
+    settings = {"methods": ["ours-bv"], "pairs": 2, "targets": 2, "categories": ["lump"], "out": tmp_path / "run"}
+    evaluate(root, BACKBONE, **settings)
+    labels = read_labels(root, "lump")
+    name = next(name for name, label in labels.items() if name != label.reference_seq)
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ turn))
+    with pytest.raises(InputError, match=f"lump/{name}: the pose label has changed"):
+        evaluate(root, BACKBONE, **settings)
+    evaluate(root, BACKBONE, **settings | {"out": tmp_path / "other"})
+
+
+def test_a_worker_that_finds_another_backbone_under_the_name_says_so():
+    root, rows = small_folder(), resolve(["ours"])
+    pairs = pairs_of_rows(root, rows, 1, 2, categories=["lump"])["ours"]
+    job = Job(str(root), "lump", [(pair, ["ours"]) for pair in pairs], rows, "zsp-tiny", fingerprint="zsp-tiny 0123")
+    with pytest.raises(InputError, match="zsp-tiny is zsp-tiny .* to a worker, expected zsp-tiny 0123"):
+        run_job(job)
+
+
+def test_without_being_told_a_run_is_of_the_categories_that_have_labels(tmp_path):
+    root = shutil.copytree(small_folder(), tmp_path / "data")
+    shutil.rmtree(root / "class_labels" / "lump")
+    assert {pair.category for pair in pairs_of_rows(root, resolve(["ours"]), 1, 2)["ours"]} == {"pebble"}
+    (twice,) = pairs_of_rows(root, resolve(["ours"]), 3, 2, categories=["pebble", "pebble"]).values()
+    assert len(twice) == 3
+    with pytest.raises(InputError, match="lump has 0 labelled sequences"):
+        pairs_of_rows(root, resolve(["ours"]), 1, 2, categories=["lump"])
+    shutil.rmtree(root / "class_labels")
+    with pytest.raises(InputError, match="none of 2 categories has pose labels"):
+        pairs_of_rows(root, resolve(["ours"]), 1, 2)
+
+
+def test_results_are_of_the_rows_and_categories_that_the_summary_is_of(tmp_path):
+    arguments = {"pairs": 2, "targets": 2, "out": tmp_path}
+    evaluate(small_folder(), BACKBONE, ["ours", "ours-bv"], **arguments)
+    evaluate(small_folder(), BACKBONE, ["ours-bv"], categories=["lump"], **arguments)
+    results = read_results(tmp_path)
+    assert list(results.rows) == ["ours-bv"] and len(results.errors("ours-bv")) == 2
+
+
+def test_a_torn_line_of_the_invocations_does_no_harm(tmp_path):
+    arguments = {"pairs": 1, "targets": 2, "out": tmp_path, "categories": ["lump"]}
+    evaluate(small_folder(), BACKBONE, ["ours-bv"], **arguments)
+    path = tmp_path / "invocations.jsonl"
+    path.write_bytes(path.read_bytes()[:-30])
+    evaluate(small_folder(), BACKBONE, ["ours-bv", "oracle-view"], **arguments)
+    invocations = read_results(tmp_path).invocations
+    assert [one.get("rows") for one in invocations if "rows" in one] == [["ours-bv"], ["ours-bv", "oracle-view"]]
+
+
+@pytest.mark.parametrize(
+    "answer, told",
+    [
+        (Answer(2 * np.eye(3)), "not a rotation"),
+        (Answer(np.eye(3), details={"error": 1.0}), "details name error"),
+        (Answer(np.eye(3), details={"matches": np.arange(3)}), "matches is a ndarray"),
+    ],
+)
+def test_an_answer_that_says_too_much_is_refused(answer, told):
+    with pytest.raises(InputError, match=told):
+        as_answer(answer)
+
+
+def test_numbers_of_numpy_are_kept_as_numbers():
+    assert json.dumps(dict(as_answer(Answer(np.eye(3), details={"inliers": np.int64(3)})).details)) == '{"inliers": 3}'
+
+
 def test_answers_that_are_none_are_refused_or_fail(tmp_path):
     settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     rows = {
+        "large": lambda problem: Answer(2 * np.eye(3)),
         "words": lambda problem: "north",
         "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]),
         "far view": lambda problem: (np.eye(3), 2),
     }
     summary = evaluate(small_folder(), BACKBONE, rows, **settings)
     assert all(row["failed"] == 1 and row["median"] == 180 for row in summary["methods"].values())
-    for methods in ([], {"a": 3}, ["nowhere:nothing"], "nonesuch"):
+    for methods in ([], {"a": 3}, ["nowhere:nothing"], ["./here.py:nothing"], "nonesuch"):
         with pytest.raises(InputError):
             resolve(methods)
 

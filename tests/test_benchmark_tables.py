@@ -56,7 +56,7 @@ def made_up_run(out, rows=ROWS, seed=0):
         pairs[name] = [
             Pair(category, f"s{i}", i, f"t{i}", tuple(range(n or 5))) for category in CATEGORIES for i in range(PAIRS)
         ]
-    with RunFolder(out, {"seed": seed}, dict.fromkeys(rows, "x")) as folder:
+    with RunFolder(out, {"seed": seed, "methods": dict.fromkeys(rows, "x")}) as folder:
         for name in rows:
             for pair in pairs[name]:
                 found = {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "", "inliers": 9}
@@ -196,7 +196,14 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
     assert "old" not in once and once.startswith("before\n<!-- table table_1 -->\n**Table 1.") and "between" in once
     assert f"{run[1]['methods']['ours']['acc30']:.1f}" in once and "hydrant" not in once
     assert with_tables(once, every_table(run[1]), 1234) == once
-    for wrong, told in (("no marks", "no marked table"), (text.replace("table_3", "table_9"), "table_9")):
+    lost = text.replace("<!-- end of table -->\nbetween", "between")
+    for wrong, told in (
+        ("no marks", "no marked table"),
+        (text.replace("table_3", "table_9"), "table_9"),
+        (lost, "table_3 --> out of turn"),
+        (text[: text.rindex("<!--")], "table_3 --> out of turn"),
+        (text[text.index("old") :], "end of table --> out of turn"),
+    ):
         with pytest.raises(InputError, match=told):
             with_tables(wrong, every_table(run[1]), 1234)
 

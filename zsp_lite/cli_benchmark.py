@@ -22,7 +22,7 @@ def add_benchmark(commands) -> None:
     )  # fmt: skip
     _add_data(parser)
     _add_backbone(parser)
-    parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all of the folder's")
+    parser.add_argument("--categories", type=_names, metavar="A,B", help="default: all that have pose labels")
     parser.add_argument("--pairs", type=_count, default=30, metavar="N", help="pairs per category (default: 30)")
     parser.add_argument(
         "--targets", type=_count, default=5, metavar="N",

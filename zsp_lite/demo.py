@@ -14,7 +14,7 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.frames import Frame
 from zsp_lite.labels import read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import Pair, sample_pairs, shipped_pairs
+from zsp_lite.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
 
 N_TARGETS = 5
@@ -35,16 +35,13 @@ class DemoResult:
 
 
 def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
-    """The first evaluation pair of every category: fixed beforehand, not picked for its result.
+    """The first evaluation pair of every category with pose labels: fixed beforehand, not picked for its result.
 
     Categories without evaluation pairs for `n_targets` get the first pair of a sample with seed 0. Raises
-    InputError where the folder holds no category.
+    InputError where the folder holds no such category.
     """
-    categories = dataset.categories()
-    if not categories:
-        raise InputError(f"{dataset.root}: no category found, expected folders with frame_annotations.jgz")
     pairs = []
-    for category in categories:
+    for category in labelled_categories(dataset):
         shipped = shipped_pairs(dataset, category, n_targets)
         pairs.append((shipped or sample_pairs(dataset, category, 1, n_targets, seed=0))[0])
     return pairs

@@ -85,6 +85,22 @@ def sample_pairs(
     return pairs
 
 
+def labelled_categories(dataset: Co3D) -> list[str]:
+    """The categories that pairs can be made of: CO3D's folders hold more than anyone has labelled.
+
+    Raises InputError where there is none.
+    """
+    categories = dataset.categories()
+    if not categories:
+        raise InputError(f"{dataset.root}: no category found, expected folders with frame_annotations.jgz")
+    if found := [category for category in categories if len(read_labels(dataset.root, category)) >= 2]:
+        return found
+    raise InputError(
+        f"{dataset.root}: none of {len(categories)} categories has pose labels of two sequences, expected them in "
+        "class_labels/CATEGORY/SEQUENCE.json (see zsp-lite data labels)"
+    )
+
+
 def upstream_pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
     """Where a data folder keeps its evaluation set: ROOT/determ_eval/{n}samples_{N}tgt/CATEGORY.pt."""
     folder = Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt"

@@ -33,14 +33,19 @@ print(json.dumps({"frames": len(keys), "seconds": opened - start, "sequence_seco
 
 
 def process_memory(field: str = "VmHWM") -> int:
-    """Bytes of memory of this process: "VmHWM", the most so far, or "VmRSS", now.  macOS knows the most alone."""
+    """Bytes of memory of this process: "VmHWM", the most so far, or "VmRSS", now; 0 where the system does not say.
+
+    macOS knows the most alone, Windows neither.
+    """
     try:
         # ru_maxrss of a child starts at its parent's size on Linux; /proc knows this process alone.
         status = Path("/proc/self/status").read_text()
         return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith(f"{field}:")))
-    except OSError:
-        import resource
-
+    except (OSError, StopIteration):
+        try:
+            import resource
+        except ImportError:
+            return 0
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 

@@ -16,6 +16,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 
 _MARKED = re.compile(r"(<!-- table (\S+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
+_MARK = re.compile(r"<!-- (table \S+|end of table) -->")
 _CATEGORY = re.compile(r"\w+ Acc30")
 
 
@@ -23,11 +24,15 @@ def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     """The text with its marked tables anew, without their notes and columns of single categories.
 
     pairs: that the run's figures are of; the titles say so.
-    Raises InputError for a mark that names no table of the run, and where there is none.
+    Raises InputError for a mark that names no table of the run or has no counterpart, and where there is none.
     """
     by_name = {table.name: table for table in tables}
-    if not _MARKED.search(text):
+    marks = _MARK.findall(text)
+    if not marks:
         raise InputError("document has no marked table, expected <!-- table NAME --> and <!-- end of table -->")
+    for i, mark in enumerate(marks):
+        if mark.startswith("end") != bool(i % 2) or (i % 2 == 0 and i + 1 == len(marks)):
+            raise InputError(f"document has <!-- {mark} --> out of turn, expected a start and an end for each table")
 
     def fresh(found: re.Match[str]) -> str:
         start, name, _, end = found.groups()
@@ -39,8 +44,11 @@ def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
 
 
 def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> None:
-    """Write the tables into a file. Raises what `with_tables` does."""
-    text = read_bytes(Path(path), "document").decode()
+    """Write the tables into a file. Raises what `with_tables` does, and InputError for what is no text."""
+    try:
+        text = read_bytes(Path(path), "document").decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"document {path} is no UTF-8 text ({error})") from error
     write_atomic(path, with_tables(text, tables, pairs).encode())
 
 

@@ -60,7 +60,7 @@ def open_crew(executor: Executor | str | None, workers: int = 1) -> Iterator[Cre
         module, _, name = executor.partition(":")
         try:
             made = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
             raise InputError(
                 f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor ({error})"
             ) from error

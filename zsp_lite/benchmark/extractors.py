@@ -12,6 +12,7 @@ from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast
 from zsp_lite.baselines.rootsift import RootSift
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.baselines.swav import load_swav, load_swav_tiny
+from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.vit import VisionTransformer
@@ -54,7 +55,7 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
 
 
 def fingerprint(extractor: Any) -> str:
-    """An extractor's name and a hash of its weights and of what it does with them.
+    """An extractor's name and a hash of its weights and of what it does with them, or of what someone's own is.
 
     Retrained weights of the same name are another extractor, and so are another block or facet, another size of the
     input and another mean or standard deviation to normalise it by.
@@ -62,7 +63,10 @@ def fingerprint(extractor: Any) -> str:
     name = getattr(extractor, "name", type(extractor).__name__)
     if not isinstance(extractor, Backbone):
         weights = extractor.state_dict() if hasattr(extractor, "state_dict") else {}
-        return f"{name} {_digest('', weights)}" if weights else name
+        if weights:
+            return f"{name} {_digest('', weights)}"
+        own = extractor is not None and not type(extractor).__module__.startswith("zsp_lite.")
+        return f"{name} {digest_of(extractor)}" if own else name
     chosen = (
         extractor.key_block, extractor.facet, extractor.saliency_heads, extractor.image_size, extractor.mean,
         extractor.std, extractor.precision,

@@ -21,6 +21,7 @@ from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.storage import PartReader, part_writer
 from zsp_lite.benchmark.store import FrameKey, FrameStore
 from zsp_lite.co3d import Co3D
+from zsp_lite.errors import InputError
 from zsp_lite.labels import read_labels
 from zsp_lite.pairs import Pair
 
@@ -33,6 +34,7 @@ class Job:
 
     backbone: what `load_backbone` takes, or an object that is called on images.  cache: folder of feature maps, None
     for none.  threads: of torch while it describes a frame.  part: the file to append records to, None for no file.
+    fingerprint: of the backbone that a worker is to find under the name, None for any.
     """
 
     root: str
@@ -43,6 +45,7 @@ class Job:
     cache: str | None = None
     threads: int | None = None
     part: str | None = None
+    fingerprint: str | None = None
 
 
 def split(work: Work, pieces: int) -> list[list[tuple[Pair, Sequence[str]]]]:
@@ -99,15 +102,22 @@ def run_job(job: Job) -> list[dict]:
 
 
 def worker_extractors(job: Job) -> dict[str, Any]:
-    """The extractors of a job's rows; loaded once in a process where the backbone goes by its name."""
+    """The extractors of a job's rows; loaded once in a process where the backbone goes by its name.
+
+    Raises InputError where the name stands for another backbone here than where the run was started.
+    """
     names = tuple(dict.fromkeys(method.features for method in job.methods.values()))
     if not isinstance(job.backbone, str | BackboneChoice):
         return make_extractors(job.backbone, names)
     with _loading:
-        if (job.backbone, names) not in _loaded:
+        wanted = job.backbone, job.fingerprint, names
+        if wanted not in _loaded:
             _loaded.clear()
-            _loaded[job.backbone, names] = make_extractors(load_backbone(job.backbone), names)
-        return _loaded[job.backbone, names]
+            backbone = load_backbone(job.backbone)
+            if job.fingerprint not in (None, found := fingerprint(backbone)):
+                raise InputError(f"backbone {job.backbone} is {found} to a worker, expected {job.fingerprint}")
+            _loaded[wanted] = make_extractors(backbone, names)
+        return _loaded[wanted]
 
 
 _loaded: dict[tuple, dict[str, Any]] = {}

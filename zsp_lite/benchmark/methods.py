@@ -6,12 +6,14 @@ given and may answer stands in `problem`.
 
 import hashlib
 import importlib
-import inspect
+import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
+from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.robustness import DAMAGES, Damaged
 from zsp_lite.errors import InputError
 from zsp_lite.verified import VerifiedSettings
@@ -176,23 +178,13 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
 
 
 def fingerprint(method: Method) -> str:
-    """What decides a row's results, as far as it can be told: its settings, and the source of functions.
+    """What decides a row's results, as far as it can be told: its settings, and what functions and objects do.
 
     Two rows of one name and different fingerprints must not share a file.
     """
+    if method.solve is not None or any(callable(value) for value in method.settings.values()):
+        return digest_of((method.features, method.answer, method.settings, method.targets, method.solve))
     text = f"{method.features} {method.answer} {sorted(method.settings.items(), key=str)!r} {method.targets}"
-    functions = [method.solve, *(value for value in method.settings.values() if callable(value))]
-    text = text if not any(functions) else ""  # a function's repr has its address in it
-    for function in functions:
-        if function is None:
-            continue
-        if is_dataclass(function) and " at 0x" not in repr(function):  # a function with settings, none without a name
-            text += repr(function)
-        known = function if inspect.isroutine(function) or inspect.isclass(function) else type(function)
-        try:
-            text += inspect.getsource(known)
-        except (OSError, TypeError):  # typed in at a prompt
-            text += getattr(known, "__qualname__", str(known))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -219,11 +211,13 @@ def _method(name: str, meant: Any) -> Method:
 
 def _import(path: str) -> Any:
     module, _, name = path.partition(":")
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # a console script does not look into the current folder by itself
     try:
         found = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise InputError(f"method {path!r} cannot be imported: {error}") from error
     return found
 

@@ -17,6 +17,9 @@ from zsp_lite.frames import Frame
 from zsp_lite.pairs import Pair
 from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
 
+# What is found out about an answer: no detail may go by one of these names.
+MEASURED = ("error", "failed", "translation_error", "scale", "view", "note")
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -24,7 +27,7 @@ class Answer:
 
     rotation: from the reference's camera to that of target view `view` (an index).  translation: in the target's
     unit, and scale: where the method knows them.  note: why not to trust it, "" for no reason.  details: figures
-    worth keeping with it, such as {"inliers": 12}.
+    worth keeping with it, such as {"inliers": 12}; "timings" in it are seconds by stage.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -38,10 +41,11 @@ class Answer:
 def as_answer(found: Any) -> Answer:
     """An Answer from what methods return: itself, a PoseEstimate, a Sim3 or a rotation (of view 0), or (pose, view).
 
-    Raises InputError for anything else, and for a matrix that is no rotation.
+    Raises InputError for anything else, for a matrix that is no rotation, and for details that are named like what is
+    measured or hold more than numbers and texts.
     """
     if isinstance(found, Answer):
-        return found
+        return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
     if isinstance(found, PoseEstimate):
         details = {"matches": len(found.matches), "inliers": int(found.inliers.sum()), "timings": found.timings}
         if found.confidence is not None:
@@ -50,13 +54,27 @@ def as_answer(found: Any) -> Answer:
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
-    matrix = np.asarray(pose, dtype=np.float64) if isinstance(pose, np.ndarray | torch.Tensor | list) else np.empty(0)
+    return Answer(_rotation(pose), int(view))
+
+
+def _rotation(found: Any) -> Float[np.ndarray, "3 3"]:
+    matrix = np.asarray(found, dtype=np.float64) if isinstance(found, np.ndarray | torch.Tensor | list) else np.empty(0)
     if matrix.shape != (3, 3):
         raise InputError(
             f"method returned a {type(found).__name__}, expected a Sim3 or 3x3 rotation, alone or with the view's "
             "index, a PoseEstimate or an Answer"
         )
-    return Answer(Sim3(1.0, matrix, np.zeros(3)).R, int(view))
+    return Sim3(1.0, matrix, np.zeros(3)).R
+
+
+def _details(details: Mapping[str, Any]) -> dict[str, Any]:
+    if taken := sorted({*MEASURED} & details.keys()):
+        raise InputError(f"method's details name {', '.join(taken)}, expected other names than {', '.join(MEASURED)}")
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in details.items()}
+    for name, value in plain.items():
+        if name != "timings" and not isinstance(value, bool | int | float | str | None):
+            raise InputError(f"method's detail {name} is a {type(value).__name__}, expected a number or a text")
+    return plain
 
 
 class Problem:
@@ -121,9 +139,8 @@ class Problem:
         keys = self.keys[1:]
         if only is not None:
             keys, targets = keys[only : only + 1], targets[only : only + 1]
-        # All that follows the similarities differs with these; what stays at its default drops out of the name.
-        matching = replace(solver, view_selector="correspond", trials=1, threshold=1.0, sample_size=3)
-        name = tuple(getattr(matching, part) for part in (
+        # What matches depend on; estimates that agree in it share them.
+        name = tuple(getattr(solver, part) for part in (
             "k", "kmeans", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning",
         ))  # fmt: skip
         comparisons, seconds = [], 0.0

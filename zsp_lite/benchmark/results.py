@@ -2,12 +2,13 @@
 
 import gzip
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.benchmark.storage import INVOCATIONS, PAIRS, SETTINGS, read_records
+from zsp_lite.benchmark.storage import PAIRS, SETTINGS, read_invocations, read_records
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 
@@ -47,13 +48,14 @@ def read_results(path: str | Path) -> Results:
             raise InputError(f"{path} holds no summary.json; run the benchmark to its end first")
         summary = _decode(read_bytes(path / "summary.json", "summary"), path / "summary.json")
         settings = _decode(read_bytes(path / SETTINGS, "settings"), path / SETTINGS)
+        # What the summary is of: earlier calls may have left other rows, and other categories, in the folder.
+        asked, categories = summary["methods"], summary["data"]["categories"]
         rows: dict[str, dict[str, dict]] = {}
         for key, record in read_records(path / PAIRS, mend=False).items():
             for name, found in record["methods"].items():
-                kept = {part: found[part] for part in _KEPT if part in found}
-                rows.setdefault(name, {})[key] = kept
-        lines = (path / INVOCATIONS).read_text().splitlines() if (path / INVOCATIONS).is_file() else []
-        return Results(summary, settings, [_decode(line.encode(), path / INVOCATIONS) for line in lines], rows)
+                if name in asked and record["category"] in categories:
+                    rows.setdefault(name, {})[key] = {part: found[part] for part in _KEPT if part in found}
+        return Results(summary, settings, read_invocations(path), rows)
     content = _decode(_inflate(read_bytes(path, "results"), path), path)
     try:
         keys = content["pairs"]
@@ -97,7 +99,7 @@ def _rounded(value: Any) -> Any:
 def _inflate(data: bytes, path: Path) -> bytes:
     try:
         return gzip.decompress(data)
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"results {path}: not a gzip file, or cut off ({error})") from error
 
 

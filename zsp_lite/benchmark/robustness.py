@@ -107,7 +107,7 @@ class Damaged:
 
 
 def object_spread(frame: Frame) -> float:
-    """Standard deviation, averaged over the axes, of the points seen on the object (without a mask, of all)."""
+    """Standard deviation, the root of the axes' mean variance, of the points seen on the object (no mask: of all)."""
     depth = _depth(frame)
     on = (depth > 0) & (True if frame.mask is None else frame.mask > 0.5)
     row, column = np.nonzero(on if on.any() else depth > 0)

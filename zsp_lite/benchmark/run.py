@@ -8,22 +8,25 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from zsp_lite.backbones import Backbone, BackboneChoice, load_backbone
 from zsp_lite.benchmark.execution import default_threads, execute, open_crew
 from zsp_lite.benchmark.extractors import Extractor, fingerprint, make_extractors, random_backbone
+from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.jobs import Job, split
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, resolve
 from zsp_lite.benchmark.methods import fingerprint as method_fingerprint
 from zsp_lite.benchmark.plan import Plan, plan
-from zsp_lite.benchmark.storage import RunFolder, read_records, surroundings
+from zsp_lite.benchmark.storage import RunFolder, read_records, same_run, surroundings
 from zsp_lite.benchmark.summary import summarise_run
 from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
 from zsp_lite.files import write_atomic
-from zsp_lite.pairs import Pair, sample_pairs, shipped_pairs
+from zsp_lite.labels import read_labels
+from zsp_lite.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 
 __all__ = ["GROUPS", "METHODS", "Method", "category_pairs", "evaluate", "random_backbone", "read_records"]
 
@@ -48,7 +51,7 @@ def evaluate(
 
     methods: rows, see `methods.resolve`.  pairs: per category; the folder's own evaluation set where it holds that
     many, else sampled with `seed` (see `category_pairs`).  targets: views per pair, for rows that do not fix them.
-    categories: default all of the folder's.  progress(done, total): called after each pair.
+    categories: default all of the folder's that have pose labels.  progress(done, total): called after each pair.
     executor, workers: who does the work, see `execution.open_crew`; `root`, and `backbone` where it is a file, must be
     at the same place for all of them.  threads: of torch for each while it describes a frame; default: the cores
     shared out.  cache: a folder to keep feature maps in, for other runs.
@@ -62,14 +65,8 @@ def evaluate(
     named = isinstance(backbone, str | BackboneChoice)
     name, backbone = backbone, load_backbone(backbone) if named else backbone
     made: dict[str, Any] = make_extractors(backbone, [row.features for row in rows.values()])
-    settings = {
-        "data": str(root), "backbone": fingerprint(backbone), "pairs": pairs, "targets": targets, "seed": seed,
-    }  # fmt: skip
-    fingerprints = {
-        name: method_fingerprint(row) + ("" if row.features == "backbone" else f" {fingerprint(made[row.features])}")
-        for name, row in rows.items()
-    }
-    with RunFolder(out, settings, fingerprints) as folder:
+    settings = _settings(root, backbone, made, rows, row_pairs, pairs, targets, seed)
+    with RunFolder(out, settings) as folder:
         todo = {
             category: [(pair, left) for pair, names in found.items() if (left := folder.wanted(pair.key, names))]
             for category, found in work.items()
@@ -95,7 +92,7 @@ def evaluate(
                 jobs = [
                     Job(
                         str(Path(root).resolve()), category, chunk, rows, name if named else backbone,
-                        None if cache is None else str(Path(cache).resolve()), each,
+                        None if cache is None else str(Path(cache).resolve()), each, fingerprint=settings["backbone"],
                     )
                     for category, found in todo.items() if found for chunk in split(found, pieces)
                 ]  # fmt: skip
@@ -122,9 +119,11 @@ def plan_run(
 ) -> Plan:
     """What `evaluate` with these arguments would take from here on; writes nothing. Raises what it would."""
     rows = resolve(methods)
-    work = work_of_categories(pairs_of_rows(root, rows, pairs, targets, seed, categories))
+    row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
+    work = work_of_categories(row_pairs)
     backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneChoice) else backbone
     extractors = make_extractors(backbone, [row.features for row in rows.values()])
+    same_run(Path(out), _settings(root, backbone, extractors, rows, row_pairs, pairs, targets, seed))
     path = Path(out) / "pairs.jsonl"
     known = {key: record["methods"] for key, record in read_records(path, mend=False).items()}
     todo = {}
@@ -132,6 +131,35 @@ def plan_run(
         left = {pair: [name for name in names if name not in known.get(pair.key, ())] for pair, names in found.items()}
         todo[category] = [(pair, names) for pair, names in left.items() if names]
     return plan(root, todo, rows, extractors)
+
+
+def _settings(
+    root: str | Path,
+    backbone: Any,
+    extractors: Mapping[str, Any],
+    rows: Mapping[str, Method],
+    row_pairs: Mapping[str, Sequence[Pair]],
+    pairs: int,
+    targets: int,
+    seed: int,
+) -> dict[str, Any]:
+    """What decides a run's results: see `storage.same_run`."""
+    used: dict[str, set[str]] = {}
+    for pair in chain.from_iterable(row_pairs.values()):
+        used.setdefault(pair.category, set()).update((pair.reference_sequence, pair.target_sequence))
+    labels = {
+        f"{category}/{name}": digest_of((label.trans, label.reference_seq))
+        for category, names in used.items() for name, label in read_labels(root, category).items() if name in names
+    }  # fmt: skip
+    methods = {
+        name: method_fingerprint(row)
+        + ("" if row.features == "backbone" else f" {fingerprint(extractors[row.features])}")
+        for name, row in rows.items()
+    }
+    return {
+        "data": str(root), "backbone": fingerprint(backbone), "pairs": pairs, "targets": targets, "seed": seed,
+        "methods": methods, "labels": labels,
+    }  # fmt: skip
 
 
 def pairs_of_rows(
@@ -144,10 +172,11 @@ def pairs_of_rows(
 ) -> dict[str, list[Pair]]:
     """The pairs that each row is evaluated on: the same for all rows of as many target views.
 
+    categories: default all that have pose labels.
     Raises InputError for unknown categories, and where these cannot give so many pairs or views.
     """
     dataset = Co3D(root)
-    categories = list(categories or dataset.categories())
+    categories = list(dict.fromkeys(categories or labelled_categories(dataset)))
     if missing := sorted(set(categories) - set(dataset.categories())) or not categories:
         found = ", ".join(dataset.categories()) or "none"
         raise InputError(f"{root}: no categories {missing or ''}, found {found}")

@@ -1,6 +1,6 @@
 """A run's folder: what it is a run of, every finished pair, who worked on it when. Safe against a kill at any moment.
 
-    run.json           settings that decide the results; a folder with others is refused
+    run.json           what decides the results: settings, rows, pose labels; a folder with others is refused
     invocations.jsonl  one line per call: command, versions, git revision, machine, threads, seconds
     pairs.jsonl        one line per finished pair (or more: rows added later have lines of their own)
     parts/             lines of workers of other processes, until they stand in pairs.jsonl
@@ -27,6 +27,11 @@ from zsp_lite.errors import InputError
 from zsp_lite.files import write_atomic
 
 SETTINGS, INVOCATIONS, PAIRS, PARTS = "run.json", "invocations.jsonl", "pairs.jsonl", "parts"
+# Parts of the settings that a later call may add to, and what to do where one of their members has changed.
+_GROWING = {
+    "methods": "the method has changed since; choose another folder or another name",
+    "labels": "the pose label has changed since; choose another folder",
+}
 _PACKAGES = ("zsp-lite", "torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d")
 
 
@@ -36,13 +41,15 @@ class RunFolder:
     Raises InputError where the folder holds a run of something else, a damaged one, or one that is being written to.
     """
 
-    def __init__(self, out: str | Path, settings: Mapping[str, Any], fingerprints: Mapping[str, str]):
+    def __init__(self, out: str | Path, settings: Mapping[str, Any]):
         self.out = Path(out)
         self.out.mkdir(parents=True, exist_ok=True)
         self._lock = _lock(self.out / ".lock")
         try:
-            _same_run(self.out, dict(settings))
-            _same_methods(self.out, dict(fingerprints))
+            known = json.dumps(same_run(self.out, settings), indent=1).encode()
+            path = self.out / SETTINGS
+            if not path.is_file() or path.read_bytes() != known:
+                write_atomic(path, known)
             self.records = read_records(self.out / PAIRS)
             self._lines = (self.out / PAIRS).open("ab", buffering=0)
             for part in sorted((self.out / PARTS).glob("*.jsonl")):
@@ -82,8 +89,10 @@ class RunFolder:
 
     def note(self, **facts: Any) -> None:
         """Append a line to the invocations."""
-        with (self.out / INVOCATIONS).open("a") as file:
-            file.write(json.dumps(facts) + "\n")
+        path = self.out / INVOCATIONS
+        torn = path.is_file() and not path.read_bytes().endswith(b"\n")
+        with path.open("a") as file:
+            file.write("\n" * torn + json.dumps(facts) + "\n")
 
 
 def read_records(path: Path, mend: bool = True) -> dict[str, dict]:
@@ -108,6 +117,12 @@ def read_records(path: Path, mend: bool = True) -> dict[str, dict]:
     return records
 
 
+def read_invocations(out: Path) -> list[dict]:
+    """Who worked on a run when; a line that a crash cut short is passed over."""
+    path = out / INVOCATIONS
+    return list(_whole_lines(path.read_bytes())) if path.is_file() else []
+
+
 class PartReader:
     """A worker's file while it grows; what a killed worker left of a line is passed over."""
 
@@ -124,15 +139,19 @@ class PartReader:
             return []
         data = data[: data.rfind(b"\n") + 1]
         self._offset += len(data)
-        records = []
-        for line in data.splitlines():
-            try:
-                record = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(record, dict) and {"key", "methods", "saliency_iou", "seconds_per_frame"} <= record.keys():
-                records.append(record)
-        return records
+        parts = {"key", "methods", "saliency_iou", "seconds_per_frame"}
+        return [record for record in _whole_lines(data) if parts <= record.keys()]
+
+
+def _whole_lines(data: bytes) -> Iterator[dict]:
+    """The objects of the lines that hold one."""
+    for line in data.splitlines():
+        try:
+            found = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(found, dict):
+            yield found
 
 
 def merge(record: dict, line: Mapping[str, Any]) -> None:
@@ -183,32 +202,28 @@ def git_revision() -> str | None:
         return None
 
 
-def _same_run(out: Path, settings: dict) -> None:
-    """Remember what OUT is a run of; InputError where it is one of something else."""
+def same_run(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What run.json shall say: the settings, with all rows and labels that OUT has met. Writes nothing.
+
+    In `settings`, "methods" are fingerprints of rows and "labels" of pose labels, by name; the rest decides all
+    results alike. Raises InputError where OUT is a run of something else, or one of the names stood for something
+    else in it.
+    """
     path = out / SETTINGS
-    if path.is_file():
-        before = _read_settings(path)
-        before = {name: value for name, value in before.items() if name != "methods"}
-        if before != settings:
-            differing = ", ".join(key for key in settings if before.get(key) != settings[key])
-            raise InputError(f"{out} holds a run with other settings ({differing}); choose another folder")
-    elif (out / PAIRS).exists():
-        raise InputError(f"{out} holds {PAIRS} without {SETTINGS}; choose another folder")
-    else:
-        write_atomic(path, json.dumps(settings, indent=1).encode())
-
-
-def _same_methods(out: Path, fingerprints: dict[str, str]) -> None:
-    """Remember what the rows are; InputError where one of their names stood for something else in this run."""
-    settings = _read_settings(out / SETTINGS)
-    known = settings.get("methods", {})
-    if changed := sorted(name for name, value in fingerprints.items() if known.get(name, value) != value):
-        raise InputError(
-            f"{out} holds other results of {', '.join(changed)}: the method has changed since; choose another folder "
-            "or another name"
-        )
-    if fingerprints.items() - known.items():
-        write_atomic(out / SETTINGS, json.dumps(settings | {"methods": known | fingerprints}, indent=1).encode())
+    if not path.is_file():
+        if (out / PAIRS).exists():
+            raise InputError(f"{out} holds {PAIRS} without {SETTINGS}; choose another folder")
+        return dict(settings)
+    before = _read_settings(path)
+    if differing := [key for key in settings if key not in _GROWING and before.get(key) != settings[key]]:
+        raise InputError(f"{out} holds a run with other settings ({', '.join(differing)}); choose another folder")
+    merged = dict(settings)
+    for group, remedy in _GROWING.items():
+        known, asked = before.get(group, {}), settings.get(group, {})
+        if changed := sorted(name for name, value in asked.items() if known.get(name, value) != value):
+            raise InputError(f"{out} holds other results of {', '.join(changed)}: {remedy}")
+        merged[group] = known | asked
+    return merged
 
 
 def _read_settings(path: Path) -> dict:

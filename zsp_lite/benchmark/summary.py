@@ -78,7 +78,8 @@ def _saliency(records: Sequence[dict]) -> dict[str, float]:
 def _timings(records: Sequence[dict], first: Sequence[dict]) -> dict[str, float]:
     """Median seconds of each stage of the first row, of describing a frame, and of comparing two."""
     timed = [one["timings"] for one in first if "timings" in one]
-    timings = {stage: float(median([timing[stage] for timing in timed])) for stage in (timed[0] if timed else ())}
+    stages = [stage for stage in (timed[0] if timed else ()) if all(stage in timing for timing in timed)]
+    timings = {stage: float(median([timing[stage] for timing in timed])) for stage in stages}
     frame_seconds = [record["seconds_per_frame"] for record in records if record.get("seconds_per_frame")]
     if frame_seconds:
         timings["features_per_frame"] = float(median(frame_seconds))
