@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from co3d_folders import coordinates, random_camera, seeds
@@ -5,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.cameras import Camera
 from zsp_lite.errors import InputError
 
@@ -65,6 +68,16 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7)
     np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
+
+
+def test_a_rotation_of_few_decimals_is_taken_for_the_nearest_one():
+    exact = random_camera(3)
+    short = replace(exact, R=exact.R.round(4))
+    assert 1e-6 < np.abs(exact.R.round(4) @ exact.R.round(4).T - np.eye(3)).max() < 1e-3
+    np.testing.assert_allclose(short.R @ short.R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(short.R, exact.R, atol=1e-4)
+    assert Sim3(1.0, short.R @ exact.R.T, np.zeros(3)).scale == 1.0
+    np.testing.assert_array_equal(replace(exact, R=exact.R).R, exact.R)
 
 
 def test_v1_intrinsics_worked_out_by_hand():

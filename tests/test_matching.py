@@ -16,6 +16,7 @@ from zsp_lite.matching import (
     cyclical_distances,
     match,
     nearest_neighbours,
+    plain_similarities,
     similarities,
     similarity,
 )
@@ -168,6 +169,31 @@ def test_matches_are_cycles_with_their_similarity_and_distance():
         assert cosine == sim[u, v]
         assert distance == pytest.approx(-cycles[row, column])
     assert (np.diff(matches.distance) >= 0).all()
+
+
+def test_bare_keys_are_clustered_as_bare_keys():
+    from zsp_lite.matching import _gram
+
+    features, index = feature_map(3), np.arange(0, 81, 7)
+    bare = features.keys.flatten(0, 1)[index]
+    expected = torch.nn.functional.normalize(bare, dim=1) @ torch.nn.functional.normalize(bare, dim=1).T
+    np.testing.assert_allclose(_gram(features, index, False), expected.numpy(), atol=1e-6)
+    assert np.abs(_gram(features, index, True) - expected.numpy()).max() > 0.1
+    bare, binned = (match(features, feature_map(4), k=20, binning=binning) for binning in (False, True))
+    (sim,) = plain_similarities(features, [feature_map(4)])
+    np.testing.assert_array_equal(bare.target, match(features, feature_map(4), k=20, binning=False, sim=sim).target)
+    assert not np.array_equal(bare.target, binned.target)
+
+
+@pytest.mark.parametrize("matcher", ["cyclical", "mutual"])
+@pytest.mark.parametrize("cycle_from", ["reference", "target"])
+def test_a_mask_that_does_not_fit_is_named(matcher, cycle_from):
+    maps, wrong = (feature_map(0), feature_map(1, (4, 5))), np.ones((2, 2), bool)
+    for name in ("ref_foreground", "target_foreground"):
+        with pytest.raises(InputError, match=f"match: {name} has shape .2, 2"):
+            match(*maps, cycle_from=cycle_from, matcher=matcher, **{name: wrong})
+    with pytest.raises(InputError, match="match: sim has shape .3, 3"):
+        match(*maps, cycle_from=cycle_from, matcher=matcher, sim=torch.zeros(3, 3))
 
 
 def test_without_kmeans_the_k_best_cycles_are_taken_ties_by_similarity():

@@ -22,6 +22,7 @@ NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 _AXES = np.array([-1.0, -1.0, 1.0])
 # Annotations carry float32 rotations; what deviates more than this is not a rotation at all.
 _ROTATION_TOLERANCE = 1e-3
+_EXACT = 1e-6  # what float32 leaves of one
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,8 @@ class Camera:
 
     `R` (3, 3) and `t` (3,): world to camera; `focal` (2,) and `principal_point` (2,): (x, y), pixels; `size`:
     image (height, width), pixels. Lengths are in the unit of the world. Raises InputError on values that are
-    not finite, an `R` that is not a rotation (to 1e-3), a focal length or size that is not positive.
+    not finite, an `R` that is not a rotation (to 1e-3; the nearest one is kept), a focal length or size that is
+    not positive.
     """
 
     R: Float[np.ndarray, "3 3"]
@@ -42,10 +44,14 @@ class Camera:
     def __post_init__(self):
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("principal_point", (2,))):
             object.__setattr__(self, name, _finite(getattr(self, name), shape, f"camera {name}"))
-        if np.abs(self.R @ self.R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
+        deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
+        if deviation > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
             raise InputError(
                 f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1"
             )
+        if deviation > _EXACT:  # written with few decimals: what follows takes it for a rotation
+            left, _, right = np.linalg.svd(self.R)
+            object.__setattr__(self, "R", left @ right)
         if (self.focal <= 0).any():
             raise InputError(f"camera focal is {self.focal.tolist()}, expected positive pixels")
         object.__setattr__(self, "size", _image_size(self.size))

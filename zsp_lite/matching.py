@@ -35,7 +35,7 @@ class Matches:
 
     reference: Int[np.ndarray, "k 2"]  # (row, column) on the reference's grid
     target: Int[np.ndarray, "k 2"]  # (row, column) on the target's grid
-    similarity: Float[np.ndarray, "k"]  # cosine of the two log-binned descriptors
+    similarity: Float[np.ndarray, "k"]  # cosine of the two descriptors
     distance: Float[np.ndarray, "k"]  # d(u, u') >= 0 of the cycle, in patches; of another matcher minus its score
 
     def __len__(self) -> int:
@@ -105,7 +105,10 @@ def cyclical_distances(
     n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
     if tuple(sim.shape) != (n1, n2):
         raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, grids expect {(n1, n2)}")
-    on1, on2 = _mask(fg1, grid1, "fg1", sim.device), _mask(fg2, grid2, "fg2", sim.device)
+    on1, on2 = (
+        _mask(mask, grid, f"cyclical_distances: {name}", sim.device)
+        for mask, grid, name in ((fg1, grid1, "fg1"), (fg2, grid2, "fg2"))
+    )
     forth, back = nearest_neighbours(sim)
     u = torch.arange(n1, device=sim.device)
     returned = back[forth]
@@ -129,6 +132,7 @@ def match(
     target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,
     matcher: str | Matcher = "cyclical",
+    binning: bool = True,
 ) -> Matches:
     """At most k correspondences between two feature maps (section 4.1; supplement, "K-Means clustering").
 
@@ -140,6 +144,8 @@ def match(
     clusters and salience are the target's, and `cyclical_distances` masks in its published form. Foreground
     is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
     matcher: another way to choose and rank partners than by cyclical distance, a name in `MATCHERS` or a function.
+    binning: compare and cluster log-binned descriptors, or bare keys.
+    Raises InputError for a k below 1, an unknown name, and a mask or `sim` of another shape than the maps'.
     """
     if k < 1:
         raise InputError(f"match: k is {k}, expected at least 1")
@@ -147,9 +153,16 @@ def match(
         raise InputError(f"match: matcher is {matcher!r}, expected one of cyclical, {', '.join(MATCHERS)}")
     if cycle_from not in ("reference", "target"):
         raise InputError(f"match: cycle_from is {cycle_from!r}, expected 'reference' or 'target'")
-    sim = similarity(ref, target) if sim is None else torch.as_tensor(sim)
+    if sim is None:
+        (sim,) = (similarities if binning else plain_similarities)(ref, [target])
+    sim = torch.as_tensor(sim)
+    if sim.shape != (ref.grid[0] * ref.grid[1], target.grid[0] * target.grid[1]):
+        raise InputError(f"match: sim has shape {tuple(sim.shape)}, expected one row and column per patch of "
+                         f"{ref.grid} and {target.grid}")
     on_ref = ref.foreground(threshold) if ref_foreground is None else ref_foreground
     on_target = target.foreground(threshold) if target_foreground is None else target_foreground
+    on_ref = _mask(on_ref, ref.grid, "match: ref_foreground", sim.device).reshape(ref.grid)
+    on_target = _mask(on_target, target.grid, "match: target_foreground", sim.device).reshape(target.grid)
     if cycle_from == "reference":
         start, end, on_start, on_end = ref, target, on_ref, on_target
     else:
@@ -159,9 +172,8 @@ def match(
         score = cyclical_distances(sim, start.grid, end.grid, on_start, on_end, published).flatten()
         best, neighbour = sim.max(dim=1)
     else:
-        on_start = _mask(on_start, start.grid, "ref_foreground", sim.device)
-        on_end = _mask(on_end, end.grid, "target_foreground", sim.device)
-        neighbour, score = (MATCHERS[matcher] if isinstance(matcher, str) else matcher)(sim, on_start, on_end)
+        rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
+        neighbour, score = rank(sim, on_start.flatten(), on_end.flatten())
         best = sim.gather(1, neighbour[:, None])[:, 0]
 
     # Off the device once; a few hundred candidates are a matter for numpy.
@@ -169,7 +181,7 @@ def match(
     order = np.lexsort((np.arange(len(best)), -best, -score))
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
-        clusters = _cluster(_gram(start, order), k, np.random.default_rng(seed))
+        clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
         order = order[_most_salient(clusters, start.saliency.flatten().cpu().numpy()[order])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
     v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
@@ -189,7 +201,7 @@ def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, "n"
         return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
     mask = torch.as_tensor(mask, device=device)
     if tuple(mask.shape) != grid:
-        raise InputError(f"cyclical_distances: {name} has shape {tuple(mask.shape)}, expected {grid}")
+        raise InputError(f"{name} has shape {tuple(mask.shape)}, expected {grid}")
     return mask.flatten().bool()
 
 
@@ -228,9 +240,12 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, "n"]:
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
 
-def _gram(features: FeatureMap, index: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m m"]:
-    """Cosines between the log-binned descriptors of a few patches; for so few the bins are cheap to make."""
+def _gram(features: FeatureMap, index: Int[np.ndarray, "m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
+    """Cosines between the descriptors of a few patches; for so few the bins are cheap to make."""
     keys = features.keys.to(torch.float32)
+    if not binning:
+        bare = F.normalize(keys.flatten(0, 1)[torch.from_numpy(index).to(keys.device)], dim=1)
+        return (bare @ bare.T).cpu().numpy().astype(np.float64)
     bins = bin_indices(features.grid)[:, torch.from_numpy(index)].to(keys.device)
     pooled = average_pool(average_pool(keys, 0), 1)
     descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)

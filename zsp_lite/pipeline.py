@@ -175,6 +175,7 @@ class ZeroShotPose:
         matches = match(
             reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
             ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
+            binning=self.binning,
         )  # fmt: skip
         return Comparison(
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
@@ -252,7 +253,7 @@ def view_alignment(reference: View, target: View) -> Sim3:
 
 
 def _spread(points: Float[np.ndarray, "n 3"]) -> float:
-    """Standard deviation, averaged over the axes."""
+    """Standard deviation: the root of the axes' mean variance."""
     return float(np.sqrt(points.var(axis=0).mean())) or 1.0
 
 

@@ -71,9 +71,7 @@ def train(
         raise InputError("training has 1 object, expected at least 2: the last ones are held out")
     folder = Path(folder)
     crops = object_crops(folder / "crops", config.objects, config.seed, progress=progress)
-    training, held_out = (
-        crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS) if len(crops) > VIEWS else (crops, crops)
-    )
+    training, held_out = crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS)
     note_config(config, folder / "posecontrast-tiny.json")
     torch.manual_seed(config.seed)
     model = TinyParts()

@@ -95,7 +95,9 @@ def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation
 
 
 def _render_shard(first: int, count: int, folder: Path, seed: int, proportions: float, deformation: float) -> Path:
-    path = folder / f"objects-{seed}-{first:06d}-{first + count:06d}.npz"
+    # The name says all that decides the content: what was rendered in another way is not taken for it.
+    name = f"objects-{seed}-{first:06d}-{first + count:06d}-{proportions:g}-{deformation:g}.npz"
+    path = folder / name
     if not path.exists():
         numbers = range(seed * 10_000_000 + first, seed * 10_000_000 + first + count)
         rows = [render_object(number, None, proportions, deformation) for number in numbers]

@@ -125,7 +125,7 @@ class Trainee(nn.Module):
         return self.backbone.forward_training(images, self.key_block)
 
     def centred(self, keys: Tensor, update_mean: bool = False) -> Tensor:
-        """Keys about their running mean, which `export_checkpoint` subtracts through the key bias."""
+        """Keys about their running mean; `export_checkpoint` does the same by a mean at 224 px, in the key bias."""
         keys = keys.float()
         if update_mean:
             mean = keys.detach().mean((0, 1))

@@ -78,8 +78,8 @@ class Hypothesis:
 class Solution:
     """What the solver found.
 
-    hypotheses: best score first, at least 15 degrees apart, never none.  view_angles: degrees between the reference's
-    line of sight and each target view's (N,), under the best; infinite for views left out.  flags: one line per
+    hypotheses: best score first, at least 15 degrees apart, never none.  view_angles: degrees of rotation from the
+    reference's camera to each target view's (N,), under the best; infinite for views left out.  flags: one line per
     reason not to trust it.  timings: seconds per stage.  scene: what the poses were tested on, its views in the
     order `order` of the targets.  poses: the hypotheses in its working units.
     """

@@ -7,7 +7,7 @@ seen   the share of points that lie on a seen surface
 off    how far points fall outside the silhouettes
 front  how far they float before the surfaces seen there, in space that a view saw to be free
 And one of the pictures as wholes:
-view   how alike the reference and the target views are that look from the same side as it, under the pose
+view   how alike the reference and the target views are that are little turned against it, under the pose
 A point behind a seen surface is hidden, and one where the depth is unknown may be anywhere: neither is held against
 the pose.
 """
@@ -26,7 +26,7 @@ from zsp_lite.verified.scene import Scene
 # In working units, shares of the object's spread: the width of "on the surface", and where an offence costs in full.
 TOUCH = 0.25
 FULL = 0.5
-SAME_SIDE = 45.0  # degrees between two lines of sight at which a view's likeness counts 1/e
+SAME_SIDE = 45.0  # degrees of rotation between two cameras at which a view's likeness counts 1/e
 # Weight at which a point's similarity counts half: a glimpse in one view is less than the sight of three.
 _GLIMPSE = 0.5
 # Lookups at a time; what they need then stays in the processor's cache.
@@ -82,7 +82,7 @@ class Weights:
 
     def score(self, terms: Terms) -> Float[Tensor, "m"]:
         """The weighted sum of the terms, the higher the better."""
-        return terms.table() @ torch.tensor(astuple(self))
+        return terms.table() @ torch.tensor(astuple(self), dtype=torch.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +141,8 @@ def verify(scene: Scene, poses: Poses, every: tuple[int, int] = (1, 1)) -> Terms
 def same_side(scene: Scene, poses: Poses) -> Float[Tensor, "m"]:
     """The view term: what the method chooses the best view by (sec. 4.2), as evidence for a pose among others.
 
-    Each target view's likeness to the reference, less their mean, counts by how near the pose puts its line of sight
-    to the reference's. With one target view it is 0.
+    Each target view's likeness to the reference, less their mean, counts by how little the pose turns its camera
+    against the reference's, about the line of sight too: features change with it. With one target view it is 0.
     """
     away = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
     return torch.exp(-((away / SAME_SIDE) ** 2)) @ scene.likeness
