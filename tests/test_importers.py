@@ -218,6 +218,16 @@ def test_a_box_in_the_first_picture_finds_the_object_in_all(views):
     assert np.median(overlaps) > 0.75 and min(overlaps) > 0.4, overlaps
 
 
+def test_pictures_of_unpadded_numbers_keep_their_poses(tmp_path, views):
+    twelve = [replace(views[i % len(views)], name=str(i)) for i in range(12)]
+    write_open3d(tmp_path / "padded", [replace(view, name=f"{i:04d}") for i, view in enumerate(twelve)])
+    write_open3d(tmp_path / "plain", twelve)
+    padded, plain = (READERS["open3d"](tmp_path / name).shots for name in ("padded", "plain"))
+    assert [shot.image.stem for shot in plain] == [str(i) for i in range(12)]
+    for one, other in zip(padded, plain, strict=True):
+        np.testing.assert_array_equal(one.camera.R, other.camera.R)
+
+
 def test_masks_come_from_files_by_name(tmp_path, views):
     folder = tmp_path / "scan"
     folder.mkdir()

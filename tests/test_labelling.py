@@ -158,8 +158,11 @@ def test_undo_skip_clear_and_move(root):
     labelling.undo("a")
     labelling.undo("best")
     assert len(labelling.names) == 4
+    pick_all(labelling, "b", corners()[:4])
+    labelling.accept("b")
     labelling.skip("b")
-    assert Labelling(root, "chair").progress()[-1].state == "skipped"
+    assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(root, "chair")
+    labelling.clear("b")
     labelling.pick("b", (0, 0, 0))
     assert labelling.progress()[-1].state == "open"
 

@@ -1,6 +1,7 @@
 """The demo on a folder with a known answer, and the page made of it."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -110,3 +111,11 @@ def test_the_overview_is_one_picture_of_all_results(results, tmp_path):
     picture = read_image(write_overview(tmp_path / "deep" / "overview.jpg", results * 2))
     height, width = picture.shape[:2]
     assert 2 < width / height < 4  # two rows of six square pictures
+
+
+def test_frames_that_do_not_show_the_object_stay_out_of_the_overview(results, tmp_path):
+    (result,) = results
+    empty = [replace(frame, mask=np.zeros_like(frame.mask)) for frame in result.sequence[:4]]
+    sequence = (*empty, *result.sequence[4:])
+    whole = read_image(write_overview(tmp_path / "whole.jpg", results))
+    assert read_image(write_overview(tmp_path / "some.jpg", [replace(result, sequence=sequence)])).shape == whole.shape

@@ -126,8 +126,8 @@ def _add_backbone(parser: Parser) -> None:
     )
     parser.add_argument(
         "--image-size", type=_count, metavar="PX",
-        help="pictures are resized to so many pixels, or the nearest multiple of the patch size (default: the "
-        "checkpoint's, as a rule 224)",
+        help="object crops, of 224 px as in the paper, are resized to so many pixels, or the nearest multiple of the "
+        "patch size: more of them make finer patches, no finer pictures (default: the checkpoint's, as a rule 224)",
     )  # fmt: skip
 
 

@@ -7,18 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from zsp_lite import plots
 from zsp_lite.demo import DemoResult, object_cloud
 from zsp_lite.files import write_atomic
+from zsp_lite.frames import Frame
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.pipeline import object_crop
 from zsp_lite.scene3d import aligned_clouds
 
 _DPI = 110
 _OVERVIEW_FRAMES = 4
+_ON_OBJECT = 0.4  # of a mask: what `crop_to_object` goes by
 
 _CSS = """
 :root { color-scheme: light; --ink: #1c2733; --soft: #5a6773; --line: #dfe4e9; --accent: #0072b2; }
@@ -62,17 +65,18 @@ def write_overview(path: str | Path, results: Sequence[DemoResult]) -> Path:
     path = Path(path)
     images, titles = [], []
     for result in results:
-        frames = [object_crop(frame) for frame in result.sequence[:_OVERVIEW_FRAMES]]
-        images += [view.frame.rgb for view in _best_views(result)] + [frame.rgb for frame in frames]
+        views, frames = [view.frame for view in _best_views(result)], _crops(result)
+        blank = [np.full_like(views[0].rgb, 255)] * (_OVERVIEW_FRAMES - len(frames))
+        images += [frame.rgb for frame in (*views, *frames)] + blank
         titles += [f"{result.pair.category}: reference", "chosen target view"]
-        titles += [f"pose {result.error:.0f}° off" if k == 0 else "" for k in range(len(frames))]
+        titles += [f"pose {result.error:.0f}° off" if k == 0 else "" for k in range(_OVERVIEW_FRAMES)]
     figure, axes = plots.show_images(images, titles, columns=2 + _OVERVIEW_FRAMES, size=1.7)
     for row, result in enumerate(results):
         cloud = object_cloud(result.estimate.reference_view, most=1500)
         colours = plots.coordinate_colours(cloud)
         first = row * (2 + _OVERVIEW_FRAMES)
         plots.draw_points(axes[first], result.estimate.reference_view.frame.camera, cloud, colours, size=3)
-        cameras = [object_crop(frame).camera for frame in result.sequence[:_OVERVIEW_FRAMES]]
+        cameras = [frame.camera for frame in _crops(result)]
         for axis, camera, pose in zip(axes[first + 2 :], cameras, result.estimate.propagate(cameras)):
             plots.draw_points(axis, camera, pose.apply(cloud), colours, size=3)
     write_atomic(path, _jpeg(figure))
@@ -263,6 +267,12 @@ def _scene(result: DemoResult, name: str) -> str:
 
 def _best_views(result: DemoResult):
     return [result.estimate.reference_view, result.estimate.target_views[result.estimate.view]]
+
+
+def _crops(result: DemoResult) -> list[Frame]:
+    """The object in the target sequence's frames that show it; in CO3D some have an empty mask."""
+    shown = [frame for frame in result.sequence if frame.mask is None or (frame.mask > _ON_OBJECT).any()]
+    return [object_crop(frame) for frame in shown[:_OVERVIEW_FRAMES]]
 
 
 def _figure(title: str, figure: Figure, wide: bool, alt: str, caption: str) -> str:

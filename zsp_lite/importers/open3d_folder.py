@@ -1,5 +1,6 @@
 """Open3D's RGB-D folders: color/ (or image/, rgb/), depth/ in millimetres, an intrinsic file and a trajectory log."""
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -67,10 +68,16 @@ def read_trajectory(path: Path) -> list[Float[np.ndarray, "4 4"]]:
 
 def _images(folder: Path, names: tuple[str, ...]) -> list[Path]:
     for name in names:
-        found = sorted(path for path in (folder / name).glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+        found = [path for path in (folder / name).glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
         if found:
-            return found
+            return sorted(found, key=_by_number)
     raise InputError(f"capture {folder} has no pictures in {', '.join(f'{name}/' for name in names)}")
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Sorts 2.jpg before 10.jpg."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part) if part.isdigit() else -1, part) for part in parts]
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path:

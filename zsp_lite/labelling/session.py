@@ -18,7 +18,7 @@ from zsp_lite.co3d import Co3D
 from zsp_lite.errors import InputError
 from zsp_lite.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks, rigid_label
-from zsp_lite.labels import PoseLabel, read_labels, write_label
+from zsp_lite.labels import PoseLabel, label_folder, read_labels, write_label
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
@@ -227,9 +227,13 @@ class Labelling:
         return path
 
     def skip(self, sequence: str) -> None:
-        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. InputError for the reference."""
+        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. Its label, if any, goes.
+
+        Raises InputError for the reference.
+        """
         if self._known(sequence) == self.reference:
             raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
+        (label_folder(self.root, self.category) / f"{sequence}.json").unlink(missing_ok=True)
         if sequence not in self._stored.skipped:
             self._stored.skipped.append(sequence)
             self._save()
