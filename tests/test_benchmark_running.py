@@ -1,5 +1,7 @@
 """A run's results: the same whoever computes them, in whatever order, however often it is killed."""
 
+import enum
+import functools
 import io
 import json
 import os
@@ -10,7 +12,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from zsp_lite.benchmark import run as run_module
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.execution import open_crew
 from zsp_lite.benchmark.extractors import fingerprint as extractor_fingerprint
+from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.jobs import Job, frame_keys, records_of, run_job, split, worker_extractors
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, fingerprint, resolve
 from zsp_lite.benchmark.plan import Plan, duration, frames_at_once, size
@@ -409,7 +411,7 @@ class OwnEstimator:
     "make",
     [
         lambda k: Method(settings={"matcher": one_way, "k": k}),
-        lambda k: Method(solve=partial(own_method, k=k)),
+        lambda k: Method(solve=functools.partial(own_method, k=k)),
         lambda k: turned_by(k),
         lambda k: OwnEstimator(k),
         lambda k: OwnEstimator(1, np.arange(k)),
@@ -420,6 +422,72 @@ class OwnEstimator:
 def test_a_row_of_ones_own_is_known_by_all_of_its_settings(make):
     first, again, other = (fingerprint(resolve({"mine": make(k)})["mine"]) for k in (30, 30, 70))
     assert first == again != other
+
+
+class Mode(enum.Enum):
+    A, B = 1, 2
+
+
+@functools.lru_cache
+def first_remembered(problem):
+    return problem, 1
+
+
+@functools.lru_cache
+def second_remembered(problem):
+    return problem, 2
+
+
+class Slotted:
+    __slots__ = ("k",)
+
+    def __init__(self, k):
+        self.k = k
+
+
+@pytest.mark.parametrize(
+    "first, second",
+    [
+        (Mode.A, Mode.B),
+        (first_remembered, second_remembered),
+        (Slotted(1), Slotted(2)),
+        (torch.zeros(3, dtype=torch.bfloat16), torch.ones(3, dtype=torch.bfloat16)),
+        (torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)),
+        (np.zeros(4), np.zeros((2, 2))),
+        ({"a": {1, 2}}, {"a": {1, 3}}),
+    ],
+)
+def test_what_differs_is_told_apart(first, second):
+    assert digest_of(first) == digest_of(first) != digest_of(second)
+
+
+def test_a_class_that_was_typed_in_is_known_by_its_members():
+    made = []
+    for k in (30, 30, 70):
+        space = {}
+        exec(f"class Typed:\n    k = {k}\n    @staticmethod\n    def solve(problem):\n        return problem", space)
+        made.append(digest_of(space["Typed"]()))
+    assert made[0] == made[1] != made[2]
+
+
+def test_another_process_finds_the_same_identity():
+    code = """
+import logging
+import cv2
+from benchmark_folder import own_method
+from zsp_lite.benchmark.identity import digest_of
+class Own:
+    def __init__(self):
+        self.sift, self.log, self.also = cv2.SIFT_create(), logging.getLogger("x"), lambda: (own_method, cv2)
+print(digest_of(Own()))
+"""
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+    runs = [
+        subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths, "PYTHONHASHSEED": seed},
+                       capture_output=True, text=True, check=True).stdout
+        for seed in ("1", "2")
+    ]  # fmt: skip
+    assert runs[0] == runs[1] and len(runs[0]) == 17
 
 
 def test_a_backbone_of_ones_own_is_known_by_more_than_its_name():
@@ -481,6 +549,13 @@ def test_a_torn_line_of_the_invocations_does_no_harm(tmp_path):
     evaluate(small_folder(), BACKBONE, ["ours-bv", "oracle-view"], **arguments)
     invocations = read_results(tmp_path).invocations
     assert [one.get("rows") for one in invocations if "rows" in one] == [["ours-bv"], ["ours-bv", "oracle-view"]]
+
+
+def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
+    (tmp_path / "rows_of_my_own.py").write_text("def still(problem):\n    return None\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
+    assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 
 @pytest.mark.parametrize(

@@ -196,13 +196,14 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
     assert "old" not in once and once.startswith("before\n<!-- table table_1 -->\n**Table 1.") and "between" in once
     assert f"{run[1]['methods']['ours']['acc30']:.1f}" in once and "hydrant" not in once
     assert with_tables(once, every_table(run[1]), 1234) == once
+    assert "old" not in with_tables(text.replace("\n", "\r\n"), every_table(run[1]), 1234)
     lost = text.replace("<!-- end of table -->\nbetween", "between")
     for wrong, told in (
         ("no marks", "no marked table"),
         (text.replace("table_3", "table_9"), "table_9"),
-        (lost, "table_3 --> out of turn"),
-        (text[: text.rindex("<!--")], "table_3 --> out of turn"),
-        (text[text.index("old") :], "end of table --> out of turn"),
+        (lost, "has the marks table table_1, table table_3, end of table, expected a start"),
+        (text[: text.rindex("<!--")], "expected a start and an end for each"),
+        (text[text.index("old") :], "expected a start and an end for each"),
     ):
         with pytest.raises(InputError, match=told):
             with_tables(wrong, every_table(run[1]), 1234)
@@ -241,7 +242,9 @@ def test_a_run_in_one_file_gives_the_same_tables(run, tmp_path):
 def test_what_is_no_run_is_refused(tmp_path):
     (tmp_path / "a.json.gz").write_bytes(gzip.compress(b'{"pairs": []}'))
     (tmp_path / "b.json.gz").write_bytes(gzip.compress(b"{}")[:15])
-    for path in (tmp_path, tmp_path / "a.json.gz", tmp_path / "b.json.gz", tmp_path / "c"):
+    whole = gzip.compress(b"{}" + b" " * 99)
+    (tmp_path / "d.json.gz").write_bytes(whole[:10] + b"\xff" * 8 + whole[18:])
+    for path in (tmp_path, *(tmp_path / name for name in ("a.json.gz", "b.json.gz", "c", "d.json.gz"))):
         with pytest.raises(InputError, match=str(path)):
             read_results(path)
 

@@ -17,6 +17,7 @@ from transformers import AutoModel
 
 from zsp_lite import ZeroShotPose, cli, load_backbone
 from zsp_lite.backbones import Backbone, download, prepare_images, verify
+from zsp_lite.benchmark.identity import backbone_digest
 from zsp_lite.co3d import Co3D
 from zsp_lite.demo import demo_pairs
 from zsp_lite.doctor import sample_data
@@ -404,7 +405,8 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     weights = load_file(folder / "model.safetensors")
     kept = {key: x for key, x in weights.items() if "pooler" not in key}
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
-    load_backbone(f"hf:{folder}", "cpu", image_size=48)  # nobody reads the pooler
+    first, second = (load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2))  # nobody reads the pooler
+    assert backbone_digest(first) == backbone_digest(second)
     del kept["layernorm.weight"]
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
     refused(f"hf:{folder}", "1 weights are not in the file, first layernorm.weight")

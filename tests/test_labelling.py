@@ -160,6 +160,9 @@ def test_undo_skip_clear_and_move(root):
     assert len(labelling.names) == 4
     pick_all(labelling, "b", corners()[:4])
     labelling.accept("b")
+    write_label(root, "chair", PoseLabel(np.eye(4), "a", "best"))
+    with pytest.raises(InputError, match="a has a label not made of picks; remove .*a.json"):
+        labelling.skip("a")
     labelling.skip("b")
     assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(root, "chair")
     labelling.clear("b")

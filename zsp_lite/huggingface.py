@@ -146,6 +146,10 @@ def load_huggingface(name: str, image_size: int | None = None) -> HuggingFaceViT
     missing = sorted(key for key in found["missing_keys"] if "pooler" not in key and "mask_token" not in key)
     if missing:
         raise InputError(f"{name}: {len(missing)} weights are not in the file, first {missing[0]}")
+    made_up = found["missing_keys"]
+    for key, weight in model.named_parameters():
+        if key in made_up:
+            weight.data.zero_()  # drawn at random, they would make every loading another backbone
     model = getattr(model, "vision_model", model).to(torch.float32).eval()
     size = nearest_multiple(IMAGE_SIZE if image_size is None else image_size, patch_size)
     return HuggingFaceViT(model, vision, size, *_normalisation(folder, name), name)

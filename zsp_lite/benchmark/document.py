@@ -15,7 +15,7 @@ from zsp_lite.benchmark.tables import THIS_RUN, Table
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 
-_MARKED = re.compile(r"(<!-- table (\S+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
+_MARKED = re.compile(r"(<!-- table (\S+) -->[ \t]*\r?\n)(.*?)(<!-- end of table -->)", re.DOTALL)
 _MARK = re.compile(r"<!-- (table \S+|end of table) -->")
 _CATEGORY = re.compile(r"\w+ Acc30")
 
@@ -30,9 +30,8 @@ def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     marks = _MARK.findall(text)
     if not marks:
         raise InputError("document has no marked table, expected <!-- table NAME --> and <!-- end of table -->")
-    for i, mark in enumerate(marks):
-        if mark.startswith("end") != bool(i % 2) or (i % 2 == 0 and i + 1 == len(marks)):
-            raise InputError(f"document has <!-- {mark} --> out of turn, expected a start and an end for each table")
+    if 2 * len(_MARKED.findall(text)) != len(marks):
+        raise InputError(f"document has the marks {', '.join(marks)}, expected a start and an end for each table")
 
     def fresh(found: re.Match[str]) -> str:
         start, name, _, end = found.groups()

@@ -4,7 +4,6 @@ No scheduler of our own: an executor is given all jobs at once. Jobs travel as c
 and backbones defined in a notebook travel with them.
 """
 
-import importlib
 import os
 import signal
 import threading
@@ -20,6 +19,7 @@ from typing import Any
 import cloudpickle
 
 from zsp_lite.benchmark.jobs import Job, one_thread_each, records_of, run_job
+from zsp_lite.benchmark.methods import import_object
 from zsp_lite.benchmark.storage import PartReader, RunFolder
 from zsp_lite.errors import InputError
 
@@ -57,10 +57,9 @@ def open_crew(executor: Executor | str | None, workers: int = 1) -> Iterator[Cre
         with _dask(executor.removeprefix("dask://")) as crew:
             yield crew
     else:
-        module, _, name = executor.partition(":")
         try:
-            made = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            made = import_object(executor)
+        except InputError as error:
             raise InputError(
                 f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor ({error})"
             ) from error

@@ -1,7 +1,6 @@
 """Who describes images for the benchmark's rows, by name, and how to tell two of them apart."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast
 from zsp_lite.baselines.rootsift import RootSift
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.baselines.swav import load_swav, load_swav_tiny
-from zsp_lite.benchmark.identity import digest_of
+from zsp_lite.benchmark.identity import backbone_digest, digest_of
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.vit import VisionTransformer
@@ -61,21 +60,6 @@ def fingerprint(extractor: Any) -> str:
     input and another mean or standard deviation to normalise it by.
     """
     name = getattr(extractor, "name", type(extractor).__name__)
-    if not isinstance(extractor, Backbone):
-        weights = extractor.state_dict() if hasattr(extractor, "state_dict") else {}
-        if weights:
-            return f"{name} {_digest('', weights)}"
-        own = extractor is not None and not type(extractor).__module__.startswith("zsp_lite.")
-        return f"{name} {digest_of(extractor)}" if own else name
-    chosen = (
-        extractor.key_block, extractor.facet, extractor.saliency_heads, extractor.image_size, extractor.mean,
-        extractor.std, extractor.precision,
-    )  # fmt: skip
-    return f"{name} {_digest(repr(chosen), extractor.model.state_dict())}"
-
-
-def _digest(text: str, weights: Mapping[str, torch.Tensor]) -> str:
-    digest = hashlib.sha256(text.encode())
-    for key, weight in sorted(weights.items()):
-        digest.update(key.encode() + weight.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    if extractor is None:
+        return name
+    return f"{name} {backbone_digest(extractor) if isinstance(extractor, Backbone) else digest_of(extractor)}"

@@ -1,4 +1,4 @@
-"""What someone's own function or object is, as a text: two of the same text can be expected to answer alike."""
+"""What a backbone, or someone's own function or object, is: two of the same digest can be expected to answer alike."""
 
 import functools
 import hashlib
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
-_TRANSIENT = ("training",)  # a module's mode: turned back and forth by whoever uses it
+from zsp_lite.backbones import Backbone
+
+_ADDRESS = re.compile(r"\b0x[0-9a-fA-F]+")
 
 
 def digest_of(value: Any) -> str:
@@ -20,12 +21,26 @@ def digest_of(value: Any) -> str:
     return hashlib.sha256(description(value).encode()).hexdigest()[:16]
 
 
+def backbone_digest(backbone: Backbone) -> str:
+    """A hash of a backbone's weights and of what it does with them; neither its device nor its batches count."""
+    chosen = (
+        backbone.key_block, backbone.facet, backbone.saliency_heads, backbone.image_size, backbone.mean, backbone.std,
+        backbone.precision,
+    )  # fmt: skip
+    digest = hashlib.sha256(repr(chosen).encode())
+    for key, weight in sorted(backbone.model.state_dict().items()):
+        digest.update(key.encode() + _bytes(weight))
+    return digest.hexdigest()[:16]
+
+
 def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     """Functions by their source, defaults and what they close over; objects by their class and public attributes.
 
-    Arrays and weights go in as hashes. What a function looks up among its module's globals is not followed, and
-    attributes whose names begin with an underscore are taken for caches.
+    Objects that say themselves what they are (`__repr__`) are believed, arrays and weights go in as hashes. What a
+    function looks up among its module's globals is not followed; attributes whose names begin with an underscore, and
+    cached properties, are taken for caches.
     """
+    value = inspect.unwrap(value) if callable(value) else value
     if id(value) in _within:
         return "(itself)"
     _within = (*_within, id(value))
@@ -33,9 +48,12 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     def all_of(values: Any) -> list[str]:
         return [description(one, _within) for one in values]
 
-    if isinstance(value, np.ndarray | torch.Tensor):
-        array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
-        return f"{array.dtype}{array.shape} {hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()}"
+    if isinstance(value, Backbone):
+        return backbone_digest(value)
+    if isinstance(value, torch.Tensor):
+        return f"{value.dtype}{tuple(value.shape)} {hashlib.sha256(_bytes(value)).hexdigest()}"
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape} {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
     if isinstance(value, Mapping):
         return f"{{{', '.join(sorted(map(': '.join, zip(all_of(value), all_of(value.values())))))}}}"
     if isinstance(value, list | tuple):
@@ -44,6 +62,8 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
         return f"{{{', '.join(sorted(all_of(value)))}}}"
     if isinstance(value, functools.partial):
         return f"partial{description((value.func, value.args, value.keywords), _within)}"
+    if inspect.ismodule(value):
+        return value.__name__
     if inspect.ismethod(value):
         return f"{description(value.__self__, _within)}.{value.__name__}"
     if inspect.isfunction(value):
@@ -51,25 +71,43 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
         return _source(value) + description((value.__defaults__, value.__kwdefaults__, cells), _within)
     if inspect.isclass(value):
         return _source(value)
-    attributes = getattr(value, "__dict__", None)
-    if attributes is None or inspect.isroutine(value) or inspect.ismodule(value):
-        return _ADDRESS.sub("", repr(value))
-    known = {name: one for name, one in attributes.items() if name[0] != "_" and name not in _TRANSIENT}
-    if isinstance(value, torch.nn.Module):
-        known |= {"weights": value.state_dict(), "structure": repr(value)}
     kind = type(value)
+    attributes = _attributes(value)
+    if isinstance(value, torch.nn.Module):
+        attributes = {name: one for name, one in attributes.items() if name != "training"}
+        attributes |= {"weights": value.state_dict(), "structure": repr(value)}
+    elif kind.__repr__ is not object.__repr__ and not hasattr(kind, "__dataclass_fields__"):
+        return f"{kind.__qualname__} {_ADDRESS.sub('', repr(value))}"
     own = [one for one in kind.__mro__ if one.__module__.split(".")[0] == kind.__module__.split(".")[0]]
-    return " ".join(map(_source, own)) + description(known, _within)
+    return " ".join(map(_source, own)) + description(attributes, _within)
 
 
+def _attributes(value: Any) -> dict[str, Any]:
+    slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ()) if hasattr(value, name)]
+    found = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
+    cached = (functools.cached_property, property)
+    return {
+        name: one for name, one in found.items()
+        if name[0] != "_" and not isinstance(inspect.getattr_static(type(value), name, None), cached)
+    }  # fmt: skip
+
+
+def _bytes(tensor: torch.Tensor) -> bytes:
+    return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+
+
+@functools.lru_cache(maxsize=512)
 def _source(known: Any) -> str:
     try:
         return inspect.getsource(known)
     except (OSError, TypeError):  # typed in at a prompt, unpickled in a worker, or compiled
         name = getattr(known, "__qualname__", str(known))
     if inspect.isclass(known):
-        members = [one for one in vars(known).values() if inspect.isfunction(one)]
-        return f"{name} {' '.join(map(_source, members))}"
+        members = {
+            part: getattr(one, "__func__", getattr(one, "fget", one)) for part, one in vars(known).items()
+            if not part.startswith("__") or inspect.isfunction(one)
+        }  # fmt: skip
+        return f"{name} {description(members, (id(known),))}"
     code = getattr(known, "__code__", None)
     return name if code is None else f"{name} {_code(code)}"
 

@@ -196,7 +196,7 @@ def _method(name: str, meant: Any) -> Method:
             raise InputError(
                 f"method {meant!r} is unknown, expected one of {', '.join((*GROUPS, *METHODS))}, or module:name"
             )
-        meant = _import(meant)
+        meant = import_object(meant)
     if isinstance(meant, Method):
         return meant
     if callable(getattr(meant, "estimate", None)):
@@ -209,7 +209,8 @@ def _method(name: str, meant: Any) -> Method:
     )
 
 
-def _import(path: str) -> Any:
+def import_object(path: str) -> Any:
+    """What "module:name" stands for, in an installed module or one of the current folder. InputError where nothing."""
     module, _, name = path.partition(":")
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a console script does not look into the current folder by itself
@@ -218,7 +219,7 @@ def _import(path: str) -> Any:
         for part in name.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"method {path!r} cannot be imported: {error}") from error
+        raise InputError(f"{path!r} cannot be imported: {error}") from error
     return found
 
 

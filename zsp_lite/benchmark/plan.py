@@ -62,11 +62,12 @@ class Plan:
     def lines(self, workers: int) -> list[str]:
         """For people to read."""
         numbers = sorted({1, self.cores, workers})
+        memory = f"{self.memory / 2**30:.1f} GiB" if process_memory() else "unknown on this system"
         times = ", ".join(f"{duration(self.seconds(n))} with {n} worker{'s' * (n > 1)}" for n in numbers)
         return [
             f"frames to describe   {self.frames:,}",
             f"pairs                {self.pairs:,} ({self.estimates:,} estimates in all rows)",
-            f"memory per worker    {self.memory / 2**30:.1f} GiB",
+            f"memory per worker    {memory}",
             f"disk                 {size(self.results_bytes)} of results; a feature cache would take "
             f"{size(self.cache_bytes)}",
             f"calibration          {1000 * self.frame_seconds:.0f} ms per frame, {1000 * self.pair_seconds:.0f} ms per "

@@ -49,7 +49,10 @@ def read_results(path: str | Path) -> Results:
         summary = _decode(read_bytes(path / "summary.json", "summary"), path / "summary.json")
         settings = _decode(read_bytes(path / SETTINGS, "settings"), path / SETTINGS)
         # What the summary is of: earlier calls may have left other rows, and other categories, in the folder.
-        asked, categories = summary["methods"], summary["data"]["categories"]
+        try:
+            asked, categories = summary["methods"], summary["data"]["categories"]
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path / 'summary.json'}: not a run's summary ({error})") from error
         rows: dict[str, dict[str, dict]] = {}
         for key, record in read_records(path / PAIRS, mend=False).items():
             for name, found in record["methods"].items():

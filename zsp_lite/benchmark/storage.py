@@ -221,6 +221,8 @@ def same_run(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     for group, remedy in _GROWING.items():
         known, asked = before.get(group, {}), settings.get(group, {})
         if changed := sorted(name for name, value in asked.items() if known.get(name, value) != value):
+            if "labels" not in before:
+                remedy = "it is of an earlier version of zsp-lite; choose another folder"
             raise InputError(f"{out} holds other results of {', '.join(changed)}: {remedy}")
         merged[group] = known | asked
     return merged

@@ -227,13 +227,16 @@ class Labelling:
         return path
 
     def skip(self, sequence: str) -> None:
-        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. Its label, if any, goes.
+        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. The label made of its picks goes.
 
-        Raises InputError for the reference.
+        Raises InputError for the reference, and for a sequence whose label was not made of picks.
         """
         if self._known(sequence) == self.reference:
             raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
-        (label_folder(self.root, self.category) / f"{sequence}.json").unlink(missing_ok=True)
+        path = label_folder(self.root, self.category) / f"{sequence}.json"
+        if path.is_file() and len(self.picks(sequence)) != len(self.names):
+            raise InputError(f"sequence {sequence} has a label not made of picks; remove {path} to leave it out")
+        path.unlink(missing_ok=True)
         if sequence not in self._stored.skipped:
             self._stored.skipped.append(sequence)
             self._save()

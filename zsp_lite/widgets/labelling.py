@@ -203,7 +203,7 @@ class _Desk:
                 ("redo", "Take all keypoints of this sequence back and begin anew", self.redo),
                 ("guess", "Let the method propose the alignment", self.guess),
                 ("accept", "Write this sequence's label", self.accept),
-                ("skip", "Leave this sequence out", self.skip),
+                ("skip", "Leave this sequence out, without a label", self.skip),
                 ("next", "Go to the next open sequence", self.next),
                 ("pick", "Pick the point under the cross-hair", self.pick_by_slider),
             )
