@@ -26,7 +26,9 @@ from zsp_lite.training.train import (
     Trainee,
     TrainingConfig,
     export_checkpoint,
+    fit_read_outs,
     initialise,
+    starting_weights,
     train,
 )
 
@@ -308,6 +310,69 @@ def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
     assert not (tmp_path / "fourth").exists()
     (tmp_path / "first" / "checkpoint.pt").unlink()  # no longer needed
     train(still, tmp_path / "second", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
+
+
+def test_a_run_can_start_from_exported_weights(folder, renders, tmp_path):
+    quiet = dict(log=lambda line: None)
+    weights = train(TINY, tmp_path / "first", folder, **quiet)
+    state = starting_weights(TINY, weights)
+    again = Trainee(TINY)
+    again.load_state_dict(state)
+    image, exported = torch.rand(1, 3, 32, 32), load_backbone(weights, "cpu").model
+    mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.no_grad():
+        expected = exported.forward_training((image - mean) / std, 0)
+        got = again((image - MEAN) / STD)
+    torch.testing.assert_close(got.keys, expected.keys, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(got.tokens, expected.tokens, atol=1e-4, rtol=1e-4)
+
+    still = replace(TINY, learning_rate=0.0)
+    second = load_file(train(still, tmp_path / "second", folder, start_from=weights, **quiet))
+    first = load_file(weights)
+    for name in ("patch_embed.proj.weight", "pos_embed", "blocks.1.mlp.fc2.weight"):
+        torch.testing.assert_close(second[name], first[name], atol=1e-3, rtol=2e-3)
+    with pytest.raises(InputError, match="zsp-tiny: of a network of another shape, expected one of 2 blocks, 24 wide"):
+        train(TINY, tmp_path / "third", folder, start_from="zsp-tiny", **quiet)
+    assert not (tmp_path / "third").exists()
+
+
+def test_read_outs_of_exported_weights_are_fitted_before_they_are_trained(renders):
+    """They read normals, depth and foreground better than nothing at all, on crops that the fit has not seen."""
+    torch.manual_seed(0)
+    model = Trainee(CONTINUATION)
+    model.load_state_dict(starting_weights(CONTINUATION, "zsp-tiny"))
+    batch = sample_batch(renders, np.random.default_rng(99), 2, VIEWS, 96, (0.6, 1.0))
+
+    def loss():
+        with torch.no_grad():
+            out = model(batch.images)
+            on_object = ~batch.surface[..., 0].isnan()
+            heads = (model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input)
+            return [geometry_loss(head(features), batch.geometry, on_object).item() for head, features in heads]
+
+    before = loss()
+    fit_read_outs(model, renders, 0, side=96)
+    assert max(loss()) < 0.8 * min(before)
+
+
+def test_the_ablations_print_a_row_for_every_variant(folder, renders, tmp_path, monkeypatch, capsys):
+    from zsp_lite.training import ablations
+
+    few = replace(TINY, stages=(Stage(2, 32, 1, 8, (0.6, 1.0), view=1.0),))
+    variants = {name: (how, replace(few, log_binned=config.log_binned)) for name, (how, config) in
+                list(ablations.VARIANTS.items())[:3]}  # fmt: skip
+    for name, value in dict(BASE=few, VARIANTS=variants, SIDE=32, SHARD=2).items():
+        monkeypatch.setattr(ablations, name, value)
+    monkeypatch.setattr(ablations, "keep_freed_memory", lambda: None)  # this process lives on
+    weights = train(TINY, tmp_path / "first", folder, log=lambda line: None)
+    monkeypatch.setattr("sys.argv", ["ablations", str(weights), str(tmp_path / "out")])
+    ablations.main()
+    table = capsys.readouterr().out.partition("| |")[2].splitlines()[2:]
+    rows = {row.split("|")[1].strip(): [float(cell) for cell in row.split("|")[2:5]] for row in table}
+    assert list(rows) == ["before", "all of it", "no average of the weights", "the keys' mean at each place removed",
+                          *list(variants)[1:]]  # fmt: skip
+    assert all(0 <= matches <= 100 and 0 <= view <= 100 and 0 <= iou <= 1 for matches, view, iou in rows.values())
+    assert rows["before"] != rows["all of it"]
 
 
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):

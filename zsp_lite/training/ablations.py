@@ -1,6 +1,6 @@
-"""What each part of the training is worth: short runs that go on from one checkpoint, each without one part.
+"""What each part of the training is worth: short runs that go on from the same weights, each without one part.
 
-    python -m zsp_lite.training.ablations outputs/first/checkpoint.pt outputs/ablations
+    python -m zsp_lite.training.ablations zsp-tiny outputs/ablations
 
 renders 800 new objects in three ways, trains every variant for as many steps on 128 px crops, and prints a table of
 what is found on TRAINING-category objects that no run sees. Everything is kept in the folder and reused.
@@ -16,7 +16,15 @@ from torch import nn
 
 from zsp_lite.training.batches import sample_batch
 from zsp_lite.training.renders import HELD_OUT, SHARD, VIEWS, RenderSet, load_render_set, render_set
-from zsp_lite.training.train import Stage, Trainee, TrainingConfig, held_out_accuracy, keep_freed_memory, train
+from zsp_lite.training.train import (
+    Stage,
+    Trainee,
+    TrainingConfig,
+    held_out_accuracy,
+    keep_freed_memory,
+    starting_weights,
+    train,
+)
 
 SIDE = 128
 FULL = Stage(160, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
@@ -47,23 +55,24 @@ def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
-    parser.add_argument("start_from", type=Path, help="checkpoint that every variant goes on from")
+    parser.add_argument("start_from", help="a checkpoint of `train` or an exported backbone, which variants go on from")
     parser.add_argument("out", type=Path, help="folder for renders and runs")
-    parser.add_argument("--also", type=Path, nargs="*", default=[], help="checkpoints of other runs, measured beside")
+    parser.add_argument("--also", nargs="*", default=[], help="other such weights, measured beside")
     arguments = parser.parse_args()
     keep_freed_memory()
     unseen = load_render_set(render_set(arguments.out / "held-out", SHARD, 0, first=HELD_OUT))
-    rows = {"before": measured(load(arguments.start_from, "average"), unseen)}
-    rows |= {str(path): measured(load(path, "average"), unseen) for path in arguments.also}
+    sources = {"before": arguments.start_from} | {source: source for source in arguments.also}
+    rows = {name: measured(trainee(starting_weights(BASE, source)), unseen) for name, source in sources.items()}
     for name, (how, config) in VARIANTS.items():
         renders = arguments.out / how
-        render_set(renders, config.objects, config.seed, min(SHARD, config.objects // 8), **RENDERS[how])
+        render_set(renders, config.objects, config.seed, min(SHARD, max(1, config.objects // 8)), **RENDERS[how])
         run = arguments.out / "".join(letter if letter.isalnum() else "-" for letter in name)
         train(config, run, renders, log=lambda line: print(line, flush=True), start_from=arguments.start_from)
-        rows[name] = measured(load(run / "checkpoint.pt", "average"), unseen)
+        state = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)
+        rows[name] = measured(trainee(state["average"]), unseen)
         if name == "all of it":
-            rows["no average of the weights"] = measured(load(run / "checkpoint.pt", "model"), unseen)
-            model = load(run / "checkpoint.pt", "average")
+            rows["no average of the weights"] = measured(trainee(state["model"]), unseen)
+            model = trainee(state["average"])
             model.key_mean = positional_mean(model, load_render_set(sorted(renders.glob("*.npz"))[:1]))
             rows["the keys' mean at each place removed"] = measured(model, unseen)
     print("| | matches (%) | view (%) | IoU |\n|---|---|---|---|")
@@ -71,9 +80,9 @@ def main() -> None:
         print(f"| {name} | {100 * matches:.1f} | {100 * view:.1f} | {iou:.3f} |")
 
 
-def load(path: Path, part: str) -> Trainee:
+def trainee(state: dict[str, torch.Tensor]) -> Trainee:
     model = Trainee(BASE)
-    model.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)[part])
+    model.load_state_dict(state)
     return model
 
 

@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from zsp_lite.annotations import decode
-from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD
+from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, available_backbones, load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
@@ -242,12 +242,12 @@ def _learning_rate(config: TrainingConfig, step: int, side: int) -> float:
 def train(
     config: TrainingConfig, folder: Path, renders: Path | None = None, log: Callable[[str], None] = print,
     progress=lambda iterable, total: iterable, checkpoint_every: int = 250, log_every: int = 50,
-    start_from: Path | None = None,
+    start_from: str | Path | None = None,
 ) -> Path:  # fmt: skip
     """Train from scratch, or resume from `folder`/checkpoint.pt, and export `folder`/zsp-tiny.safetensors.
 
     folder receives config.json, log.jsonl (one JSON object per line), the checkpoint and the exported weights;
-    `start_from` names a checkpoint of an earlier run of the same shape: its weight average becomes the start.
+    `start_from` is where the weights of a further run come from (see `starting_weights`).
     `renders` is where the training set is kept or made (default `folder`/renders): 1.1 MB per object there, and in
     memory; `progress` wraps the rendering of its shards. The checkpoint holds model, average, optimiser and step;
     batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
@@ -257,18 +257,20 @@ def train(
     folder = Path(folder)
     checkpoint_file = folder / "checkpoint.pt"
     first_time = not checkpoint_file.exists()
-    start = _load(config, start_from)["average"] if start_from is not None and first_time else None
+    torch.manual_seed(config.seed)
+    start = starting_weights(config, start_from) if start_from is not None and first_time else None
     claim_folder(folder, asdict(config))
     resumed = None if first_time else _load(config, checkpoint_file)
     training, held_out = training_and_held_out(renders or folder / "renders", config.objects, config.seed, progress)
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    torch.manual_seed(config.seed)
     model = Trainee(config)
     if start is None:
         initialise(model, training, config.seed)
     else:
         model.load_state_dict(start)
+        if not start["geometry_of_tokens.weight"].any():
+            fit_read_outs(model, training, config.seed)
     model.to(device)
     average = Trainee(config).to(device)
     average.load_state_dict(model.state_dict())
@@ -342,22 +344,71 @@ def keep_freed_memory() -> None:
             libc.mallopt(*option)
 
 
+def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Tensor]:
+    """The state of a `Trainee` to go on from: the average of a checkpoint of `train`, or an exported backbone.
+
+    The latter is a .safetensors file, or the name of a backbone (`available_backbones`); the read-outs for geometry,
+    which no exported file has, are 0 then. InputError where there is none, or one of another shape.
+    """
+    if Path(source).suffix != ".safetensors" and str(source) not in available_backbones():
+        return _load(config, Path(source))["average"]
+    trainee, backbone = Trainee(config), load_backbone(source, "cpu").model
+    for parameter in (*trainee.geometry_of_tokens.parameters(), *trainee.geometry_of_keys.parameters()):
+        nn.init.zeros_(parameter)
+    _load_state(trainee.backbone, backbone.state_dict(), config, source)
+    _expect_input(trainee.backbone, (IMAGENET_MEAN, IMAGENET_STD), (MEAN, STD))
+    return trainee.state_dict()
+
+
+@torch.no_grad()
+def fit_read_outs(model: Trainee, renders: RenderSet, seed: int, objects: int = 6, side: int = 128) -> None:
+    """Set the read-outs by least squares on crops of `side` pixels; the foreground's targets are logits of -2 and 2.
+
+    From random values their gradients would drown the others for hundreds of steps.
+    """
+    batch = sample_batch(renders, np.random.default_rng([seed, 4]), objects, VIEWS, side, (0.6, 1.0))
+    on_object = ~batch.surface[..., 0].isnan()
+    foreground = 4.0 * on_object.double()[..., None] - 2
+    out = model(batch.images)
+    for read_out, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input)):
+        x = F.pad(features.double(), (0, 1), value=1.0)
+        fits = [torch.linalg.solve(a.mT @ a + torch.eye(a.shape[1]), a.mT @ b) for a, b in (
+            (x[on_object], batch.geometry[on_object].double()), (x.flatten(0, 1), foreground.flatten(0, 1)))]  # fmt: skip
+        weight = torch.cat(fits, 1).T.float()
+        read_out.weight.copy_(weight[:, :-1])
+        read_out.bias.copy_(weight[:, -1])
+
+
 def _load(config: TrainingConfig, path: Path) -> dict:
     """A checkpoint of a network like `config`'s. InputError where there is none."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a checkpoint of `train`")
+        raise InputError(f"{path}: no such file, expected a checkpoint of `train` or exported weights")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         parts = {name: state[name] for name in ("model", "average", "optimiser", "step")}
         parts["smooth"] = state.get("smooth", {})
     except Exception as error:  # torch raises whatever its unpickler stumbles over
         raise InputError(f"{path}: damaged, or no checkpoint of `train`") from error
+    _load_state(Trainee(config), parts["average"], config, path)
+    return parts
+
+
+def _load_state(model: nn.Module, state: dict[str, Tensor], config: TrainingConfig, source: str | Path) -> None:
     try:
-        Trainee(config).load_state_dict(parts["average"])
+        model.load_state_dict(state)
     except RuntimeError as error:
         shape = f"{config.depth} blocks, {config.embed_dim} wide"
-        raise InputError(f"{path}: of a network of another shape, expected one of {shape}") from error
-    return parts
+        raise InputError(f"{source}: of a network of another shape, expected one of {shape}") from error
+
+
+@torch.no_grad()
+def _expect_input(backbone: VisionTransformer, scaling: tuple, new: tuple) -> None:
+    """Have a backbone that sees (rgb - mean) / std, by `scaling`, do the same with what `new` makes of the picture."""
+    (mean, std), (new_mean, new_std) = ([torch.as_tensor(x).expand(3).view(1, 3, 1, 1) for x in pair]
+                                        for pair in (scaling, new))  # fmt: skip
+    proj = backbone.patch_embed.proj
+    proj.bias += (proj.weight * (new_mean - mean) / std).sum((1, 2, 3))
+    proj.weight *= new_std / std
 
 
 def _log_until(path: Path, step: int) -> list[str]:
@@ -400,10 +451,7 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
         _, q, k, v = block.project(x)
         x = block.finish(x, block.attn(q, k, v))
         block.attn.qkv.bias[dim : 2 * dim] -= k[:, 1:].mean((0, 1))
-    proj = backbone.patch_embed.proj
-    mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-    proj.bias += (proj.weight * (mean - MEAN) / STD).sum((1, 2, 3))
-    proj.weight *= std / STD
+    _expect_input(backbone, (MEAN, STD), (IMAGENET_MEAN, IMAGENET_STD))
     metadata = dict(name=Path(path).stem, patch_size=8, image_size=224, num_heads=config.num_heads)
     metadata |= dict(key_block=config.key_block, saliency_heads=",".join(map(str, range(config.num_heads))))
     weights = {name: value.half().contiguous() for name, value in backbone.state_dict().items()}
