@@ -1,6 +1,7 @@
 """The trainer: renders of one build at a time, four objectives, exact export, resumption."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from zsp_lite import cli
 from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, load_backbone
+from zsp_lite.backbones import TINY as SHIPPED
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_sibling
@@ -315,9 +318,10 @@ def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
 def test_a_run_can_start_from_exported_weights(folder, renders, tmp_path):
     quiet = dict(log=lambda line: None)
     weights = train(TINY, tmp_path / "first", folder, **quiet)
-    state = starting_weights(TINY, weights)
     again = Trainee(TINY)
-    again.load_state_dict(state)
+    assert set(again.load_state_dict(starting_weights(TINY, weights), strict=False).missing_keys) == {
+        f"geometry_of_{what}.{part}" for what in ("tokens", "keys") for part in ("weight", "bias")
+    }
     image, exported = torch.rand(1, 3, 32, 32), load_backbone(weights, "cpu").model
     mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     with torch.no_grad():
@@ -331,48 +335,80 @@ def test_a_run_can_start_from_exported_weights(folder, renders, tmp_path):
     first = load_file(weights)
     for name in ("patch_embed.proj.weight", "pos_embed", "blocks.1.mlp.fc2.weight"):
         torch.testing.assert_close(second[name], first[name], atol=1e-3, rtol=2e-3)
-    with pytest.raises(InputError, match="zsp-tiny: of a network of another shape, expected one of 2 blocks, 24 wide"):
-        train(TINY, tmp_path / "third", folder, start_from="zsp-tiny", **quiet)
-    assert not (tmp_path / "third").exists()
+    model = Trainee(still)
+    model.load_state_dict(starting_weights(still, weights), strict=False)
+    fit_read_outs(model, renders, still.seed)
+    kept = torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["average"]
+    torch.testing.assert_close(kept["geometry_of_tokens.weight"], model.geometry_of_tokens.weight.data)
+
+    other = tmp_path / "first" / "checkpoint.pt"
+    with pytest.raises(InputError, match="second: holds a run from other weights than .*; expected a new folder"):
+        train(still, tmp_path / "second", folder, start_from=other, **quiet)
+    weights.unlink()  # no longer needed
+    train(still, tmp_path / "second", folder, start_from=weights, **quiet)
+
+
+def test_weights_that_no_run_can_start_from_are_refused_before_a_folder_is_made(tmp_path):
+    heads, damaged = tmp_path / "heads.safetensors", tmp_path / "damaged.safetensors"
+    with safe_open(SHIPPED, "pt") as file:
+        save_file(load_file(SHIPPED), heads, metadata=file.metadata() | dict(num_heads="3", saliency_heads="0"))
+    damaged.write_bytes(b"cut off")
+    for source, problem in (
+        ("zsp-tinny", "zsp-tinny: no such file, expected a checkpoint of `train`, exported .safetensors, or zsp-tiny"),
+        (tmp_path, "is a folder, expected a checkpoint"),
+        (heads, "heads.safetensors: a network of another shape, .*'num_heads': 3.* expected .*'num_heads': 6"),
+        (damaged, "damaged.safetensors: damaged"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            train(CONTINUATION, tmp_path / "run", start_from=source)
+    with pytest.raises(InputError, match="zsp-tiny: a network of another shape, .*'depth': 12.* expected .*'depth': 2"):
+        train(TINY, tmp_path / "run", start_from="zsp-tiny")
+    assert not (tmp_path / "run").exists()
 
 
 def test_read_outs_of_exported_weights_are_fitted_before_they_are_trained(renders):
-    """They read normals, depth and foreground better than nothing at all, on crops that the fit has not seen."""
-    torch.manual_seed(0)
+    """They read normals, depth and foreground better than nothing at all, on other crops than the fit's."""
     model = Trainee(CONTINUATION)
-    model.load_state_dict(starting_weights(CONTINUATION, "zsp-tiny"))
+    assert model.load_state_dict(starting_weights(CONTINUATION, "zsp-tiny"), strict=False).missing_keys
     batch = sample_batch(renders, np.random.default_rng(99), 2, VIEWS, 96, (0.6, 1.0))
-
-    def loss():
-        with torch.no_grad():
-            out = model(batch.images)
-            on_object = ~batch.surface[..., 0].isnan()
-            heads = (model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input)
-            return [geometry_loss(head(features), batch.geometry, on_object).item() for head, features in heads]
-
-    before = loss()
+    on_object = ~batch.surface[..., 0].isnan()
+    nothing = geometry_loss(torch.zeros(*on_object.shape, 5), batch.geometry, on_object).item()
     fit_read_outs(model, renders, 0, side=96)
-    assert max(loss()) < 0.8 * min(before)
+    with torch.no_grad():
+        out = model(batch.images)
+        for read_out, features in (
+            (model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input)
+        ):  # fmt: skip
+            assert geometry_loss(read_out(features), batch.geometry, on_object).item() < 0.8 * nothing
 
 
 def test_the_ablations_print_a_row_for_every_variant(folder, renders, tmp_path, monkeypatch, capsys):
     from zsp_lite.training import ablations
 
-    few = replace(TINY, stages=(Stage(2, 32, 1, 8, (0.6, 1.0), view=1.0),))
-    variants = {name: (how, replace(few, log_binned=config.log_binned)) for name, (how, config) in
-                list(ablations.VARIANTS.items())[:3]}  # fmt: skip
-    for name, value in dict(BASE=few, VARIANTS=variants, SIDE=32, SHARD=2).items():
+    few = replace(TINY, stages=(Stage(2, 32, 2, 8, (0.6, 1.0), view=1.0),))
+    settings = ("proportions", "deformation", "log_binned")
+    variants = {name: replace(few, **{setting: getattr(config, setting) for setting in settings})
+                for name, config in ablations.VARIANTS.items() if config.stages == ablations.BASE.stages}  # fmt: skip
+    for name, value in dict(BASE=few, VARIANTS=variants, SIDE=32, SHARD=1).items():
         monkeypatch.setattr(ablations, name, value)
     monkeypatch.setattr(ablations, "keep_freed_memory", lambda: None)  # this process lives on
     weights = train(TINY, tmp_path / "first", folder, log=lambda line: None)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "renders").symlink_to(folder)  # half of them are there already
     monkeypatch.setattr("sys.argv", ["ablations", str(weights), str(tmp_path / "out")])
     ablations.main()
     table = capsys.readouterr().out.partition("| |")[2].splitlines()[2:]
     rows = {row.split("|")[1].strip(): [float(cell) for cell in row.split("|")[2:5]] for row in table}
-    assert list(rows) == ["before", "all of it", "no average of the weights", "the keys' mean at each place removed",
-                          *list(variants)[1:]]  # fmt: skip
+    assert list(rows) == [f"{weights}, before", "all of it", "no average of the weights",
+                          "the keys' mean at each place removed", *list(variants)[1:]]  # fmt: skip
     assert all(0 <= matches <= 100 and 0 <= view <= 100 and 0 <= iou <= 1 for matches, view, iou in rows.values())
-    assert rows["before"] != rows["all of it"]
+    logs = {name: json.loads((tmp_path / "out" / re.sub("[^0-9a-zA-Z]", "-", name) / "log.jsonl").read_text())
+            for name in variants}  # fmt: skip
+    assert len({log["loss"] for log in logs.values()}) == 4  # three ways to render, and bare keys
+    monkeypatch.setattr("sys.argv", ["ablations", "lost.pt", str(tmp_path / "other")])
+    with pytest.raises(SystemExit, match="lost.pt: no such file"):
+        ablations.main()
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):

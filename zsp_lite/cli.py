@@ -263,7 +263,7 @@ def _add_train(commands) -> None:
     parser = _command(
         commands, "train", _train, "train the embedded backbone, or resume; hours on a CPU",
         ["train --out outputs/first", "train --out outputs/second --start-from outputs/first/checkpoint.pt",
-         "train --out outputs/further --start-from zsp-tiny",
+         "train --out outputs/further --start-from zsp-tiny --seed 1",
          "train --out outputs/try --shorten 0.02 --objects 60",
          "train --self-distillation --out outputs/dino --renders outputs/first/renders"],
     )  # fmt: skip
@@ -274,7 +274,7 @@ def _add_train(commands) -> None:
     parser.add_argument("--renders", type=Path, metavar="DIR", help="training renders (default: OUT/renders)")
     parser.add_argument(
         "--start-from", metavar="WEIGHTS",
-        help="go on, by the recipe's second part, from a run's checkpoint.pt, from exported .safetensors, or from zsp-tiny",
+        help="go on, by the recipe's second part, from a run's checkpoint.pt, exported .safetensors, or zsp-tiny",
     )  # fmt: skip
     parser.add_argument(
         "--self-distillation", action="store_true",

@@ -150,9 +150,73 @@ def excavator(a: Assembly) -> None:
     a.add(rod((-length * 0.3, w * 0.25, 0.8), (-length * 0.3, w * 0.25, 1.1), 0.05), 3)
 
 
+def bed(a: Assembly) -> None:
+    double = a.chance(0.5)
+    length, width, z = a.u(1.9, 2.3), a.u(1.35, 1.8) if double else a.u(0.85, 1.2), a.u(0.3, 0.5)
+    a.add(box((length, width, a.u(0.15, 0.3)), (0, 0, z)), 0)
+    for end, height in ((1, a.u(0.65, 1.1)), (-1, a.u(0.35, 0.65))):
+        a.add(box((0.08, width, height), (end * length / 2, 0, height / 2 + 0.08)), 1)
+        a.add(rod((end * length / 2, width / 2, 0), (end * length / 2, width / 2, height + 0.12), 0.05), 1, mirror=True)
+    top = z + 0.17
+    if double:
+        a.add(ellipsoid((0.2, width * 0.2, 0.1), (length * 0.37, width * 0.24, top)), 2, mirror=True)
+    else:
+        a.add(ellipsoid((0.2, width * 0.36, 0.1), (length * 0.37, 0, top)), 2)
+    a.add(box((length * a.u(0.4, 0.65), width * 1.03, 0.12), (-length * 0.15, 0, top - 0.05)), 3)
+
+
+def bathtub(a: Assembly) -> None:
+    length, w, h = a.u(1.6, 2.0), a.u(0.75, 0.95), a.u(0.5, 0.65)
+    rear, front = a.u(0.55, 0.7) * length / 2, a.u(0.44, 0.56) * length / 2
+    a.add(extrusion([[-rear, 0], [front, 0], [length / 2, h], [-length / 2, h]], w), 0)
+    a.add(box((length * 0.88, w * 0.8, 0.03), (0, 0, h + 0.01)), 1)
+    for x in (-rear, front):
+        a.add(ellipsoid((0.07, 0.07, 0.1), (x * 0.85, w * 0.38, -0.03)), 2, mirror=True)
+    tap = np.array([-length / 2 + 0.06, 0, h])
+    rise = a.u(0.12, 0.3)
+    a.add(rod(tap, tap + [0, 0, rise], 0.035), 2)
+    a.add(rod(tap + [0, 0, rise], tap + [a.u(0.1, 0.25), 0, rise - 0.03], 0.03), 2)
+    a.add(ellipsoid((0.04, 0.04, 0.06), tap + [0, 0.13, 0.05]), 2, mirror=True)
+
+
+def skateboard(a: Assembly) -> None:
+    length, w, z = a.u(1.6, 2.2), a.u(0.4, 0.55), 0.25
+    a.add(box((length * 0.66, w, 0.05), (0, 0, z)), 0)
+    for end, reach, rise in ((1, a.u(0.2, 0.3), a.u(0.35, 0.6)), (-1, a.u(0.14, 0.22), a.u(0.15, 0.35))):
+        deck = box((length * reach, w * 0.92, 0.05), (length * reach / 2 - 0.01, 0, 0)).turned("y", -rise)
+        deck = deck if end == 1 else deck.turned("z", np.pi)
+        a.add(deck.moved((end * length * 0.33, 0, z)), 0)
+    for x in (-0.24 * length, 0.26 * length):
+        a.add(cylinder(0.09, 0.09, 0.1).turned("x", _QUARTER_TURN).moved((x, w * 0.42, 0.09)), 2, mirror=True)
+        a.add(rod((x, -w * 0.4, 0.1), (x, w * 0.4, 0.1), 0.04), 1)
+        a.add(box((0.2, 0.15, 0.12), (x, 0, 0.18)), 1)
+    a.add(box((length * 0.25, w * 0.98, 0.02), (length * a.u(0.05, 0.15), 0, z + 0.03)), 3)
+
+
+def tram(a: Assembly) -> None:
+    length, w, h, floor = a.u(2.4, 3.2), a.u(0.7, 0.9), a.u(0.7, 0.9), 0.15
+    rake, belt, roof = a.u(0.1, 0.3), floor + h * 0.45, floor + h
+    front, rear = [[length / 2, floor], [length / 2, belt]], [[-length / 2, roof], [-length / 2, floor]]
+    a.add(extrusion([*front, [length / 2 - rake, roof], *rear], w), 0)
+    screen = box((0.03, w * 0.8, h * 0.36)).turned("y", -np.arctan(rake / (roof - belt)))
+    a.add(screen.moved((length / 2 - rake / 2 + 0.01, 0, (belt + roof) / 2)), 4)
+    a.add(box((0.03, w * 0.5, h * 0.3), (-length / 2, 0, (belt + roof) / 2)), 4)
+    for k in range(4):
+        a.add(box((length * 0.15, 0.03, h * 0.3), ((k - 1.6) * length * 0.2, w / 2, (belt + roof) / 2)), 4, mirror=True)
+    a.add(ellipsoid((0.04, 0.07, 0.06), (length / 2, w * 0.32, floor + 0.17)), 5, mirror=True)
+    a.add(box((0.04, 0.1, 0.08), (-length / 2, w * 0.35, floor + 0.2)), 6, mirror=True)
+    for x in (-0.32, 0.32):
+        a.add(box((length * 0.2, w * 0.8, 0.2), (x * length, 0, 0.1)), 3)
+    arm = np.array([length * a.u(-0.05, 0.1), 0, roof + a.u(0.25, 0.4)])
+    a.add(rod((arm[0] - length * a.u(0.1, 0.18), 0, roof), arm, 0.03), 3)
+    a.add(box((0.05, w * 0.7, 0.03), arm), 3)
+
+
+# The last four are long bodies whose two ends differ in details only.
 VALIDATION = {
     generator.__name__: generator
     for generator in (
         helicopter, wheelbarrow, watering_can, vacuum_cleaner, drill, dinosaur, mailbox, excavator,
+        bed, bathtub, skateboard, tram,
     )
 }  # fmt: skip

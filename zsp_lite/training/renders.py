@@ -145,12 +145,15 @@ def load_render_set(paths: list[Path]) -> RenderSet:
 
 
 def training_and_held_out(
-    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable
-) -> tuple[RenderSet, RenderSet]:
+    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable, proportions: float = 0.3,
+    deformation: float = 1.0,
+) -> tuple[RenderSet, RenderSet]:  # fmt: skip
     """`objects` objects to train on, and others to watch the training by: an eighth as many, at most `SHARD`.
 
-    The others have numbers that no training set reaches, so runs that go on from one another can share them.
+    `proportions` and `deformation` are of the former; the others are always rendered alike, and have numbers that no
+    training set reaches, so runs that go on from one another can share them.
     """
     shard = min(SHARD, max(1, objects // 8))
     held_out = render_set(folder, shard, seed, shard, first=HELD_OUT)
-    return load_render_set(render_set(folder, objects, seed, shard, progress=progress)), load_render_set(held_out)
+    how = dict(progress=progress, proportions=proportions, deformation=deformation)
+    return load_render_set(render_set(folder, objects, seed, shard, **how)), load_render_set(held_out)
