@@ -212,7 +212,7 @@ def tram(a: Assembly) -> None:
     a.add(box((0.05, w * 0.7, 0.03), arm), 3)
 
 
-# The last four are long bodies whose two ends differ in details only.
+# The last four, long bodies whose ends differ in details only, were made to look into half turns (see the model card).
 VALIDATION = {
     generator.__name__: generator
     for generator in (

@@ -55,37 +55,43 @@ def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
-    parser.add_argument("start_from", help="a checkpoint of `train` or an exported backbone, which variants go on from")
+    parser.add_argument("start_from", help="what variants go on from: checkpoint.pt, exported .safetensors, zsp-tiny")
     parser.add_argument("out", type=Path, help="folder for renders and runs")
     parser.add_argument("--also", nargs="*", default=[], help="other such weights, measured beside")
     arguments = parser.parse_args()
     keep_freed_memory()
     try:
-        sources = {name: starting_weights(BASE, name) for name in (arguments.start_from, *arguments.also)}
+        rows = measured_rows(arguments.start_from, arguments.out, arguments.also)
     except InputError as error:
-        sys.exit(f"ablations: error: {error}")
-    unseen = load_render_set(render_set(arguments.out / "held-out", SHARD, 0, first=HELD_OUT))
-    rows = {f"{name}, before": measured(trainee(weights), unseen) for name, weights in sources.items()}
-    for name, config in VARIANTS.items():
-        run = arguments.out / "".join(letter if letter.isalnum() else "-" for letter in name)
-        renders = arguments.out / "renders"
-        train(config, run, renders, log=lambda line: print(line, flush=True), start_from=arguments.start_from)
-        state = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)
-        rows[name] = measured(trainee(state["average"]), unseen)
-        if name == "all of it":
-            rows["no average of the weights"] = measured(trainee(state["model"]), unseen)
-            model = trainee(state["average"])
-            some = load_render_set(render_set(renders, 1, BASE.seed, max(1, BASE.objects // 8)))
-            model.key_mean = positional_mean(model, some)
-            rows["the keys' mean at each place removed"] = measured(model, unseen)
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     print("| | matches (%) | view (%) | IoU |\n|---|---|---|---|")
     for name, (matches, view, iou) in rows.items():
         print(f"| {name} | {100 * matches:.1f} | {100 * view:.1f} | {iou:.3f} |")
 
 
-def trainee(state: dict[str, torch.Tensor]) -> Trainee:
+def measured_rows(start_from: str, out: Path, also: list[str]) -> dict[str, tuple[float, float, float]]:
+    sources = {f"{start_from}, before": start_from} | {name: name for name in also}
+    models = {name: trainee(starting_weights(BASE, source)) for name, source in sources.items()}
+    unseen = load_render_set(render_set(out / "held-out", SHARD, 0, first=HELD_OUT))
+    rows = {name: measured(model, unseen) for name, model in models.items()}
+    for name, config in VARIANTS.items():
+        run, renders = out / "".join(letter if letter.isalnum() else "-" for letter in name), out / "renders"
+        train(config, run, renders, log=lambda line: print(line, flush=True), start_from=start_from)
+        state = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)
+        rows[name] = measured(trainee(state["average"]), unseen)
+        if name == "all of it":
+            rows["no average of the weights"] = measured(trainee(state["model"]), unseen)
+            model = trainee(state["average"])
+            some = sorted(renders.glob(f"objects-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"))
+            model.key_mean = positional_mean(model, load_render_set(some))
+            rows["the keys' mean at each place removed"] = measured(model, unseen)
+    return rows
+
+
+def trainee(weights: dict[str, torch.Tensor]) -> Trainee:
     model = Trainee(BASE)
-    model.load_state_dict(state, strict=False)  # exported weights have no read-outs, which no figure here needs
+    model.load_state_dict(weights, strict=False)  # exported weights have no read-outs, which no figure here needs
     return model
 
 

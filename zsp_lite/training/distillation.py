@@ -26,7 +26,7 @@ from zsp_lite.files import write_atomic
 from zsp_lite.training.batches import _crop_grids as crop_grids
 from zsp_lite.training.batches import _recolour as recolour
 from zsp_lite.training.batches import sample_batch
-from zsp_lite.training.renders import VIEWS, RenderSet, training_and_held_out
+from zsp_lite.training.renders import DEFORMATION, PROPORTIONS, VIEWS, RenderSet, training_and_held_out
 from zsp_lite.training.train import (
     Trainee,
     TrainingConfig,
@@ -262,16 +262,21 @@ def distil(
 ) -> Path:  # fmt: skip
     """Run DINO from random weights, or resume from `folder`/checkpoint.pt, and export `folder`/dino-tiny.safetensors.
 
-    Of `shape` the backbone's size and key block, the number of objects and their seed count. folder receives
-    config.json and log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line before,
-    and in every tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees. `renders` is
-    where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of its shards.
+    Of `shape` count the backbone's size and key block, and which objects there are and how they are rendered. folder
+    receives config.json and log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line
+    before, and in every tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees.
+    `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
+    its shards.
     Raises InputError where `folder` holds a run of another configuration or a damaged one.
     """
     folder = Path(folder)
     network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "key_block")}
-    claim_folder(folder, dict(asdict(config), objects=shape.objects, pictures_seed=shape.seed, network=network))
-    training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, progress)
+    rendered = dict(proportions=shape.proportions, deformation=shape.deformation)
+    settings = dict(asdict(config), objects=shape.objects, pictures_seed=shape.seed, network=network) | rendered
+    claim_folder(folder, settings, earlier=dict(proportions=PROPORTIONS, deformation=DEFORMATION))
+    training, held_out = training_and_held_out(
+        renders or folder / "renders", shape.objects, shape.seed, progress, **rendered
+    )
     start = Trainee(shape)
     initialise(start, training, shape.seed)
     run = Distillation(config, start.backbone)

@@ -20,6 +20,7 @@ SIZE = 192
 GRID = 48
 SHARD = 200
 APART = np.radians((5, 45))  # in azimuth, of the two views of a pair: never farther than views of two pairs
+PROPORTIONS, DEFORMATION = 0.3, 1.0  # how far the views of one build differ; see `render_object`
 HELD_OUT = 9_000_000  # the number of the first object that is never trained on
 
 
@@ -41,7 +42,7 @@ class RenderSet:
 
 
 def render_object(
-    seed: int, generators=None, proportions: float = 0.3, deformation: float = 1.0
+    seed: int, generators=None, proportions: float = PROPORTIONS, deformation: float = DEFORMATION
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render one build; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
 
@@ -109,8 +110,8 @@ def _render_shard(first: int, count: int, folder: Path, seed: int, proportions: 
 
 
 def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, workers: int = 2,
-               progress=lambda iterable, total: iterable, first: int = 0, proportions: float = 0.3,
-               deformation: float = 1.0) -> list[Path]:  # fmt: skip
+               progress=lambda iterable, total: iterable, first: int = 0,
+               proportions: float = PROPORTIONS, deformation: float = DEFORMATION) -> list[Path]:  # fmt: skip
     """Render `objects` objects (rounded up to whole shards), from number `first` on, into `folder`, or reuse them.
 
     Returns the shard paths; a killed run continues with the first missing shard. About 1.1 MB per object.
@@ -145,8 +146,8 @@ def load_render_set(paths: list[Path]) -> RenderSet:
 
 
 def training_and_held_out(
-    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable, proportions: float = 0.3,
-    deformation: float = 1.0,
+    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable,
+    proportions: float = PROPORTIONS, deformation: float = DEFORMATION,
 ) -> tuple[RenderSet, RenderSet]:  # fmt: skip
     """`objects` objects to train on, and others to watch the training by: an eighth as many, at most `SHARD`.
 

@@ -29,7 +29,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.files import read_bytes, write_atomic
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
-from zsp_lite.training.renders import VIEWS, RenderSet, training_and_held_out
+from zsp_lite.training.renders import DEFORMATION, PROPORTIONS, VIEWS, RenderSet, training_and_held_out
 from zsp_lite.vit import TrainingTokens, VisionTransformer
 
 
@@ -59,13 +59,13 @@ class TrainingConfig:
     `seed` fixes objects, crops and random weights; `objects` are trained on, others are held out; the views of an
     object differ by `proportions` and `deformation` (see `render_object`). `queries` and `view_queries` are patches,
     per object and per view. With `log_binned` the view loss compares what the method does, otherwise bare keys.
-    InputError for no object.
+    InputError for no object, and for amounts that are negative or not finite.
     """
 
     seed: int = 0
     objects: int = 5600
-    proportions: float = 0.3
-    deformation: float = 1.0
+    proportions: float = PROPORTIONS
+    deformation: float = DEFORMATION
     embed_dim: int = 192
     depth: int = 12
     num_heads: int = 6
@@ -90,6 +90,9 @@ class TrainingConfig:
     def __post_init__(self):
         if self.objects < 1:
             raise InputError(f"training has {self.objects} objects, expected at least 1")
+        for name in ("proportions", "deformation"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"training has {name} {getattr(self, name)}, expected a finite number from 0 on")
 
     @property
     def steps(self) -> int:
@@ -254,10 +257,10 @@ def train(
     `start_from` is where the weights of a further run come from (see `starting_weights`); what an exported file lacks,
     the read-outs, is fitted first.
     `renders` is where the training set is kept or made (default `folder`/renders): 1.1 MB per object there, and in
-    memory; `progress` wraps the rendering of its shards. The checkpoint holds model, average, optimiser and step;
-    batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
-    Raises InputError where `folder` holds a run of another configuration, from other weights or a damaged one, where
-    `start_from` does not fit, and where the loss is no longer finite.
+    memory; `progress` wraps the rendering of its shards. The checkpoint holds model, average, optimiser, step and what
+    the run started from; batches depend only on (seed, step), so a resumed run continues as if nothing had happened.
+    Raises InputError where `folder` holds a run of another configuration, a damaged one, or one from other weights
+    than `start_from`, if that is still there; where `start_from` does not fit; where the loss is no longer finite.
     """
     folder = Path(folder)
     checkpoint_file = folder / "checkpoint.pt"
@@ -266,7 +269,7 @@ def train(
     if start_from is not None and (first_time or _weights_file(start_from).exists()):
         start = starting_weights(config, start_from)
         origin = hashlib.sha256(b"".join(start[name].numpy().tobytes() for name in sorted(start))).hexdigest()
-    claim_folder(folder, asdict(config))
+    claim_folder(folder, asdict(config), earlier=dict(proportions=PROPORTIONS, deformation=DEFORMATION))
     resumed = None if first_time else _load(config, checkpoint_file)
     if resumed is not None:
         if start is not None and resumed["origin"] not in (None, origin):
@@ -283,8 +286,10 @@ def train(
         model.load_state_dict(resumed["model"])
     elif start is None:
         initialise(model, training, config.seed)
-    elif model.load_state_dict(start, strict=False).missing_keys:
-        fit_read_outs(model, training, config.seed)
+    else:
+        without_read_outs = model.load_state_dict(start, strict=False).missing_keys
+        if without_read_outs:
+            fit_read_outs(model, training, config.seed)
     model.to(device)
     average = Trainee(config).to(device)
     average.load_state_dict(model.state_dict())
@@ -336,12 +341,22 @@ def train(
     return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
 
 
-def claim_folder(folder: Path, settings: dict) -> None:
-    """Make `folder` and write `settings` to its config.json. InputError where other ones are there."""
+def claim_folder(folder: Path, settings: dict, earlier: dict | None = None) -> None:
+    """Make `folder` and write `settings` to its config.json. InputError where other ones are there.
+
+    `earlier` holds what runs did whose config.json does not say it yet.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     settings, path = json.loads(json.dumps(settings)), folder / "config.json"
-    if path.exists() and decode(read_bytes(path, "configuration"), dict, path) != settings:
-        raise InputError(f"{path}: holds a run of another configuration; expected a new folder for this one")
+    if path.exists():
+        found = (earlier or {}) | decode(read_bytes(path, "configuration"), dict, path)
+        differ = sorted(name for name in settings.keys() | found.keys() if settings.get(name) != found.get(name))
+        if differ:
+            name = differ[0]
+            raise InputError(
+                f"{path}: holds a run of another configuration, {name} is {found.get(name)}, expected "
+                f"{settings.get(name)} or a new folder"
+            )
     write_atomic(path, (json.dumps(settings, indent=1) + "\n").encode())
 
 
