@@ -263,7 +263,7 @@ def _add_train(commands) -> None:
     parser = _command(
         commands, "train", _train, "train the embedded backbone, or resume; hours on a CPU",
         ["train --out outputs/first", "train --out outputs/second --start-from outputs/first/checkpoint.pt",
-         "train --out outputs/further --start-from zsp-tiny --seed 1",
+         "train --out outputs/further --start-from zsp-tiny --seed 1 --objects 2400",
          "train --out outputs/try --shorten 0.02 --objects 60",
          "train --self-distillation --out outputs/dino --renders outputs/first/renders"],
     )  # fmt: skip
