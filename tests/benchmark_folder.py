@@ -13,8 +13,8 @@ import numpy as np
 from synthetic_views import CoordinateBackbone, look_at, render
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.co3d import SequenceData, write_co3d
-from zsp_lite.labels import PoseLabel, write_label
+from zsp_lite.data.co3d import SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
 
 SEQUENCES = ("100_a", "200_b", "300_c")
 FRAMES = 8

@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.cameras import Camera
-from zsp_lite.co3d import SequenceData
-from zsp_lite.frames import Frame
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.frames import Frame
 
 coordinates = st.floats(-10, 10, allow_subnormal=False)
 seeds = st.integers(0, 2**32 - 1)

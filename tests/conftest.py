@@ -61,8 +61,8 @@ def ellipsoids(tmp_path_factory):
     from synthetic_views import look_at, render
 
     from zsp_lite.alignment import Sim3
-    from zsp_lite.co3d import Co3D, SequenceData, write_co3d
-    from zsp_lite.labels import PoseLabel, write_label
+    from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+    from zsp_lite.data.labels import PoseLabel, write_label
 
     root = tmp_path_factory.mktemp("co3d")
     turn = look_at((0.3, -1.0, 0.4)).R
@@ -71,14 +71,9 @@ def ellipsoids(tmp_path_factory):
     sequences = []
     for name, placement in placements.items():
         angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
-        frames = [
-            render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}")
-            for i, a in enumerate(angles)
-        ]
+        frames = [render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}") for i, a in enumerate(angles)]
         colours = np.full((50, 3), 128, np.uint8)
-        sequences.append(
-            SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0)
-        )
+        sequences.append(SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0))
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)

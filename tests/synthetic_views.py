@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame
 
 AXES = np.array([1.2, 0.8, 0.6])
 REACH = 1.6  # colours map [-REACH, REACH]

@@ -11,11 +11,18 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import nn
 
-from zsp_lite import backbones
-from zsp_lite.backbones import Backbone, Release, available_backbones, load_backbone, prepare_images, verify
-from zsp_lite.download import fetch
+from zsp_lite.backbones import load as backbones
+from zsp_lite.backbones.load import (
+    Backbone,
+    PretrainedWeights,
+    available_backbones,
+    load_backbone,
+    prepare_images,
+    verify,
+)
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.vit import VisionTransformer
+from zsp_lite.io.download import fetch
 
 
 def small_vit(seed: int = 0, **sizes) -> VisionTransformer:
@@ -376,8 +383,8 @@ def test_dino_models_come_from_the_server_into_the_cache(server, vit, pictures, 
     server.files["/dino/some/vit.pth"] = content
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
-    release = Release("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
-    monkeypatch.setitem(backbones.RELEASES, "dino_vits8", release)
+    release = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+    monkeypatch.setitem(backbones.PRETRAINED, "dino_vits8", release)
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu", num_heads=4)
     assert loaded.name == "dino_vits8"
@@ -390,7 +397,9 @@ def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, mo
     torch.save(small_vit(num_heads=1).state_dict(), tmp_path / "vit.pth")
     content = (tmp_path / "vit.pth").read_bytes()
     monkeypatch.setitem(
-        backbones.RELEASES, "dino_vits16", Release("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+        backbones.PRETRAINED,
+        "dino_vits16",
+        PretrainedWeights("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content)),
     )
     verify("dino_vits16")
     torch.save(small_vit(num_heads=1, seed=1).state_dict(), tmp_path / "vit.pth")  # as long, and loads as well
@@ -410,15 +419,15 @@ def test_without_the_server_one_line_says_what_to_do(server, tmp_path, monkeypat
     message = str(caught.value)
     assert "\n" not in message
     place = tmp_path / "dino_deitsmall8_pretrain.pth"
-    for part in (backbones.RELEASES["dino_vits8"].url, str(place), "zsp-tiny"):
+    for part in (backbones.PRETRAINED["dino_vits8"].url, str(place), "zsp-tiny"):
         assert part in message
 
 
 def test_released_addresses_and_hashes_are_those_that_were_published():
-    release = backbones.RELEASES["dino_vits8"]
+    release = backbones.PRETRAINED["dino_vits8"]
     folder = "https://dl.fbaipublicfiles.com/dino/dino_deitsmall8_pretrain/"
     assert release.url == folder + "dino_deitsmall8_pretrain.pth"
     assert (release.md5_prefix, release.size) == ("230cd5", 86_728_949)
-    assert {name: r.md5_prefix for name, r in backbones.RELEASES.items()} == {
+    assert {name: r.md5_prefix for name, r in backbones.PRETRAINED.items()} == {
         "dino_vits8": "230cd5", "dino_vits16": "cf0f22", "dino_vitb8": "556550", "dino_vitb16": "552daf"
     }  # fmt: skip

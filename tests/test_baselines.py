@@ -21,20 +21,20 @@ from zsp_lite.baselines.posecontrast import (
     PoseContrast,
     TinyParts,
     ViewpointHead,
-    angles_of,
+    euler_to_rotation,
     load_posecontrast,
     load_posecontrast_tiny,
     pad_to_square,
     padded,
     predicted_angles,
-    rotation_of,
+    rotation_to_euler,
 )
 from zsp_lite.baselines.resnet import TINY, ResNet, Shape
 from zsp_lite.baselines.sift import Keypoints, Sift, lifted, mutual_matches
 from zsp_lite.baselines.swav import load_swav, load_swav_tiny
 from zsp_lite.benchmark.essential import essential_rotation
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import object_crop
@@ -136,24 +136,24 @@ angles = st.tuples(st.floats(0, 359.9), st.floats(1, 179), st.floats(0, 359.9))
 
 @given(angles)
 def test_angles_and_rotations_are_each_others_inverse(found):
-    rotation = rotation_of(np.array(found))
-    assert rotation_error(rotation_of(angles_of(rotation)), rotation) < 1e-4
-    assert angles_of(rotation) == pytest.approx(np.array(found), abs=1e-6)
+    rotation = euler_to_rotation(np.array(found))
+    assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
+    assert rotation_to_euler(rotation) == pytest.approx(np.array(found), abs=1e-6)
 
 
 @pytest.mark.parametrize("pole", [0.0, 180.0])
 @pytest.mark.parametrize("azimuth", [0.0, 77.0, 300.0])
 def test_straight_from_above_or_below_angles_still_give_the_rotation(pole, azimuth):
-    rotation = rotation_of(np.array([azimuth, pole, 40.0]))
-    assert rotation_error(rotation_of(angles_of(rotation)), rotation) < 1e-4
+    rotation = euler_to_rotation(np.array([azimuth, pole, 40.0]))
+    assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
 
 
 def test_a_viewpoint_is_pascals_in_front_of_the_object_and_beside_it():
     """Azimuth, elevation and in-plane rotation 0: the camera at -y looks along +y, z upwards; labels count from -90."""
-    front = rotation_of(np.array([0.0, 90.0, 180.0]))
+    front = euler_to_rotation(np.array([0.0, 90.0, 180.0]))
     assert front == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), abs=1e-12)
     # 90 degrees of elevation: from above, what was away from the camera is up in the picture.
-    above = rotation_of(np.array([0.0, 180.0, 180.0]))
+    above = euler_to_rotation(np.array([0.0, 180.0, 180.0]))
     assert above @ (0, 1, 0) == pytest.approx((0, -1, 0), abs=1e-12)
     assert above @ (0, 0, 1) == pytest.approx((0, 0, -1), abs=1e-12)
 
@@ -174,7 +174,7 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
         logits, offsets = model.head(network.eval()(batch))
     chosen = [int(logit.argmax()) for logit in logits]
     by_hand = [15 * (i + float(offset[0, i])) for i, offset in zip(chosen, offsets, strict=True)]
-    assert rotation_error(found.rotation, rotation_of(np.clip(by_hand, 0, 360))) < 0.1
+    assert rotation_error(found.rotation, euler_to_rotation(np.clip(by_hand, 0, 360))) < 0.1
     keys = {"compress.0.weight", "compress.1.running_mean", "compress.7.bias", "fc_cls_azi.weight", "fc_reg_inp.bias"}
     assert keys <= head.state_dict().keys()
     for content in ([1], {"net_feat": features}, {"net_feat": {}, "net_vp": {}}):
@@ -282,8 +282,8 @@ def test_keypoints_are_lifted_onto_the_surface():
 def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():
     rng = np.random.default_rng(0)
     grid = (224, 224)  # a patch per pixel: nearly exact matches
-    first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal=np.array([300.0, 260.0]))
-    second = replace(look_at((0.9, 0.45, 0.3), size=(224, 224)), focal=np.array([350.0, 330.0]))
+    first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal_length=np.array([300.0, 260.0]))
+    second = replace(look_at((0.9, 0.45, 0.3), size=(224, 224)), focal_length=np.array([350.0, 330.0]))
     points = rng.normal(size=(60, 3)) * 0.5
     pixels = [np.floor(camera.project(points)[0]).astype(int)[:, ::-1] for camera in (first, second)]
     pixels[1][:15] = rng.integers(40, 180, (15, 2))  # a quarter of the matches is wrong

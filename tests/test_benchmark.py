@@ -13,7 +13,8 @@ from synthetic_views import CoordinateBackbone
 
 import zsp_lite
 from zsp_lite.alignment import ransac
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.annotations import process_memory
 from zsp_lite.benchmark.profile import (
     Row,
@@ -24,12 +25,11 @@ from zsp_lite.benchmark.profile import (
     verified_row,
 )
 from zsp_lite.benchmark.run import METHODS, category_pairs, evaluate, random_backbone, read_records
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import sample_pairs, write_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.labels import read_labels
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import sample_pairs, write_upstream_pairs
-from zsp_lite.vit import VisionTransformer
 
 
 @pytest.fixture(scope="module")

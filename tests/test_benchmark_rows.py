@@ -9,9 +9,9 @@ from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.benchmark import extractors
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, read_records, resolve
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.labels import read_labels
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 
@@ -124,8 +124,8 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
 
 
 def test_a_fingerprint_tells_apart_whatever_changes_the_features():
-    from zsp_lite.backbones import Backbone
-    from zsp_lite.vit import VisionTransformer
+    from zsp_lite.backbones.load import Backbone
+    from zsp_lite.backbones.vit import VisionTransformer
 
     torch.manual_seed(0)
     vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)

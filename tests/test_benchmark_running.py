@@ -21,7 +21,8 @@ import torch
 from benchmark_folder import SlowBackbone, own_method, small_folder
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import run as run_module
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.execution import open_crew
@@ -35,12 +36,11 @@ from zsp_lite.benchmark.results import read_results
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, plan_run, read_records, work_of_categories
 from zsp_lite.benchmark.storage import PartReader, RunFolder, _append, part_writer
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels, write_label
+from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.labels import read_labels, write_label
-from zsp_lite.pairs import sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.vit import VisionTransformer
 
 BACKBONE = CoordinateBackbone()
 ROWS = ("ours", "ours-bv")

@@ -37,9 +37,9 @@ from zsp_lite.benchmark.tables import (
     every_table,
     paper_tables,
 )
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import paired_test
-from zsp_lite.pairs import Pair
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
 PAIRS = 8

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
 FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
@@ -19,7 +19,7 @@ def view(**changes):
     values = {
         "R": np.eye(3),
         "t": [0, 0, 2],
-        "focal": [500, 500],
+        "focal_length": [500, 500],
         "principal_point": [320, 240],
         "size": SIZE,
     }
@@ -36,7 +36,7 @@ def visible_points(seed: int) -> tuple[Camera, np.ndarray]:
 def test_conversion_to_pytorch3d_and_back_changes_nothing(seed, intrinsics_format):
     camera = random_camera(seed)
     back = Camera.from_pytorch3d(**camera.to_pytorch3d(intrinsics_format), size=camera.size)
-    for name in ("R", "t", "focal", "principal_point"):
+    for name in ("R", "t", "focal_length", "principal_point"):
         np.testing.assert_allclose(getattr(back, name), getattr(camera, name), rtol=1e-9, atol=1e-9)
     assert back.size == camera.size
 
@@ -82,13 +82,13 @@ def test_a_rotation_of_few_decimals_is_taken_for_the_nearest_one():
 
 def test_v1_intrinsics_worked_out_by_hand():
     camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200))
-    np.testing.assert_allclose(camera.focal, [200, 150])
+    np.testing.assert_allclose(camera.focal_length, [200, 150])
     np.testing.assert_allclose(camera.principal_point, [90, 60])
 
 
 def test_v2_intrinsics_worked_out_by_hand():
     camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200), "ndc_isotropic")
-    np.testing.assert_allclose(camera.focal, [100, 150])
+    np.testing.assert_allclose(camera.focal_length, [100, 150])
     np.testing.assert_allclose(camera.principal_point, [95, 60])
 
 
@@ -150,7 +150,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"R": np.full((3, 3), np.nan)}, "R is not finite"),
         ({"t": [0, 0, np.inf]}, "t is not finite"),
         ({"t": "somewhere"}, "t is 'somewhere'"),
-        ({"focal": [500, 0]}, "expected positive pixels"),
+        ({"focal_length": [500, 0]}, "expected positive pixels"),
         ({"principal_point": [np.nan, 0]}, "principal_point is not finite"),
         ({"size": (0, 5)}, "expected positive"),
         ({"size": 5}, "image size is 5"),

@@ -7,9 +7,10 @@ import sys
 import pytest
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite import cli, errors
-from zsp_lite.backbones import BackboneChoice
-from zsp_lite.co3d import Co3D
+from zsp_lite import errors
+from zsp_lite.backbones.load import BackboneConfig
+from zsp_lite.cli import main as cli
+from zsp_lite.data.co3d import Co3D
 
 COMMANDS = (
     "demo", "benchmark", "tables", "compare", "synth", "weights", "train", "train-baseline", "label", "data", "profile",
@@ -34,7 +35,7 @@ def test_help_lists_every_command(capsys):
 
 
 def test_help_imports_nothing_heavy():
-    code = "import sys; from zsp_lite.cli import build_parser; build_parser(); print('torch' in sys.modules)"
+    code = "import sys; from zsp_lite.cli.main import build_parser; build_parser(); print('torch' in sys.modules)"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "False"
 
@@ -125,7 +126,7 @@ def test_the_doctor_names_each_thing_and_says_what_is_missing(capsys, ellipsoids
 
 
 def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zsp_lite.backbones.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "ellipsoid" in text and " of 5" in text and "°" in text and cli.USER_NOTE in text
@@ -163,14 +164,14 @@ def test_the_demo_takes_layer_facet_and_size_too(ellipsoids, tmp_path, capsys, m
         loaded.append(choice)
         return CoordinateBackbone()
 
-    monkeypatch.setattr("zsp_lite.backbones.load_backbone", load)
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", load)
     monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone: iter(()))
-    monkeypatch.setattr("zsp_lite.report.write_report", lambda path, *others: path)
-    monkeypatch.setattr("zsp_lite.report.write_overview", lambda *others: None)
+    monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
+    monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     demo = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
     assert cli.main([*demo, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
     assert cli.main([*demo, "--backbone", "dino_vits8"]) == 0
-    assert loaded == [BackboneChoice("zsp-tiny", "block3", "value", 96), "dino_vits8"]
+    assert loaded == [BackboneConfig("zsp-tiny", "block3", "value", 96), "dino_vits8"]
 
 
 def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):

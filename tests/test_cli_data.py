@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from co3d_folders import sequence_data
 
-from zsp_lite.cli import main
-from zsp_lite.co3d import Co3D, write_co3d
-from zsp_lite.labels import PoseLabel, read_labels, write_label
+from zsp_lite.cli.main import main
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_capture_is_imported(root, tmp_path, capsys):
     exact = make_sequence("teapot", 0, 4, 3, 64)[1]
     from dataclasses import replace
 
-    from zsp_lite.frames import Frame, write_mask
+    from zsp_lite.data.frames import Frame, write_mask
 
     frames = []
     for number, view in enumerate(exact.views):

@@ -8,10 +8,10 @@ import pytest
 from co3d_folders import edit_json, sequence_data
 
 from zsp_lite.benchmark.annotations import annotation_benchmark
-from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.frames import write_depth, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.frames import write_depth, write_image, write_mask
-from zsp_lite.ply import read_ply, write_ply
+from zsp_lite.io.ply import read_ply, write_ply
 
 V1, V2 = "ndc_norm_image_bounds", "ndc_isotropic"
 
@@ -54,7 +54,7 @@ def test_what_is_written_is_read(tmp_path, intrinsics_format):
     assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
     for annotation, expected in zip(annotations, written.frames, strict=True):
         frame = dataset.load(annotation)
-        for name in ("R", "t", "focal", "principal_point"):
+        for name in ("R", "t", "focal_length", "principal_point"):
             np.testing.assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
         np.testing.assert_array_equal(frame.mask, expected.mask)
         np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
@@ -88,7 +88,7 @@ def test_the_format_of_intrinsics_is_told_frame_by_frame(tmp_path):
     dataset = Co3D(tmp_path)
     for data in (old, new):
         camera = dataset.load(dataset.frames("chair", data.name)[0]).camera
-        np.testing.assert_allclose(camera.focal, data.frames[0].camera.focal)
+        np.testing.assert_allclose(camera.focal_length, data.frames[0].camera.focal_length)
     assert dataset.frames("chair", "new")[0].viewpoint.intrinsics_format == V2
     assert "meta" in json.loads(gzip.decompress(frames_file(tmp_path).read_bytes()))[1]
 
@@ -163,9 +163,7 @@ def test_what_may_be_null_may_be_null(root):
 
 @pytest.mark.parametrize("field", ["sequence_name", "frame_number", "image"])
 def test_a_missing_field_is_named_with_its_file(root, field):
-    edit_json(
-        frames_file(root), lambda frames: [{k: v for k, v in frame.items() if k != field} for frame in frames]
-    )
+    edit_json(frames_file(root), lambda frames: [{k: v for k, v in frame.items() if k != field} for frame in frames])
     with pytest.raises(InputError, match=rf"frame_annotations\.jgz.*missing required field `{field}`"):
         Co3D(root).frames("chair", "b_2")
 
@@ -193,9 +191,7 @@ def test_a_camera_that_is_not_finite_fails_alone_and_by_name(root):
 
 
 def test_a_matrix_that_is_no_rotation_is_refused_with_its_frame(root):
-    edit_json(
-        frames_file(root), lambda frames: frames[0]["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])
-    )
+    edit_json(frames_file(root), lambda frames: frames[0]["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]))
     with pytest.raises(InputError, match="frame b_2/0: camera R"):
         Co3D(root).load(first(root))
 
@@ -261,9 +257,7 @@ def test_the_depth_mask_makes_depth_unknown(root):
     write_mask(root / annotation.depth.mask_path, allowed)
     after = Co3D(root).load(annotation).depth
     np.testing.assert_array_equal(after, np.where(allowed > 0, before, 0))
-    change_first_frame(
-        root, depth={"path": annotation.depth.path, "scale_adjustment": 2.0, "mask_path": None}
-    )
+    change_first_frame(root, depth={"path": annotation.depth.path, "scale_adjustment": 2.0, "mask_path": None})
     np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
 
 
@@ -294,9 +288,7 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
 
     def score(items):
         for item in items:
-            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[
-                item["sequence_name"]
-            ]
+            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[item["sequence_name"]]
 
     edit_json(tmp_path / "chair" / "sequence_annotations.jgz", score)
     dataset = Co3D(tmp_path)

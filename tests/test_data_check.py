@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from co3d_folders import edit_json, sequence_data
 
-from zsp_lite.co3d import Co3D, write_co3d
-from zsp_lite.data_check import check_folder
+from zsp_lite.data.check import check_folder
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, write_label
-from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 
 
 @pytest.fixture

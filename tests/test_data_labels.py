@@ -17,12 +17,12 @@ from co3d_folders import sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.co3d import Co3D, write_co3d
-from zsp_lite.data_labels import align_worlds, bring_labels, carry_labels
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.label_import import align_worlds, import_labels, transfer_labels
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.pairs import sample_pairs, shipped_pairs, write_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, read_labels, write_label
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import sample_pairs, shipped_pairs, write_upstream_pairs
 
 
 @pytest.fixture
@@ -69,22 +69,22 @@ def check_arrived(root):
 
 
 def test_labels_and_pairs_come_from_a_clone(clone, root):
-    assert bring_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
+    assert import_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
     check_arrived(root)
     assert not (root / "README.md").exists()
 
 
 def test_other_labels_are_replaced_only_when_that_is_said(clone, root):
-    bring_labels(clone, root)
-    bring_labels(clone, root)  # the same again loses nothing
+    import_labels(clone, root)
+    import_labels(clone, root)  # the same again loses nothing
     mine = np.eye(4)
     mine[:3, 3] = 0.1
     write_label(root, "chair", PoseLabel(mine, "b", "a"))
     before = everything(root)
     with pytest.raises(InputError, match=r"b\.json would be replaced by other content, expected --replace"):
-        bring_labels(clone, root)
+        import_labels(clone, root)
     assert everything(root) == before
-    bring_labels(clone, root, replace=True)
+    import_labels(clone, root, replace=True)
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
@@ -92,9 +92,9 @@ def test_other_labels_are_replaced_only_when_that_is_said(clone, root):
 def test_and_from_an_archive_with_its_checksum(clone, root, kind):
     path, digest = packed(clone, kind)
     with pytest.raises(InputError, match=f"has SHA-256 {digest}, expected 00"):
-        bring_labels(path, root, "00" * 32)
+        import_labels(path, root, "00" * 32)
     assert not (root / "class_labels").exists()
-    bring_labels(path, root, digest.upper())
+    import_labels(path, root, digest.upper())
     check_arrived(root)
 
 
@@ -111,11 +111,11 @@ def test_and_from_a_url_with_its_checksum(clone, root, monkeypatch, tmp_path):
     url = f"http://127.0.0.1:{server.server_port}/{path.name}"
     try:
         with pytest.raises(InputError, match="needs its SHA-256"):
-            bring_labels(url, root)
+            import_labels(url, root)
         with pytest.raises(InputError, match="expected 00"):
-            bring_labels(url, root, "00" * 32)
+            import_labels(url, root, "00" * 32)
         assert not list((tmp_path / "cache").iterdir()), "a wrong file is not kept"
-        bring_labels(url, root, digest)
+        import_labels(url, root, digest)
     finally:
         server.shutdown()
         server.server_close()
@@ -137,7 +137,7 @@ def test_a_bad_file_stops_everything_before_a_file_is_written(clone, root, file,
     (clone / file).write_bytes(content)
     before = everything(root)
     with pytest.raises(InputError, match=message):
-        bring_labels(clone, root)
+        import_labels(clone, root)
     assert everything(root) == before
 
 
@@ -163,7 +163,7 @@ def test_an_archive_that_cannot_be_unpacked_is_one_line(clone, root, damage):
     path, _ = packed(clone, "zip")
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(InputError, match="is broken, locked or none"):
-        bring_labels(path, root)
+        import_labels(path, root)
     assert not (root / "class_labels").exists()
 
 
@@ -171,31 +171,31 @@ def test_a_cut_archive_is_one_line(clone, root):
     path, _ = packed(clone, "tar.gz")
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match="is broken, locked or none"):
-        bring_labels(path, root)
+        import_labels(path, root)
     assert not (root / "class_labels").exists()
 
 
 def test_a_checksum_of_a_folder_is_refused_rather_than_passed_over(clone, root):
     with pytest.raises(InputError, match="is a folder, expected an archive or a URL"):
-        bring_labels(clone, root, "00" * 32)
+        import_labels(clone, root, "00" * 32)
 
 
 def test_labels_of_two_references_never_come_together(clone, root, tmp_path):
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
     before = everything(root)
     with pytest.raises(InputError, match="would have references a, z, expected one; nothing was written"):
-        bring_labels(clone, root)
+        import_labels(clone, root)
     assert everything(root) == before
     two_layouts(tmp_path)
     write_label(tmp_path / "v2", "chair", PoseLabel(np.eye(4), "z", "z"))
     with pytest.raises(InputError, match="would have references a, z"):
-        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert list(read_labels(tmp_path / "v2", "chair")) == ["z"]
 
 
 def test_labels_come_to_where_the_folder_has_its_labels(clone, root):
     write_label(root / "data", "chair", PoseLabel(np.eye(4), "c", "a"))
-    bring_labels(clone, root)
+    import_labels(clone, root)
     assert list(read_labels(root, "chair")) == ["a", "b", "c"]
 
 
@@ -206,7 +206,7 @@ def test_code_in_pairs_is_not_run(clone, root, tmp_path):
 
     torch.save([Evil()], clone / "data" / "determ_eval" / "200samples_5tgt" / "chair.pt")
     with pytest.raises(InputError, match="plain data"):
-        bring_labels(clone, root)
+        import_labels(clone, root)
     assert not (tmp_path / "ran").exists()
 
 
@@ -219,9 +219,9 @@ def test_sources_without_labels_are_refused(root, tmp_path):
         (tmp_path / "text.zip", "of 4 bytes is broken, locked or none, expected .zip or .tar.gz"),
     ):
         with pytest.raises(InputError, match=message):
-            bring_labels(source, root)
+            import_labels(source, root)
     with pytest.raises(InputError, match="is not there"):
-        bring_labels(tmp_path / "empty", tmp_path / "nowhere")
+        import_labels(tmp_path / "empty", tmp_path / "nowhere")
 
 
 def moved(sequence, world: Sim3, noise: float = 0.0):
@@ -253,7 +253,7 @@ def two_layouts(tmp_path, noise=0.0):
 
 def test_labels_are_carried_to_another_reconstruction(tmp_path):
     worlds, trans = two_layouts(tmp_path)
-    residuals = carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+    residuals = transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert max(residuals.values()) < 1e-6
     labels = read_labels(tmp_path / "v2", "chair")
     np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
@@ -273,18 +273,18 @@ def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
     residual = align_worlds(old, new, "chair", "a")[1]
     assert 0.02 < residual < 0.5
     with pytest.raises(InputError, match="camera centres differ by .* nothing was written"):
-        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=0.01)
+        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=0.01)
     assert read_labels(tmp_path / "v2", "chair") == {}
-    assert carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=1.0)["a"] == residual
+    assert transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=1.0)["a"] == residual
 
 
 def test_what_cannot_be_carried_is_refused(tmp_path):
     two_layouts(tmp_path)
     with pytest.raises(InputError, match="has no labels of category stool"):
-        carry_labels(tmp_path / "v1", tmp_path / "v2", "stool")
+        transfer_labels(tmp_path / "v1", tmp_path / "v2", "stool")
     write_co3d(tmp_path / "v2b", "chair", [sequence_data("a")])
     with pytest.raises(InputError, match="no frames of a sequence 'b'"):
-        carry_labels(tmp_path / "v1", tmp_path / "v2b", "chair", max_residual=10)
+        transfer_labels(tmp_path / "v1", tmp_path / "v2b", "chair", max_residual=10)
 
 
 def test_carried_labels_replace_others_only_when_that_is_said(tmp_path):
@@ -293,7 +293,7 @@ def test_carried_labels_replace_others_only_when_that_is_said(tmp_path):
     path = write_label(tmp_path / "v2", "chair", mine)
     before = path.read_bytes()
     with pytest.raises(InputError, match=r"b\.json would be replaced"):
-        carry_labels(tmp_path / "v1", tmp_path / "v2", "chair")
+        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert everything(tmp_path / "v2" / "class_labels") == {path.relative_to(tmp_path / "v2" / "class_labels"): before}
-    carry_labels(tmp_path / "v1", tmp_path / "v2", "chair", replace=True)
+    transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", replace=True)
     assert not np.array_equal(read_labels(tmp_path / "v2", "chair")["b"].trans, mine.trans)

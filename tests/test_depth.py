@@ -4,8 +4,8 @@ from co3d_folders import random_camera, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsp_lite.cameras import Camera
-from zsp_lite.depth import decode_depth, encode_depth, inpaint_depth, patch_points, structured_point_cloud
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import decode_depth, encode_depth, inpaint_depth, patch_points, unproject_depth
 from zsp_lite.errors import InputError
 
 
@@ -61,7 +61,7 @@ def test_complete_depth_needs_no_filling_and_none_at_all_is_refused():
 def test_the_structured_cloud_projects_onto_its_own_pixels():
     camera = random_camera(3, (7, 9))
     depth = np.random.default_rng(0).uniform(1, 2, (7, 9))
-    pixels, back = camera.project(camera.to_world(structured_point_cloud(depth, camera)))
+    pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
     np.testing.assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
     np.testing.assert_allclose(pixels[6, 0], [0.5, 6.5])
     np.testing.assert_allclose(back, depth)
@@ -120,7 +120,7 @@ def test_patches_need_not_divide_the_image():
 
 def test_sizes_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="expected the camera's image size"):
-        structured_point_cloud(np.ones((4, 5)), frontal((5, 4)))
+        unproject_depth(np.ones((4, 5)), frontal((5, 4)))
     with pytest.raises(InputError, match="patch grid"):
         patch_points(np.ones((4, 4)), frontal((4, 4)), (5, 2))
     with pytest.raises(InputError, match="no known pixel"):

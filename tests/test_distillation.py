@@ -10,7 +10,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from zsp_lite.backbones import load_backbone
+from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.distillation import (
     Distillation,
@@ -24,7 +25,6 @@ from zsp_lite.training.distillation import (
 )
 from zsp_lite.training.renders import training_and_held_out
 from zsp_lite.training.train import Trainee, TrainingConfig, held_out_accuracy, initialise
-from zsp_lite.vit import VisionTransformer
 
 TINY = DistillationConfig(
     steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64, hidden=64, bottleneck=64,

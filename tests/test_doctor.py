@@ -7,8 +7,9 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from zsp_lite import doctor
-from zsp_lite.doctor import BAD, NOTE, OK, Check
+from zsp_lite.cli import doctor
+from zsp_lite.cli.doctor import BAD, NOTE, OK, Check
+from zsp_lite.data import samples
 
 
 @pytest.mark.parametrize(
@@ -25,7 +26,7 @@ from zsp_lite.doctor import BAD, NOTE, OK, Check
 def test_a_package_is_held_against_its_range_and_its_pin(installed, pinned, state):
     check = doctor.compare(Requirement("torch>=2.4"), installed, pinned)
     assert check.state == state
-    assert bool(check.remedy) == (state != OK)
+    assert bool(check.fix) == (state != OK)
 
 
 def test_pins_are_read_for_this_platform_only():
@@ -42,8 +43,8 @@ loose>=1
 def test_the_tested_environment_pins_every_dependency_within_its_range():
     import tomllib
 
-    pins = doctor.read_pins((doctor.REPOSITORY / "environment.txt").read_text())
-    project = tomllib.loads((doctor.REPOSITORY / "pyproject.toml").read_text())["project"]
+    pins = doctor.read_pins((samples.REPOSITORY / "environment.txt").read_text())
+    project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
     optional = [
         one
         for extra in ("notebooks", "test", "cluster", "course", "browser")
@@ -57,27 +58,27 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
 
 def test_one_missing_essential_is_enough_to_be_unhealthy():
     fine, extra, broken = Check("a", OK, ""), Check("b", NOTE, "", "do"), Check("c", BAD, "", "do")
-    assert doctor.healthy([fine, extra]) and not doctor.healthy([fine, broken])
+    assert doctor.ok([fine, extra]) and not doctor.ok([fine, broken])
 
 
 def test_data_is_looked_for_in_the_given_folder_then_the_variable_then_the_samples(monkeypatch, tmp_path):
-    monkeypatch.setenv(doctor.DATA_VARIABLE, "/from/variable")
-    names = [name for name, _ in doctor.data_folders(tmp_path)]
-    assert names == ["--data", doctor.DATA_VARIABLE, "data_samples"]
-    monkeypatch.delenv(doctor.DATA_VARIABLE)
-    assert [name for name, _ in doctor.data_folders()] == ["data_samples"]
+    monkeypatch.setenv(samples.DATA_VARIABLE, "/from/variable")
+    names = [name for name, _ in samples.data_folders(tmp_path)]
+    assert names == ["--data", samples.DATA_VARIABLE, "data_samples"]
+    monkeypatch.delenv(samples.DATA_VARIABLE)
+    assert [name for name, _ in samples.data_folders()] == ["data_samples"]
 
 
 def test_categories_found_are_named(ellipsoids):
-    found = {check.name: check for check in doctor.examine(ellipsoids.root)}
+    found = {check.name: check for check in doctor.run_checks(ellipsoids.root)}
     assert found["data: --data"].state == OK and "ellipsoid" in found["data: --data"].found
 
 
 def test_a_folder_that_is_not_there_is_bad_where_it_was_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setenv(doctor.DATA_VARIABLE, str(tmp_path / "nowhere"))
-    found = {check.name: check for check in doctor.examine()}
-    assert found[f"data: {doctor.DATA_VARIABLE}"].state == BAD
-    assert all(check.remedy for check in found.values() if check.state != OK)
+    monkeypatch.setenv(samples.DATA_VARIABLE, str(tmp_path / "nowhere"))
+    found = {check.name: check for check in doctor.run_checks()}
+    assert found[f"data: {samples.DATA_VARIABLE}"].state == BAD
+    assert all(check.fix for check in found.values() if check.state != OK)
 
 
 def test_an_extra_is_named_with_what_it_gives_and_how_to_get_it(monkeypatch):
@@ -87,20 +88,20 @@ def test_an_extra_is_named_with_what_it_gives_and_how_to_get_it(monkeypatch):
     there, missing = found["extra transformers"], found["extra cluster"]
     assert there.state == OK and "transformers 5.0" in there.found and "hf:NAME" in there.found
     assert missing.state == NOTE and "distributed not installed" in missing.found and "Dask" in missing.found
-    assert missing.remedy.endswith("install 'zsp-lite[cluster]'")
+    assert missing.fix.endswith("install 'zsp-lite[cluster]'")
 
 
 def test_an_extra_that_is_too_old_will_not_do(monkeypatch):
     monkeypatch.setattr(doctor, "_version", lambda module: "4.0")
     monkeypatch.setattr(doctor, "_requirements_of_extras", lambda: {"transformers": SpecifierSet(">=4.56")})
     old = next(doctor._extras())
-    assert old.state == NOTE and "transformers 4.0, expected >=4.56" in old.found and old.remedy
+    assert old.state == NOTE and "transformers 4.0, expected >=4.56" in old.found and old.fix
 
 
 def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
     import tomllib
 
-    project = tomllib.loads((doctor.REPOSITORY / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
     for extra, (modules, _) in doctor.EXTRAS.items():
         names = {Requirement(one).name for one in project["optional-dependencies"][extra]}
         assert names == {module.replace("_", "-") for module in modules}
@@ -109,6 +110,6 @@ def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
 def test_open3d_says_nothing_in_a_notebook():
     """It looks for IPython's shell by the name of its class, and would start a web server there."""
     notebook = "import builtins; builtins.get_ipython = type('ZMQInteractiveShell', (), {})\n"
-    code = notebook + "from zsp_lite.open3d_import import load_open3d; load_open3d()"
+    code = notebook + "from zsp_lite.io.open3d import load_open3d; load_open3d()"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout == ""

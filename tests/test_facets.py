@@ -6,9 +6,9 @@ import torch
 from test_backbones import small_vit
 
 from zsp_lite import load_backbone
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.facets import FACETS, block_index, extract
+from zsp_lite.backbones.load import Backbone
 from zsp_lite.errors import InputError
-from zsp_lite.facets import FACETS, block_index, extract
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,10 @@ from co3d_folders import random_camera, seeds, sequence_data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsp_lite.errors import InputError
-from zsp_lite.files import write_atomic
-from zsp_lite.frames import (
+from zsp_lite.data.frames import (
     Frame,
     crop_to_object,
-    object_box,
+    mask_to_bbox,
     read_depth,
     read_image,
     read_mask,
@@ -22,6 +20,8 @@ from zsp_lite.frames import (
     write_image,
     write_mask,
 )
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import write_atomic
 
 SIZE = (24, 32)
 
@@ -43,32 +43,32 @@ def square_mask(top, left, height, width, value=1.0):
 
 
 def test_the_box_grows_by_a_tenth_half_of_it_on_each_side():
-    assert object_box(square_mask(20, 40, 40, 60)) == (18, 37, 44, 66)
+    assert mask_to_bbox(square_mask(20, 40, 40, 60)) == (18, 37, 44, 66)
 
 
 def test_the_box_stays_in_the_image():
-    assert object_box(square_mask(0, 0, 100, 200)) == (0, 0, 100, 200)
-    assert object_box(square_mask(0, 180, 40, 20)) == (0, 179, 42, 21)
+    assert mask_to_bbox(square_mask(0, 0, 100, 200)) == (0, 0, 100, 200)
+    assert mask_to_bbox(square_mask(0, 180, 40, 20)) == (0, 179, 42, 21)
 
 
 def test_pixels_at_the_threshold_do_not_count():
     mask = square_mask(20, 40, 40, 60) + square_mask(0, 0, 5, 5, 0.4)
-    assert object_box(mask, padding=0) == (20, 40, 40, 60)
+    assert mask_to_bbox(mask, padding=0) == (20, 40, 40, 60)
 
 
 @given(st.floats(0.002, 1))
 def test_the_threshold_gives_way_until_something_passes(value):
-    assert object_box(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
+    assert mask_to_bbox(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
 
 
 def test_a_lowered_threshold_keeps_the_surest_pixels():
     mask = square_mask(20, 40, 40, 60, 0.1) + square_mask(30, 50, 10, 10, 0.2)
-    assert object_box(mask, padding=0) == (30, 50, 10, 10)
+    assert mask_to_bbox(mask, padding=0) == (30, 50, 10, 10)
 
 
 def test_an_empty_or_missing_mask_is_refused():
     with pytest.raises(InputError, match="is empty"):
-        object_box(np.zeros((5, 5)))
+        mask_to_bbox(np.zeros((5, 5)))
     with pytest.raises(InputError, match="frame seen has no object mask"):
         crop_to_object(frame(name="seen"))
     with pytest.raises(InputError, match="frame seen: object mask"):
@@ -78,14 +78,8 @@ def test_an_empty_or_missing_mask_is_refused():
 def test_cropping_keeps_every_pixels_world_point():
     whole = sequence_data("one").frames[0]
     cropped = crop_to_object(whole)
-    top, left, height, width = object_box(whole.mask)
-    assert (
-        cropped.camera.size
-        == cropped.rgb.shape[:2]
-        == cropped.depth.shape
-        == cropped.mask.shape
-        == (height, width)
-    )
+    top, left, height, width = mask_to_bbox(whole.mask)
+    assert cropped.camera.size == cropped.rgb.shape[:2] == cropped.depth.shape == cropped.mask.shape == (height, width)
     np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
     pixel = np.array([3.5, 2.5])
     np.testing.assert_allclose(
@@ -166,9 +160,7 @@ def test_missing_and_corrupt_files_are_refused_by_name(tmp_path, read):
 
 
 def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path):
-    write_image(
-        tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
-    )
+    write_image(tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
     data = (tmp_path / "image.jpg").read_bytes()
     (tmp_path / "image.jpg").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="expected a complete JPEG"):

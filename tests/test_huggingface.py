@@ -15,15 +15,16 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from transformers import AutoModel
 
-from zsp_lite import ZeroShotPose, cli, load_backbone
-from zsp_lite.backbones import Backbone, download, prepare_images, verify
+from zsp_lite import ZeroShotPose, load_backbone
+from zsp_lite.backbones.huggingface import nearest_multiple
+from zsp_lite.backbones.load import Backbone, download, prepare_images, verify
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import backbone_digest
-from zsp_lite.co3d import Co3D
+from zsp_lite.cli import main as cli
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
-from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
-from zsp_lite.huggingface import nearest_multiple
-from zsp_lite.vit import VisionTransformer
 
 SIZES = {
     "hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "intermediate_size": 64,

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.cameras import rotation_from_quaternion
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.cameras import rotation_from_quaternion
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame, write_image, write_mask
 from zsp_lite.importers import READERS, import_capture
 from zsp_lite.importers.fusion import fuse
 from zsp_lite.importers.masks import grab_cut, masks_from_box
@@ -58,12 +58,12 @@ def write_tum(folder, frames):
     lines["rgb.txt"].append("1305031199.0 rgb/none.jpg")
     for name, rows in lines.items():
         (folder / name).write_text("\n".join(rows) + "\n")
-    (fx, fy), (cx, cy) = frames[0].camera.focal, frames[0].camera.principal_point
+    (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
     return {"intrinsics": (fx, fy, cx - 0.5, cy - 0.5)}
 
 
 def write_nerfstudio(folder, frames):
-    (fx, fy), (cx, cy), (h, w) = frames[0].camera.focal, frames[0].camera.principal_point, frames[0].camera.size
+    (fx, fy), (cx, cy), (h, w) = frames[0].camera.focal_length, frames[0].camera.principal_point, frames[0].camera.size
     listed = []
     for frame in frames:
         write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
@@ -161,7 +161,7 @@ def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, views):
 
 
 def test_an_imported_capture_is_complete_in_the_check(tmp_path, views):
-    from zsp_lite.data_check import check_folder
+    from zsp_lite.data.check import check_folder
 
     folder = tmp_path / "scan"
     folder.mkdir()
@@ -392,7 +392,7 @@ def test_an_import_that_was_interrupted_is_done_by_doing_it_again(tmp_path, view
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("zsp_lite.co3d.write_ply", full)
+        patched.setattr("zsp_lite.data.co3d.write_ply", full)
         with pytest.raises(OSError, match="no space"):
             import_capture(capture, data, "teapot", "mine")
     assert not (data / "teapot" / "sequence_annotations.jgz").exists()

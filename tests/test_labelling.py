@@ -9,14 +9,14 @@ from co3d_folders import edit_json, sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.annotations import FRAMES_FILE
-from zsp_lite.co3d import Co3D, write_co3d
+from zsp_lite.data.annotations import FRAMES_FILE
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks, rigid_label
 from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.desktop import label_category
 from zsp_lite.labelling.guess import _frames, guess_alignment
-from zsp_lite.labels import PoseLabel, read_labels, write_label
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.export import POSES_FILE, export_categories
 

@@ -6,8 +6,8 @@ from co3d_folders import random_camera, seeds
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, read_labels, relative_pose, write_label
 
 
 def random_label(seed, name="a", reference="zero"):
@@ -30,9 +30,7 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     seen_b = camera_b.to_camera(transform(label_b.trans, canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)
     np.testing.assert_allclose(transform(pose, seen_a), seen_b, atol=1e-9)
-    np.testing.assert_allclose(
-        pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
-    )
+    np.testing.assert_allclose(pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9)
 
 
 @given(seeds)

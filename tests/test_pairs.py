@@ -5,10 +5,9 @@ import pytest
 import torch
 from co3d_folders import edit_json, sequence_data
 
-from zsp_lite.co3d import Co3D, write_co3d
-from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, write_label
-from zsp_lite.pairs import (
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.pairs import (
     Pair,
     read_upstream_pairs,
     sample_pairs,
@@ -16,6 +15,7 @@ from zsp_lite.pairs import (
     upstream_pairs_path,
     write_upstream_pairs,
 )
+from zsp_lite.errors import InputError
 
 NAMES = ["s3", "s1", "s2"]
 

@@ -11,7 +11,7 @@ from zsp_lite.alignment import umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose, look, object_crop, patch_mask
+from zsp_lite.pipeline import ZeroShotPose, extract_views, object_crop, patch_mask
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
 
 
 def test_views_prepared_before_give_the_same_estimate(method, estimate, reference, targets):
-    views = look(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
+    views = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
     shared = method.estimate_from_features(views[0], views[1:])
     assert (shared.sim3.matrix == estimate.sim3.matrix).all()
     assert list(shared.timings) == ["matching", "view", "alignment"]
@@ -185,7 +185,7 @@ def test_too_few_matches_fall_back_to_the_best_view_and_say_so(backbone, referen
 def test_collinear_points_fall_back_and_say_so(method, reference):
     # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a line.
     flat = replace(reference, depth=np.full_like(reference.depth, 4.0))
-    views = look(method.backbone, [object_crop(flat)] * 2)
+    views = extract_views(method.backbone, [object_crop(flat)] * 2)
     for view in views:
         view.foreground[:] = False
         view.foreground[:, 14] = True

@@ -4,9 +4,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from zsp_lite import plots, scene3d
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
+from zsp_lite.viz import plots, scene3d
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))

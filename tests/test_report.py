@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite.data.frames import read_image
 from zsp_lite.demo import demo_pairs, object_cloud, run_demo
-from zsp_lite.frames import read_image
-from zsp_lite.report import page, table_row, write_overview, write_report
+from zsp_lite.viz.report import page, table_row, write_overview, write_report
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_pairs_are_the_same_every_time(ellipsoids):
 
 
 def test_shipped_evaluation_pairs_come_first(ellipsoids):
-    from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+    from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 
     pairs = sample_pairs(ellipsoids, "ellipsoid", 3, 2, seed=11)
     path = upstream_pairs_path(ellipsoids.root, "ellipsoid", 3, 2)

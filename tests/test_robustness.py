@@ -21,10 +21,10 @@ from zsp_lite.benchmark.robustness import (
     pose_noise,
 )
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import sample_pairs
 from zsp_lite.synthetic.export import export_categories, make_object, make_sequence
 
 

@@ -13,13 +13,13 @@ import pytest
 
 from zsp_lite.alignment import umeyama
 from zsp_lite.benchmark.published import CATEGORIES
-from zsp_lite.cli import main
-from zsp_lite.co3d import Co3D
-from zsp_lite.doctor import sample_data
+from zsp_lite.cli.main import main
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import crop_to_object
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.pairs import read_upstream_pairs, upstream_pairs_path
+from zsp_lite.data.samples import sample_data
 from zsp_lite.errors import InputError
-from zsp_lite.frames import crop_to_object
-from zsp_lite.labels import read_labels, relative_pose
-from zsp_lite.pairs import read_upstream_pairs, upstream_pairs_path
 from zsp_lite.synthetic import evaluation_categories, export, training_categories, validation_categories
 from zsp_lite.synthetic.assembly import make_shape, surface_spread
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
@@ -59,11 +59,7 @@ def chairs():
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 # Categories
@@ -167,7 +163,7 @@ def test_the_sweep_goes_once_around_between_10_and_35_degrees():
     assert 330 < np.ptp(turned) < 390
     elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
     assert 8 < elevation.min() and elevation.max() < 37
-    assert np.ptp([camera.focal[0] for camera in cameras]) == 0
+    assert np.ptp([camera.focal_length[0] for camera in cameras]) == 0
 
 
 def test_canonical_coordinates_project_onto_their_own_pixels_and_depth(chairs):
@@ -229,9 +225,7 @@ def test_masks_are_soft_and_right_to_two_pixels(chairs):
     for data, exact in chairs:
         for frame, view in zip(data.frames, exact.views, strict=True):
             inside = view.mask.astype(np.uint8)
-            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
-                1 - inside, cv2.DIST_L2, 5
-            )
+            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
             wrong = (frame.mask > 0.5) != view.mask
             assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
 
@@ -301,9 +295,7 @@ def test_a_sequence_depends_on_its_own_name_alone(folder, tmp_path):
     """One category by itself, begun with one sequence, then completed, gives the very bytes of the whole."""
     export_categories(["toytruck"], tmp_path, 1, FRAMES, SEED, SIZE)
     export_categories(["toytruck"], tmp_path, 2, FRAMES, SEED, SIZE)
-    whole = {
-        name: data for name, data in files(folder).items() if "toytruck" in name and "determ_eval" not in name
-    }
+    whole = {name: data for name, data in files(folder).items() if "toytruck" in name and "determ_eval" not in name}
     part = {name: data for name, data in files(tmp_path).items() if "toytruck" in name}
     assert part == whole and len(part) > 50
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import zsp_lite
-from zsp_lite.baselines.posecontrast import angles_of, load_posecontrast_tiny, rotation_of
+from zsp_lite.baselines.posecontrast import euler_to_rotation, load_posecontrast_tiny, rotation_to_euler
 from zsp_lite.baselines.swav import load_swav_tiny
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
@@ -70,7 +70,7 @@ def test_a_turned_picture_has_a_turned_pose(crops):
     first, second, labels = sample(crops, rng, config)
     index = np.random.default_rng(0).integers(len(crops), size=config.batch)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert rotation_error(rotation_of(labels.numpy()), quarter @ crops.rotation[index]).max() < 0.01
+    assert rotation_error(euler_to_rotation(labels.numpy()), quarter @ crops.rotation[index]).max() < 0.01
     plain = posecontrast._pictures(crops, index).mean(1).flatten(1)
     for pictures in (first, second):
         # x to the right becomes y downwards: clockwise on the screen.
@@ -80,8 +80,8 @@ def test_a_turned_picture_has_a_turned_pose(crops):
 
 
 def test_the_viewpoint_loss_is_least_for_the_true_bins_and_offsets():
-    rotation = rotation_of(np.array([[100.0, 70.0, 200.0], [10.0, 150.0, 359.0]]))
-    labels = torch.from_numpy(angles_of(rotation).astype(np.float32))
+    rotation = euler_to_rotation(np.array([[100.0, 70.0, 200.0], [10.0, 150.0, 359.0]]))
+    labels = torch.from_numpy(rotation_to_euler(rotation).astype(np.float32))
     bins = [(labels[:, i] / 15).long() for i in range(3)]
     logits = [20 * torch.nn.functional.one_hot(b, n).float() for b, n in zip(bins, (24, 12, 24), strict=True)]
     offsets = [(labels[:, i] / 15 - b)[:, None].expand(-1, n) for i, (b, n) in enumerate(zip(bins, (24, 12, 24)))]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from sklearn.neighbors import NearestNeighbors
 
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.depth import patch_points
+from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
-from zsp_lite.depth import patch_points
-from zsp_lite.doctor import sample_data
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.export import make_object
 from zsp_lite.synthetic.truth import hits, object_frames, patch_coordinates, true_pair, true_partners

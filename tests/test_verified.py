@@ -8,16 +8,16 @@ import torch
 from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSettings
 from zsp_lite.verified.hypotheses import equally_good
 from zsp_lite.verified.refinement import rotations
 from zsp_lite.verified.verification import TERMS, Weights
-from zsp_lite.views import look, object_crop
+from zsp_lite.views import extract_views, object_crop
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def views(method, frames):
-    return look(method.backbone, [object_crop(frame) for frame in frames])
+    return extract_views(method.backbone, [object_crop(frame) for frame in frames])
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
     cameras = [turned(look_at(side, distance=4.5), ELSEWHERE.R) for side in sides]
     frames = [render(look_at((1, 0.2, 0.1)), AT_HOME, "reference")]
     frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
-    reference, *targets = look(method.backbone, [object_crop(frame) for frame in frames])
+    reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])
     found = method.estimate_from_features(reference, targets)
     assert "does not look alike" in found.note and not found.reliable
 

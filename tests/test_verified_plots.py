@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from zsp_lite import plots, verified_plots
 from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import reliability
 from zsp_lite.verified.maps import Seen, ViewMaps
 from zsp_lite.verified.verification import FULL, TERMS, TOUCH, Evidence, Weights
+from zsp_lite.viz import plots
+from zsp_lite.viz import verified as verified_plots
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 # One view; points: on the surface, far behind it, far before it, outside the silhouette, over a hole in the depth.

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3, umeyama
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import (
     Calibration,
@@ -30,7 +30,7 @@ from zsp_lite.verified.refinement import Search, refine, rotations
 from zsp_lite.verified.scene import contrast, make_scene, surface_shares
 from zsp_lite.verified.soft_icp import soft_icp, spread_indices
 from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, same_side, verify
-from zsp_lite.views import View, look, object_crop
+from zsp_lite.views import View, extract_views, object_crop
 
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
 DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2)]
@@ -57,7 +57,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def views(frames):
-    return look(CoordinateBackbone(), [object_crop(frame) for frame in frames])
+    return extract_views(CoordinateBackbone(), [object_crop(frame) for frame in frames])
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +334,7 @@ def met(view: View, camera: Camera, world: np.ndarray, unit: float) -> dict:
     known = mask[row, column] if surface > 0 else 0.0
     inside = np.argwhere(mask >= 0.5)
     # Crops are not isotropic: pixels back to lengths at the point's depth.
-    away = (inside[:, ::-1] + 0.5 - (x, y)) / camera.focal * depth / unit
+    away = (inside[:, ::-1] + 0.5 - (x, y)) / camera.focal_length * depth / unit
     return {
         "off": min(max(np.linalg.norm(away, axis=1).min() - 0.01, 0) / 0.5, 1),
         "front": known * np.clip((-behind - 0.25) / 0.5, 0, 1),

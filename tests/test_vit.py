@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.vit import VisionTransformer
 
 DEPTH, DIM, HEADS, PATCH = 3, 48, 6, 8
 

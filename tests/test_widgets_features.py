@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from zsp_lite.backbones import load_backbone
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarity
 from zsp_lite.synthetic.truth import hits

@@ -10,16 +10,16 @@ from co3d_folders import sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.co3d import write_co3d
+from zsp_lite.data.co3d import write_co3d
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling
-from zsp_lite.labels import PoseLabel, read_labels, write_label
 from zsp_lite.metrics import rotation_error
 
 pytest.importorskip("anywidget", reason="the labelling widget needs anywidget: pip install 'zsp-lite[notebooks]'")
 
 from zsp_lite.widgets import cloud_view  # noqa: E402
-from zsp_lite.widgets.cloud_view import ViewBox, point_under, thin_out  # noqa: E402
+from zsp_lite.widgets.cloud_view import ViewBox, point_under, subsample  # noqa: E402
 from zsp_lite.widgets.labelling import label_poses  # noqa: E402
 from zsp_lite.widgets.latency import LIMIT, build_example, measure  # noqa: E402
 
@@ -255,12 +255,12 @@ def test_the_front_is_picked_and_the_nearest_of_it():
 
 def test_thinning_is_deterministic_and_neighbours_follow_each_other():
     points = np.random.default_rng(3).uniform(size=(9000, 3))
-    kept = thin_out(points)
+    kept = subsample(points)
     assert len(kept) == 6000 == len(np.unique(kept))
-    np.testing.assert_array_equal(kept, thin_out(points.copy()))
+    np.testing.assert_array_equal(kept, subsample(points.copy()))
     steps = np.linalg.norm(np.diff(points[kept], axis=0), axis=1)
     assert np.median(steps) < 0.25 * np.median(np.linalg.norm(points[kept][1:] - points[kept][::-1][1:], axis=1))
-    assert len(thin_out(points[:5])) == 5
+    assert len(subsample(points[:5])) == 5
 
 
 def test_strays_do_not_shrink_the_object_and_odd_clouds_are_named():

@@ -5,7 +5,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from zsp_lite.best_view import VIEW_SELECTORS
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
 pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip install 'zsp-lite[notebooks]'")
@@ -83,7 +83,7 @@ def test_a_circle_of_cameras_comes_out_as_a_circle_seen_from_above():
 def test_cameras_on_a_line_go_round_nothing():
     one = camera_at(0)
     places = [one.t + np.array([step, 0, 0]) for step in range(5)]
-    cameras = [Camera(one.R, place, one.focal, one.principal_point, one.size) for place in places]
+    cameras = [Camera(one.R, place, one.focal_length, one.principal_point, one.size) for place in places]
     with pytest.raises(InputError, match="5 camera centres"):
         around(cameras, np.zeros((1, 3)))
     with pytest.raises(InputError, match="2 camera centres"):

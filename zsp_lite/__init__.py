@@ -1,42 +1,78 @@
-"""Zero-shot category-level object pose estimation (Goodwin et al., ECCV 2022): the method on a small library.
+"""Zero-shot category-level object pose estimation (Goodwin et al., ECCV 2022), as a small library.
 
     import zsp_lite
     method = zsp_lite.ZeroShotPose(zsp_lite.load_backbone())
     pose = method.estimate(reference_frame, target_frames).sim3
+
+Read the files in this order:
+
+    minimal      the whole method on one page
+    pipeline     the method composed of its stages, each in a file of its own:
+    views        object crop, features, foreground
+    features     feature maps and log-binned descriptors
+    matching     cyclical distances and correspondences; matchers has the alternatives of the supplement
+    best_view    which target view to align with
+    alignment    Umeyama in RANSAC
+    metrics      rotation errors and their statistics
+    demo         one pair of each category, from folder to pose
+
+    data         CO3D folders, frames, cameras, depth, labels, pairs
+    backbones    vision transformers and how to load them
+    viz          plots, 3D scenes, the HTML report
+    io           files, downloads, PLY, Open3D
+    verified     a solver beyond the paper that tests many poses against all views
+    benchmark    the paper's tables
+    baselines, labelling, importers, synthetic, training, widgets, cli
 """
 
 import importlib
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-# Where each name lives. Names and modules come when first asked for: torch takes seconds, `zsp-lite --help` need not.
+if TYPE_CHECKING:  # for editors and type checkers; a test holds this against `_HOMES`
+    from zsp_lite import alignment, best_view, demo, errors, features, matchers, matching, metrics, pipeline, views
+    from zsp_lite.alignment import Sim3
+    from zsp_lite.backbones import facets, vit
+    from zsp_lite.backbones.load import Backbone, load_backbone
+    from zsp_lite.data import annotations, cameras, co3d, depth, frames, labels, pairs, samples
+    from zsp_lite.data.cameras import Camera
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.frames import Frame
+    from zsp_lite.errors import InputError
+    from zsp_lite.features import FeatureMap
+    from zsp_lite.matching import Matches
+    from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+    from zsp_lite.viz import plots, report, scene3d
+
+# Names and modules by where they live, imported on first use: torch takes seconds, `zsp-lite --help` need not.
 _HOMES = {
-    "Camera": "cameras",
-    "Co3D": "co3d",
-    "FeatureMap": "features",
-    "Frame": "frames",
-    "InputError": "errors",
-    "Matches": "matching",
-    "PoseEstimate": "pipeline",
-    "Sim3": "alignment",
-    "ZeroShotPose": "pipeline",
-    "load_backbone": "backbones",
+    "": "alignment best_view demo errors features matchers matching metrics pipeline views",
+    "alignment": "Sim3",
+    "backbones": "facets vit",
+    "backbones.load": "Backbone load_backbone",
+    "data": "annotations cameras co3d depth frames labels pairs samples",
+    "data.cameras": "Camera",
+    "data.co3d": "Co3D",
+    "data.frames": "Frame",
+    "errors": "InputError",
+    "features": "FeatureMap",
+    "matching": "Matches",
+    "pipeline": "PoseEstimate ZeroShotPose",
+    "viz": "plots report scene3d",
 }
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
-_MODULES = (
-    "alignment", "backbones", "best_view", "cameras", "co3d", "depth", "features", "frames", "labels", "matching",
-    "metrics", "pairs", "pipeline", "plots", "scene3d", "vit",
-)  # fmt: skip
-
-__all__ = ["__version__", *_HOMES, *_MODULES]
+__all__ = ["__version__", *_HOME_OF]
 
 
 def __getattr__(name: str):
-    if name in _MODULES:
-        return importlib.import_module(f"{__name__}.{name}")
-    if name not in _HOMES:
+    if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home = ".".join(filter(None, (__name__, _HOME_OF[name])))
+    if name[0].isupper() or name == "load_backbone":
+        return getattr(importlib.import_module(home), name)
+    return importlib.import_module(f"{home}.{name}")
 
 
 def __dir__() -> list[str]:

@@ -2,6 +2,6 @@
 
 import sys
 
-from zsp_lite.cli import main
+from zsp_lite.cli.main import main
 
 sys.exit(main())

@@ -35,8 +35,9 @@ class Sim3:
         scale = float(self.scale)
         rotation, translation = np.asarray(self.R, dtype=np.float64), np.asarray(self.t, dtype=np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise InputError(f"Sim3: R and t have shapes {rotation.shape} and {translation.shape}, "
-                             "expected (3, 3) and (3,)")
+            raise InputError(
+                f"Sim3: R and t have shapes {rotation.shape} and {translation.shape}, expected (3, 3) and (3,)"
+            )
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and 0 < scale < np.inf):
             raise InputError(f"Sim3: expected finite R and t and a positive finite scale, scale is {scale}")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
@@ -82,16 +83,16 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
     source, target = _point_pairs(source, target, minimum=3)
     scale, rotation, translation, conditioning = umeyama_batch(source[None], target[None], with_scale)
     if not conditioning[0] > _COLLINEAR:
-        raise InputError(f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
-                         "expected at least 3 that span a plane")
+        raise InputError(
+            f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
+            "expected at least 3 that span a plane"
+        )
     return Sim3(scale[0], rotation[0], translation[0])
 
 
 def umeyama_batch(
     source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
-) -> tuple[
-    Float[np.ndarray, "b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]
-]:
+) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
     """`umeyama` on a batch of point sets, unchecked: scales, rotations, translations, and conditionings.
 
     The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear points.
@@ -122,7 +123,7 @@ def ransac(
     sample_size: int = 4,
     seed: int | np.random.Generator = 0,
     scale_range: tuple[float, float] = (0.0, np.inf),
-) -> tuple[Sim3, Bool[np.ndarray, "n"]]:
+) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
     """Umeyama in RANSAC: the most inliers among `trials` samples, then a fit on those inliers.
 
     source, target: (N, 3) corresponding points, N >= sample_size, numpy or torch.
@@ -137,15 +138,19 @@ def ransac(
     or has a scale out of range.
     """
     if not (threshold > 0 and trials >= 1 and sample_size >= 3):
-        raise InputError(f"ransac: threshold={threshold}, trials={trials}, sample_size={sample_size}; "
-                         "expected a positive threshold, at least 1 trial and at least 3 points per sample")
+        raise InputError(
+            f"ransac: threshold={threshold}, trials={trials}, sample_size={sample_size}; "
+            "expected a positive threshold, at least 1 trial and at least 3 points per sample"
+        )
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        raise InputError(f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
-                         f"collinear, or scale outside {scale_range}")
+        raise InputError(
+            f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
+            f"collinear, or scale outside {scale_range}"
+        )
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
 
     residual = _residuals(scale, rotation, translation, source, target)
@@ -163,7 +168,7 @@ def ransac(
 
 
 def _residuals(
-    scale: Float[np.ndarray, "trials"],
+    scale: Float[np.ndarray, " trials"],
     rotation: Float[np.ndarray, "trials 3 3"],
     translation: Float[np.ndarray, "trials 3"],
     source: Float[np.ndarray, "n 3"],
@@ -208,8 +213,7 @@ def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> I
 def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np.ndarray, np.ndarray]:
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise InputError(f"source and target have shapes {source.shape} and {target.shape}, "
-                         "expected equal (N, 3)")
+        raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):

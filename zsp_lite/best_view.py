@@ -1,7 +1,7 @@
 """Which target view to align with: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
 
 Each score is a plain function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a
-`Comparison`. The view with the highest score is chosen.
+`ViewPair`. The view with the highest score is chosen.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _ORTHOGONAL = 2**0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ViewPair:
     """A target view beside the reference: all that a selector may look at."""
 
     reference: FeatureMap
@@ -40,17 +40,17 @@ def correspondence_score(matches: Matches, k: int) -> float:
     With fewer than k matches, each missing one counts as orthogonal, d = sqrt(2): otherwise a view with
     hardly any foreground in common would win by having little to sum.
     """
-    return strength(torch.as_tensor(matches.similarity), k)
+    return score_from_cosines(torch.as_tensor(matches.similarity), k)
 
 
-def strength(cosines: Float[torch.Tensor, "n"], k: int) -> float:
+def score_from_cosines(cosines: Float[torch.Tensor, " n"], k: int) -> float:
     """`correspondence_score` of matches whose descriptors have these cosines."""
     distances = (2 - 2 * cosines).clamp_min(0).sqrt()
     return -float(distances.sum()) - max(k - len(cosines), 0) * _ORTHOGONAL
 
 
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:
-    """"GlobalSim": cosine of the two images' global features."""
+    """ "GlobalSim": cosine of the two images' global features."""
     first, second = torch.as_tensor(reference.global_feature), torch.as_tensor(target.global_feature)
     return float(F.cosine_similarity(first, second, dim=0))
 
@@ -67,7 +67,7 @@ def cyclical_iou(
     target_foreground: Bool[torch.Tensor, "target_rows target_cols"],
     threshold: float = 1.5,
 ) -> float:
-    """"CyclicalDistIoU": IoU of the target's foreground and its patches that cycle through the reference back
+    """ "CyclicalDistIoU": IoU of the target's foreground and its patches that cycle through the reference back
     to within `threshold` patches of themselves.
 
     The paper does not give its threshold; 1.5 patches takes a return to the patch itself or to one of its
@@ -83,7 +83,7 @@ def cyclical_iou(
     return mask_iou(distances >= -threshold, target_foreground)
 
 
-VIEW_SELECTORS: dict[str, Callable[[Comparison], float]] = {
+VIEW_SELECTORS: dict[str, Callable[[ViewPair], float]] = {
     "correspond": lambda c: correspondence_score(c.matches, c.k),
     "global": lambda c: global_score(c.reference, c.target),
     "saliency": lambda c: mask_iou(c.reference_foreground, c.target_foreground),

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.co3d import Co3D
-from zsp_lite.depth import structured_point_cloud
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame
-from zsp_lite.labels import read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
 
 N_TARGETS = 5
@@ -47,9 +47,7 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
     return pairs
 
 
-def run_demo(
-    dataset: Co3D, backbone: Callable[[Sequence[np.ndarray]], list[FeatureMap]]
-) -> Iterator[DemoResult]:
+def run_demo(dataset: Co3D, backbone: Callable[[Sequence[np.ndarray]], list[FeatureMap]]) -> Iterator[DemoResult]:
     """The estimates for `demo_pairs`, one after the other, with the paper's settings."""
     method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
@@ -63,8 +61,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     """
     reference = dataset.load(dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame))
     targets = [
-        dataset.load(dataset.frame(pair.category, pair.target_sequence, number))
-        for number in pair.target_frames
+        dataset.load(dataset.frame(pair.category, pair.target_sequence, number)) for number in pair.target_frames
     ]
 
     start = time.perf_counter()
@@ -74,9 +71,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     labels = read_labels(dataset.root, pair.category)
     for sequence in (pair.reference_sequence, pair.target_sequence):
         if sequence not in labels:
-            raise InputError(
-                f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with"
-            )
+            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with")
     truth = relative_pose(
         labels[pair.reference_sequence], reference.camera,
         labels[pair.target_sequence], targets[estimate.view].camera,
@@ -84,9 +79,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
     error = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     sequence = dataset.frames(pair.category, pair.target_sequence)
     spread = np.linspace(0, len(sequence), _SEQUENCE_FRAMES, endpoint=False).astype(int)
-    return DemoResult(
-        pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(spread))
-    )
+    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(spread)))
 
 
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
@@ -103,7 +96,7 @@ def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarra
     else:
         rows, cols = (np.arange(n) * m // n for n, m in zip(frame.depth.shape, view.foreground.shape))
         inside = view.foreground.cpu().numpy()[np.ix_(rows, cols)]
-    points = structured_point_cloud(frame.depth, frame.camera)[inside & (frame.depth > 0)]
+    points = unproject_depth(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
     # A mask that is a pixel too wide lets points of the background through, far behind the object.

@@ -24,7 +24,7 @@ class FeatureMap:
 
     keys: Float[Tensor, "h w d"]
     saliency: Float[Tensor, "h w"]
-    global_feature: Float[Tensor, "e"]
+    global_feature: Float[Tensor, " e"]
 
     def __post_init__(self):
         if self.keys.ndim != 3 or 0 in self.keys.shape:
@@ -58,8 +58,7 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     with torch.inference_mode(False):  # kept for later callers, who may want gradients
         rows, columns = torch.arange(height)[:, None], torch.arange(width)
         filled = [
-            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1)
-            for dy, dx in near + far
+            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1) for dy, dx in near + far
         ]
         return torch.stack(filled).flatten(1)
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Matcher = Callable[
-    [Float[Tensor, "n1 n2"], Bool[Tensor, "n1"], Bool[Tensor, "n2"]], tuple[Int[Tensor, "n1"], Float[Tensor, "n1"]]
+    [Float[Tensor, "n1 n2"], Bool[Tensor, " n1"], Bool[Tensor, " n2"]], tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]
 ]
 
 # Neither is given in the paper. 0.1 is what LoFTR (Sun et al. 2021) divides its similarities by before a dual softmax,
@@ -24,8 +24,8 @@ TRANSPORT_STEPS = 100
 
 
 def mutual(
-    similarity: Float[Tensor, "n1 n2"], on1: Bool[Tensor, "n1"], on2: Bool[Tensor, "n2"]
-) -> tuple[Int[Tensor, "n1"], Float[Tensor, "n1"]]:
+    similarity: Float[Tensor, "n1 n2"], on1: Bool[Tensor, " n1"], on2: Bool[Tensor, " n2"]
+) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
     """Mutual nearest neighbours among the objects' patches, scored by their similarity."""
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,10 +38,10 @@ def mutual(
 
 def dual_softmax(
     similarity: Float[Tensor, "n1 n2"],
-    on1: Bool[Tensor, "n1"],
-    on2: Bool[Tensor, "n2"],
+    on1: Bool[Tensor, " n1"],
+    on2: Bool[Tensor, " n2"],
     temperature: float = SOFTMAX_TEMPERATURE,
-) -> tuple[Int[Tensor, "n1"], Float[Tensor, "n1"]]:
+) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
     """The product of both softmaxes: the chance that each patch is the other's choice (Cheng et al. 2021)."""
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,11 +55,11 @@ def dual_softmax(
 
 def optimal_transport(
     similarity: Float[Tensor, "n1 n2"],
-    on1: Bool[Tensor, "n1"],
-    on2: Bool[Tensor, "n2"],
+    on1: Bool[Tensor, " n1"],
+    on2: Bool[Tensor, " n2"],
     regularisation: float = TRANSPORT_REGULARISATION,
     steps: int = TRANSPORT_STEPS,
-) -> tuple[Int[Tensor, "n1"], Float[Tensor, "n1"]]:
+) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
     """The plan that moves an even mass from one object's patches to the other's at cost 1 - similarity.
 
     (Liu et al. 2020.) A patch's partner is where most of its mass goes, the score that mass.

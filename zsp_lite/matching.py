@@ -35,8 +35,8 @@ class Matches:
 
     reference: Int[np.ndarray, "k 2"]  # (row, column) on the reference's grid
     target: Int[np.ndarray, "k 2"]  # (row, column) on the target's grid
-    similarity: Float[np.ndarray, "k"]  # cosine of the two descriptors
-    distance: Float[np.ndarray, "k"]  # d(u, u') >= 0 of the cycle, in patches; of another matcher minus its score
+    similarity: Float[np.ndarray, " k"]  # cosine of the two descriptors
+    distance: Float[np.ndarray, " k"]  # d(u, u') >= 0 of the cycle, in patches; of another matcher minus its score
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -81,7 +81,7 @@ def plain_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1
 
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
-) -> tuple[Int[Tensor, "n1"], Int[Tensor, "n2"]]:
+) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
     """For each row its most similar column, for each column its most similar row (the argmins of eq. 2)."""
     sim = torch.as_tensor(sim)
     return sim.argmax(dim=1), sim.argmax(dim=0)
@@ -157,8 +157,10 @@ def match(
         (sim,) = (similarities if binning else plain_similarities)(ref, [target])
     sim = torch.as_tensor(sim)
     if sim.shape != (ref.grid[0] * ref.grid[1], target.grid[0] * target.grid[1]):
-        raise InputError(f"match: sim has shape {tuple(sim.shape)}, expected one row and column per patch of "
-                         f"{ref.grid} and {target.grid}")
+        raise InputError(
+            f"match: sim has shape {tuple(sim.shape)}, expected one row and column per patch of "
+            f"{ref.grid} and {target.grid}"
+        )
     on_ref = ref.foreground(threshold) if ref_foreground is None else ref_foreground
     on_target = target.foreground(threshold) if target_foreground is None else target_foreground
     on_ref = _mask(on_ref, ref.grid, "match: ref_foreground", sim.device).reshape(ref.grid)
@@ -196,7 +198,7 @@ def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
     return keys
 
 
-def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, "n"]:
+def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, " n"]:
     if mask is None:
         return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
     mask = torch.as_tensor(mask, device=device)
@@ -232,7 +234,7 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
     return (x + back).add_(on)
 
 
-def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, "n"]:
+def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     """1 / length of each patch's log-binned descriptor."""
     index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
     raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(average_pool(keys, 0), 1)))
@@ -240,7 +242,7 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, "n"]:
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
 
-def _gram(features: FeatureMap, index: Int[np.ndarray, "m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
+def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
     """Cosines between the descriptors of a few patches; for so few the bins are cheap to make."""
     keys = features.keys.to(torch.float32)
     if not binning:
@@ -253,7 +255,7 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, "m"], binning: bool = Tru
     return (descriptors @ descriptors.T).cpu().numpy().astype(np.float64)
 
 
-def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, "m"]:
+def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
     """k-means labels of m points known by their inner products.
 
     The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
@@ -267,7 +269,7 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
 
 
-def _most_salient(labels: Int[np.ndarray, "m"], salience: Float[np.ndarray, "m"]) -> Int[np.ndarray, "clusters"]:
+def _most_salient(labels: Int[np.ndarray, " m"], salience: Float[np.ndarray, " m"]) -> Int[np.ndarray, " clusters"]:
     """Index of each cluster's most salient point (ties: the first), ascending."""
     order = np.lexsort((np.arange(len(labels)), -salience, labels))
     _, first = np.unique(labels[order], return_index=True)

@@ -11,21 +11,21 @@ import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3, ransac
-from zsp_lite.best_view import VIEW_SELECTORS, Comparison
-from zsp_lite.cameras import Camera
+from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, match, plain_similarities, similarities
 from zsp_lite.verified import Hypothesis, VerifiedSettings, solve
-from zsp_lite.views import IMAGE_SIZE, View, frame_view, look, object_crop, patch_mask
+from zsp_lite.views import IMAGE_SIZE, View, extract_views, frame_view, object_crop, patch_mask
 
 if TYPE_CHECKING:
-    from zsp_lite.backbones import Backbone
+    from zsp_lite.backbones.load import Backbone
 
 # Views are pipeline's vocabulary, wherever they live.
 __all__ = [
-    "IMAGE_SIZE", "PoseEstimate", "View", "ZeroShotPose", "frame_view", "look", "match_points", "object_crop",
+    "IMAGE_SIZE", "PoseEstimate", "View", "ZeroShotPose", "frame_view", "extract_views", "match_points", "object_crop",
     "patch_mask", "view_alignment",
 ]  # fmt: skip
 
@@ -50,9 +50,9 @@ class PoseEstimate:
     sim3: Sim3
     view: int
     matches: Matches
-    inliers: Bool[np.ndarray, "k"]
+    inliers: Bool[np.ndarray, " k"]
     points: tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]
-    view_scores: Float[np.ndarray, "n"]
+    view_scores: Float[np.ndarray, " n"]
     timings: dict[str, float]
     target_camera: Camera
     reference_view: View
@@ -150,7 +150,7 @@ class ZeroShotPose:
         with _timed(timings, "crop"):
             frames = [object_crop(frame) for frame in (reference, *targets)]
         with _timed(timings, "features"):
-            views = look(self.backbone, frames, self.foreground, self.saliency_threshold)
+            views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
         return self.estimate_from_features(views[0], views[1:], timings)
 
     def estimate_from_features(
@@ -170,14 +170,14 @@ class ZeroShotPose:
         compared = similarities if self.binning else plain_similarities
         return compared(reference.features, [target.features for target in targets])
 
-    def compare(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> Comparison:
+    def compare(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
         """The matches between the reference and one target view, and what a view selector looks at."""
         matches = match(
             reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
             ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
             binning=self.binning,
         )  # fmt: skip
-        return Comparison(
+        return ViewPair(
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
         )
 
@@ -185,7 +185,7 @@ class ZeroShotPose:
         self,
         reference: View,
         targets: Sequence[View],
-        comparisons: Sequence[Comparison],
+        comparisons: Sequence[ViewPair],
         timings: dict[str, float] | None = None,
     ) -> PoseEstimate:
         """The last two stages: choose the view and align (sec. 4.2 and 4.3), or verify poses in all views."""
@@ -216,7 +216,7 @@ class ZeroShotPose:
         )  # fmt: skip
 
     def _estimate_verified(
-        self, reference: View, targets: Sequence[View], comparisons: Sequence[Comparison], timings: dict[str, float]
+        self, reference: View, targets: Sequence[View], comparisons: Sequence[ViewPair], timings: dict[str, float]
     ) -> PoseEstimate:
         """The best hypothesis of the verified solver, in the target view that it sees the object most alike."""
         found = solve(

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from zsp_lite.depth import patch_points
+from zsp_lite.data.depth import patch_points
+from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.frames import Frame, crop_to_object, resize_frame
 
 if TYPE_CHECKING:
-    from zsp_lite.backbones import Backbone
+    from zsp_lite.backbones.load import Backbone
 
 IMAGE_SIZE = 224
 # Thin parts (a chair's legs) never fill half a patch.
@@ -67,7 +67,7 @@ def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     return resize_frame(frame if frame.mask is None else crop_to_object(frame), (size, size))
 
 
-def look(
+def extract_views(
     backbone: "Backbone",
     frames: Sequence[Frame],
     foreground: str = "saliency",

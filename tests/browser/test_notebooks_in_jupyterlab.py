@@ -33,6 +33,7 @@ plt.close("all")
 display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.getvalue())]))
 """
 
+
 def chromium(playwright) -> str | None:
     """The system's Chromium or Chrome, or else the one that Playwright has installed."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

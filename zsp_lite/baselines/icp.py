@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
-from zsp_lite.depth import inpaint_depth, structured_point_cloud
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import inpaint_depth, unproject_depth
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
-from zsp_lite.open3d_import import load_open3d
+from zsp_lite.io.open3d import load_open3d
 
 POINTS = 5000
 _STEPS = 100
@@ -76,7 +76,7 @@ def object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     depth, chosen = frame.depth, on_object & (frame.depth > 0)
     if chosen.sum() < _FEW:
         depth, chosen = inpaint_depth(frame.depth), on_object
-    return structured_point_cloud(depth, frame.camera)[chosen]
+    return unproject_depth(depth, frame.camera)[chosen]
 
 
 def _sample(points: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:

@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from zsp_lite.backbones import prepare_images
+from zsp_lite.backbones.checkpoints import read_checkpoint
+from zsp_lite.backbones.load import prepare_images
 from zsp_lite.baselines.resnet import TINY, ResNet, Shape, load_weights
 from zsp_lite.baselines.swav import normalised
-from zsp_lite.checkpoints import read_checkpoint
-from zsp_lite.download import cache_folder
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
+from zsp_lite.io.download import cache_folder
 
 FILE = "posecontrast.pth"  # in the cache folder; nobody hosts it under a fixed address
 TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "posecontrast-tiny.safetensors"
@@ -37,7 +37,7 @@ class Viewpoint:
     """rotation: from the category's canonical frame to the camera (ours).  feature: what the picture is like."""
 
     rotation: Float[np.ndarray, "3 3"]
-    feature: Float[Tensor, "d"]
+    feature: Float[Tensor, " d"]
 
 
 class ViewpointHead(nn.Module):
@@ -81,7 +81,7 @@ class PoseContrast:
             with torch.inference_mode():
                 feature = self.network(batch)
                 angles = predicted_angles(*self.head(feature))[0]
-            found.append(Viewpoint(rotation_of(angles.numpy()), feature[0].clone()))
+            found.append(Viewpoint(euler_to_rotation(angles.numpy()), feature[0].clone()))
         return found
 
 
@@ -139,7 +139,7 @@ def predicted_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Flo
     return torch.stack(angles, dim=1).clamp(0, 360)
 
 
-def rotation_of(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+def euler_to_rotation(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Canonical frame to camera (ours) from azimuth, elevation and in-plane rotation in degrees, all counted from 0.
 
     Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth) towards a camera that looks along -z.
@@ -149,8 +149,8 @@ def rotation_of(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*ba
     return _AXES @ _turn(in_plane, 2) @ _turn(elevation, 0) @ _turn(azimuth, 2)
 
 
-def angles_of(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """The inverse of `rotation_of`: azimuth and in-plane rotation in [0, 360), elevation in [0, 180]."""
+def rotation_to_euler(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """The inverse of `euler_to_rotation`: azimuth and in-plane rotation in [0, 360), elevation in [0, 180]."""
     turned = _AXES @ np.asarray(rotation, np.float64)
     # Seen straight from above or below, azimuth and in-plane rotation are one: all of it is given to the azimuth.
     pole = np.hypot(turned[..., 2, 0], turned[..., 2, 1]) < 1e-9
@@ -170,7 +170,7 @@ def padded(frame: Frame, size: int) -> UInt8[np.ndarray, "s s 3"]:
 
     The crop's camera tells its aspect: a photograph's pixels were square before the crop was squeezed.
     """
-    x, y = frame.camera.focal * (1 / frame.camera.size[1], 1 / frame.camera.size[0])
+    x, y = frame.camera.focal_length * (1 / frame.camera.size[1], 1 / frame.camera.size[0])
     return pad_to_square(frame.rgb, y / x, size)
 
 

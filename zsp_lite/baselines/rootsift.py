@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from zsp_lite.backbones import Image, prepare_images
+from zsp_lite.backbones.load import Image, prepare_images
 from zsp_lite.features import FeatureMap
 
 _CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations in each cell
@@ -58,7 +58,7 @@ class RootSift:
 
 
 def dense_sift(
-    grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, "side"], size: float
+    grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
     """SIFT descriptors of upright keypoints `size` pixels wide at (row, column) in centres x centres.
 
@@ -86,7 +86,7 @@ def dense_sift(
     return np.round(histograms * (_UNIT / np.maximum(norm, np.finfo(np.float32).eps))).clip(0, 255)
 
 
-def _weights(n: int, centres: Float[np.ndarray, "side"], cell: float) -> Float[np.ndarray, "rows n"]:
+def _weights(n: int, centres: Float[np.ndarray, " side"], cell: float) -> Float[np.ndarray, "rows n"]:
     """Along one axis, what each of n pixels counts in each cell of each keypoint: rows are keypoints times cells."""
     offset = np.arange(n) - np.round(centres)[:, None]
     place = offset / cell

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from zsp_lite.depth import inpaint_depth
+from zsp_lite.data.depth import inpaint_depth
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
 
 _ON_OBJECT = 0.5
 
@@ -48,7 +48,7 @@ class Sift:
 
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
-) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Indices of at most k mutual nearest neighbours, and the cosines of their descriptors, most similar first."""
     if not len(first.pixels) or not len(second.pixels):
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)

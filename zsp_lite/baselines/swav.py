@@ -10,12 +10,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, Image, prepare_images
+from zsp_lite.backbones.checkpoints import read_checkpoint
+from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, Image, prepare_images
 from zsp_lite.baselines.resnet import TINY, ResNet, Shape, load_weights
-from zsp_lite.checkpoints import read_checkpoint
-from zsp_lite.download import cache_folder, fetch
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
+from zsp_lite.io.download import cache_folder, fetch
 
 URL = "https://dl.fbaipublicfiles.com/deepcluster/swav_800ep_pretrain.pth.tar"
 TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "swav-tiny.safetensors"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.annotations import FRAMES_FILE, SEQUENCES_FILE
+from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
 
 _FRAMES_PER_SEQUENCE = 100
 
@@ -18,7 +18,7 @@ _MEASURE = """
 import json, sys, time
 from pathlib import Path
 from zsp_lite.benchmark.annotations import process_memory
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
 
 before = process_memory("VmRSS")
 start = time.perf_counter()
@@ -59,9 +59,7 @@ def annotation_benchmark(frames: int = 86_000) -> dict:
     """
     with tempfile.TemporaryDirectory() as root:
         size = _write_category(Path(root), frames)
-        done = subprocess.run(
-            [sys.executable, "-c", _MEASURE, root], capture_output=True, text=True, check=True
-        )
+        done = subprocess.run([sys.executable, "-c", _MEASURE, root], capture_output=True, text=True, check=True)
     figures = json.loads(done.stdout)
     json_mb = size / 2**20
     return {**figures, "json_mb": json_mb, "extra_memory_mb": figures["memory_mb"] - json_mb}

@@ -9,7 +9,7 @@ from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, lifted, mutual_matches
 from zsp_lite.benchmark.problem import Answer, Problem
-from zsp_lite.best_view import strength
+from zsp_lite.best_view import score_from_cosines
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import SCALE_RANGE
 
@@ -41,7 +41,7 @@ def sift(problem: Problem) -> Answer:
     first: Keypoints
     first, *others = problem.described("sift")
     found = [mutual_matches(first, other, _K) for other in others]
-    view = int(np.argmax([strength(torch.from_numpy(similarity), _K) for *_, similarity in found]))
+    view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
     details = {"matches": len(one), "inliers": 0}
     try:

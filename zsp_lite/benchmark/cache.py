@@ -8,10 +8,10 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.files import write_atomic
-from zsp_lite.frames import Frame
+from zsp_lite.io.files import write_atomic
 
 _PARTS = ("keys", "saliency", "global_feature")
 

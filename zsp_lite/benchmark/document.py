@@ -13,7 +13,7 @@ from pathlib import Path
 from zsp_lite.benchmark.formats import as_markdown
 from zsp_lite.benchmark.tables import THIS_RUN, Table
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 
 _MARKED = re.compile(r"(<!-- table (\S+) -->[ \t]*\r?\n)(.*?)(<!-- end of table -->)", re.DOTALL)
 _MARK = re.compile(r"<!-- (table \S+|end of table) -->")

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.cameras import Camera
-from zsp_lite.frames import Frame
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.matching import Matches
 
 # Matches are patch centres: a patch is as far as a true one may be off.
@@ -24,7 +24,7 @@ def essential_rotation(
     size = reference.camera.size
     first = _directions(reference.camera, matches.reference, grid)
     second = _directions(target.camera, matches.target, grid)
-    focal = np.concatenate([reference.camera.focal, target.camera.focal]).mean()
+    focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
     threshold = _PATCHES * size[0] / grid[0] / focal
     if len(matches) >= _FEWEST:
         found, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, threshold)

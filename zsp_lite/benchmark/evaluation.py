@@ -12,11 +12,11 @@ from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore, Spent
 from zsp_lite.best_view import mask_iou
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import PoseLabel, relative_pose
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
-from zsp_lite.labels import PoseLabel, relative_pose
 from zsp_lite.metrics import rotation_error, translation_error
-from zsp_lite.pairs import Pair
 from zsp_lite.pipeline import patch_mask, view_alignment
 
 # A pair whose frames cannot be used counts as wrong as can be: leaving it out would reward failing.

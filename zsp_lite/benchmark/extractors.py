@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast_tiny
 from zsp_lite.baselines.rootsift import RootSift
 from zsp_lite.baselines.sift import Sift
@@ -14,7 +15,6 @@ from zsp_lite.baselines.swav import load_swav, load_swav_tiny
 from zsp_lite.benchmark.identity import backbone_digest, digest_of
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.vit import VisionTransformer
 
 Extractor = Callable[[list[np.ndarray]], list[FeatureMap]]
 

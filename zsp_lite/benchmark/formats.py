@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from zsp_lite.benchmark.tables import OTHER_DATA, THIS_RUN, Cell, Table
-from zsp_lite.files import write_atomic
+from zsp_lite.io.files import write_atomic
 
 _NOTHING = "–"
 _LATEX = str.maketrans(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.load import Backbone
 
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]+")
 

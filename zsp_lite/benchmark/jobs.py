@@ -13,17 +13,17 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from zsp_lite.backbones import BackboneChoice, load_backbone
+from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.extractors import fingerprint, make_extractors
 from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.storage import PartReader, part_writer
 from zsp_lite.benchmark.store import FrameKey, FrameStore
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.labels import read_labels
-from zsp_lite.pairs import Pair
 
 Work = Sequence[tuple[Pair, Sequence[str]]]  # pairs and the rows that each of them still lacks
 
@@ -107,7 +107,7 @@ def worker_extractors(job: Job) -> dict[str, Any]:
     Raises InputError where the name stands for another backbone here than where the run was started.
     """
     names = tuple(dict.fromkeys(method.features for method in job.methods.values()))
-    if not isinstance(job.backbone, str | BackboneChoice):
+    if not isinstance(job.backbone, str | BackboneConfig):
         return make_extractors(job.backbone, names)
     with _loading:
         wanted = job.backbone, job.fingerprint, names

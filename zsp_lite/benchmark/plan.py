@@ -13,10 +13,10 @@ from zsp_lite.benchmark.execution import default_threads
 from zsp_lite.benchmark.jobs import frame_keys, one_thread_each, split
 from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.store import FrameKey, FrameStore
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import Pair
 from zsp_lite.features import FeatureMap
-from zsp_lite.labels import read_labels
-from zsp_lite.pairs import Pair
 
 # Of a crop of 224 x 224 pixels: colours, depth and mask.
 _CROP_BYTES = 224 * 224 * (3 + 4 + 4)

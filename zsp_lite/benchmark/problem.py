@@ -11,10 +11,10 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.store import FrameKey, FrameStore
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
-from zsp_lite.pairs import Pair
 from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
 
 # What is found out about an answer: no detail may go by one of these names.

@@ -18,15 +18,15 @@ import torch
 import torch.nn.functional as F
 
 from zsp_lite.alignment import ransac, umeyama_batch
-from zsp_lite.backbones import Backbone
+from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.annotations import annotation_benchmark
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import log_bin
-from zsp_lite.frames import Frame
 from zsp_lite.matching import similarities
-from zsp_lite.pipeline import ZeroShotPose, look, object_crop
-from zsp_lite.vit import VisionTransformer
+from zsp_lite.pipeline import ZeroShotPose, extract_views, object_crop
 
 N_TARGETS = 5
 
@@ -88,7 +88,7 @@ def verified_row(repeats: int = 5) -> Row:
     """Median milliseconds of all stages of the verified solver that follow features, similarities and matches."""
     method = ZeroShotPose(random_vits8(), foreground="mask", solver="verified")
     crops = [object_crop(frame) for frame in made_up_frames(1 + N_TARGETS)]
-    reference, *targets = look(method.backbone, crops, method.foreground)
+    reference, *targets = extract_views(method.backbone, crops, method.foreground)
     compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     (seconds,) = _median_seconds([lambda: method.estimate_from_comparisons(reference, targets, compared)], repeats)
     note = f"beyond features, similarities and matches; {torch.get_num_threads()} threads"
@@ -122,9 +122,7 @@ def ransac_rows(repeats: int = 5) -> list[Row]:
     source = rng.normal(size=(50, 3))
     target = source + 0.02 * rng.normal(size=(50, 3))
     target[:30] = rng.normal(size=(30, 3))
-    fast, loop = _median_seconds(
-        [lambda: ransac(source, target), lambda: ransac_by_loop(source, target)], 2 * repeats
-    )
+    fast, loop = _median_seconds([lambda: ransac(source, target), lambda: ransac_by_loop(source, target)], 2 * repeats)
     return [
         Row("RANSAC, 1,000 trials, 50 points", 1000 * fast, "ms"),
         Row("RANSAC by a loop over the trials", 1000 * loop, "ms"),

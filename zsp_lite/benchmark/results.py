@@ -10,7 +10,7 @@ from typing import Any
 
 from zsp_lite.benchmark.storage import PAIRS, SETTINGS, read_invocations, read_records
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 
 RESULTS = "results.json.gz"
 # Beyond these decimals an error in degrees, or a length, says nothing.

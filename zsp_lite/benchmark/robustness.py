@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.annotations import decode
 from zsp_lite.benchmark.problem import Problem
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes
-from zsp_lite.frames import Frame
+from zsp_lite.io.files import read_bytes
 from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
 from zsp_lite.views import frame_view
 
@@ -134,7 +134,7 @@ def exact(frame: Frame, root: str | Path, category: str, sequence: str) -> Frame
 @lru_cache(maxsize=8)
 def _object_rays(root: str, category: str, sequence: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """A function from an eye (3,) and directions (..., 3) in a sequence's world to the way to the object, (...)."""
-    from zsp_lite.open3d_import import load_open3d
+    from zsp_lite.io.open3d import load_open3d
     from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
 
     settings, poses = Path(root) / SETTINGS_FILE, Path(root) / category / POSES_FILE

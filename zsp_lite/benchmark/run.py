@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.backbones import Backbone, BackboneChoice, load_backbone
+from zsp_lite.backbones.load import Backbone, BackboneConfig, load_backbone
 from zsp_lite.benchmark.execution import default_threads, execute, open_crew
 from zsp_lite.benchmark.extractors import Extractor, fingerprint, make_extractors, random_backbone
 from zsp_lite.benchmark.identity import digest_of
@@ -22,18 +22,18 @@ from zsp_lite.benchmark.methods import fingerprint as method_fingerprint
 from zsp_lite.benchmark.plan import Plan, plan
 from zsp_lite.benchmark.storage import RunFolder, read_records, same_run, surroundings
 from zsp_lite.benchmark.summary import summarise_run
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.files import write_atomic
-from zsp_lite.labels import read_labels
-from zsp_lite.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
+from zsp_lite.io.files import write_atomic
 
 __all__ = ["GROUPS", "METHODS", "Method", "category_pairs", "evaluate", "random_backbone", "read_records"]
 
 
 def evaluate(
     root: str | Path,
-    backbone: Backbone | Extractor | str | BackboneChoice,
+    backbone: Backbone | Extractor | str | BackboneConfig,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int = 100,
     targets: int = 5,
@@ -62,7 +62,7 @@ def evaluate(
     rows = resolve(methods)
     row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
     work = work_of_categories(row_pairs)
-    named = isinstance(backbone, str | BackboneChoice)
+    named = isinstance(backbone, str | BackboneConfig)
     name, backbone = backbone, load_backbone(backbone) if named else backbone
     made: dict[str, Any] = make_extractors(backbone, [row.features for row in rows.values()])
     settings = _settings(root, backbone, made, rows, row_pairs, pairs, targets, seed)
@@ -109,7 +109,7 @@ def evaluate(
 
 def plan_run(
     root: str | Path,
-    backbone: Backbone | Extractor | str | BackboneChoice,
+    backbone: Backbone | Extractor | str | BackboneConfig,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int = 100,
     targets: int = 5,
@@ -121,7 +121,7 @@ def plan_run(
     rows = resolve(methods)
     row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
     work = work_of_categories(row_pairs)
-    backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneChoice) else backbone
+    backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     extractors = make_extractors(backbone, [row.features for row in rows.values()])
     same_run(Path(out), _settings(root, backbone, extractors, rows, row_pairs, pairs, targets, seed))
     path = Path(out) / "pairs.jsonl"

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.files import write_atomic
+from zsp_lite.io.files import write_atomic
 
 SETTINGS, INVOCATIONS, PAIRS, PARTS = "run.json", "invocations.jsonl", "pairs.jsonl", "parts"
 # Parts of the settings that a later call may add to, and what to do where one of their members has changed.

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.benchmark.cache import FeatureCache
-from zsp_lite.cameras import Camera
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
 from zsp_lite.pipeline import View, ZeroShotPose, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence and frame number

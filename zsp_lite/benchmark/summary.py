@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from zsp_lite.data.pairs import Pair
 from zsp_lite.metrics import median, paired_test, summarise
-from zsp_lite.pairs import Pair
 
 _RESAMPLES = 2000
 

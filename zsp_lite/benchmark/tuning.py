@@ -19,11 +19,11 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
+from zsp_lite.data.pairs import Pair, sample_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pairs import Pair, sample_pairs
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.synthetic.export import SPLITS
 from zsp_lite.verified import solve
@@ -47,11 +47,11 @@ class Outcome:
 
     category: str
     terms: Float[np.ndarray, "m terms"]
-    errors: Float[np.ndarray, "m"]
+    errors: Float[np.ndarray, " m"]
     apart: Float[np.ndarray, "m m"]
     spread: float = 0.0
 
-    def scores(self, weights: Weights) -> Float[np.ndarray, "m"]:
+    def scores(self, weights: Weights) -> Float[np.ndarray, " m"]:
         """The hypotheses' scores under some weights."""
         return self.terms @ np.array(astuple(weights))
 
@@ -154,7 +154,7 @@ def calibrate(outcomes: Sequence[Outcome], weights: Weights) -> Calibration:
     return fit_calibration(margin, _spreads(outcomes), error < _RIGHT)
 
 
-def _spreads(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "n"]:
+def _spreads(outcomes: Sequence[Outcome]) -> Float[np.ndarray, " n"]:
     return np.array([one.spread for one in outcomes])
 
 
@@ -208,7 +208,7 @@ def report(outcomes: Sequence[Outcome]) -> list[str]:
     return lines
 
 
-def _accuracy(errors: Float[np.ndarray, "n"]) -> str:
+def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
     return (
         f"median {np.median(errors):.1f} degrees, Acc30 {100 * np.mean(errors < 30):.1f} %, "
         f"Acc15 {100 * np.mean(errors < 15):.1f} %"

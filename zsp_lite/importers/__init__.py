@@ -7,7 +7,7 @@ fusion      one point cloud of the object, and the scale that CO3D has
 convert     all of it in one call
 """
 
-from zsp_lite.importers.capture import Capture, Shot
+from zsp_lite.importers.capture import Capture, CaptureFrame
 from zsp_lite.importers.convert import READERS, import_capture
 
-__all__ = ["READERS", "Capture", "Shot", "import_capture"]
+__all__ = ["READERS", "Capture", "CaptureFrame", "import_capture"]

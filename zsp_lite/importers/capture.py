@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
 from zsp_lite.errors import InputError
-from zsp_lite.files import path_inside, read_bytes
-from zsp_lite.frames import Frame, read_grey16, read_image, read_mask
+from zsp_lite.io.files import path_inside, read_bytes
 
 Pair = Sequence[float] | Float[np.ndarray, "2"]  # (x, y), pixels
 # Matrices in files are printed numbers; what deviates more is no rotation.
@@ -19,7 +19,7 @@ _ROTATION_TOLERANCE = 2e-2
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class CaptureFrame:
     """One picture of a capture.
 
     camera: of the image as stored (OpenCV axes, pixel centres at half-integers).  depth: a 16-bit PNG or a .npy file,
@@ -61,7 +61,7 @@ class Shot:
 class Capture:
     """The shots of one object, in the order in which they were taken, with cameras in one world."""
 
-    shots: tuple[Shot, ...]
+    shots: tuple[CaptureFrame, ...]
 
     def thinned(self, count: int) -> "Capture":
         """At most `count` shots, evenly spread."""
@@ -71,7 +71,7 @@ class Capture:
         return Capture(tuple(self.shots[index] for index in chosen))
 
 
-def camera_of(
+def camera_from_pose(
     to_world: Float[np.ndarray, "4 4"],
     focal: Pair,
     principal_point: Pair,

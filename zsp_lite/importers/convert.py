@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zsp_lite.cameras import Box
-from zsp_lite.co3d import SequenceData, write_co3d
+from zsp_lite.data.cameras import Box
+from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.errors import InputError
-from zsp_lite.files import plain_name
 from zsp_lite.importers.capture import Capture
 from zsp_lite.importers.fusion import fuse, scale_frame, unit_scale
 from zsp_lite.importers.lists import read_lists
@@ -15,6 +14,7 @@ from zsp_lite.importers.masks import masks_from_box, masks_from_files
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.open3d_folder import read_open3d
 from zsp_lite.importers.tum import read_tum
+from zsp_lite.io.files import plain_name
 
 READERS: dict[str, Callable[..., Capture]] = {
     "tum": read_tum,

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.depth import structured_point_cloud
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
-from zsp_lite.open3d_import import load_open3d
+from zsp_lite.io.open3d import load_open3d
 
 _VOXELS = 96  # along three standard deviations of the object: finer than depth cameras are
 _MAX_POINTS = 50_000
@@ -71,7 +71,7 @@ def _spread(frames: Sequence[Frame]) -> float:
     for frame in frames:
         if frame.depth is not None and frame.mask is not None:
             on = (frame.mask > 0.5) & (frame.depth > 0)
-            clouds.append(frame.camera.to_world(structured_point_cloud(frame.depth, frame.camera)[on])[::7])
+            clouds.append(frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[on])[::7])
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     if len(points) < 4:
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some in its masks")

@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Capture, Shot, camera_of, image_size, listed_file, numbers, read_rows
+from zsp_lite.importers.capture import (
+    Capture,
+    CaptureFrame,
+    camera_from_pose,
+    image_size,
+    listed_file,
+    numbers,
+    read_rows,
+)
 
 
 def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
@@ -36,9 +44,9 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
         to_world[: len(values) // 4] = np.array(values).reshape(-1, 4)
         path = listed_file(folder, image[0], f"{folder / 'rgb.txt'}, line {line}")
         size = size or image_size(path)
-        camera = camera_of(to_world, matrix.diagonal()[:2], matrix[:2, 2], size, where)
+        camera = camera_from_pose(to_world, matrix.diagonal()[:2], matrix[:2, 2], size, where)
         depth_path = listed_file(folder, depth[0], f"{folder / 'depth.txt'}, line {line}")
-        shots.append(Shot(path, depth_path, camera, float(len(shots)), depth_unit))
+        shots.append(CaptureFrame(path, depth_path, camera, float(len(shots)), depth_unit))
     return Capture(tuple(shots))
 
 

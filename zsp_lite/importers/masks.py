@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.cameras import Box
-from zsp_lite.depth import structured_point_cloud
+from zsp_lite.data.cameras import Box
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame, read_mask
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame, read_mask
 
 _ROUNDS = 4
 _GROWTH = 0.1  # of a box that is projected
@@ -85,7 +85,7 @@ def _object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """World points of the mask, but for its border, where depth may be the background's."""
     inside = cv2.erode(frame.mask, np.ones((5, 5), np.uint8)) > 0.5
     depth = np.zeros(frame.camera.size, np.float32) if frame.depth is None else frame.depth
-    return frame.camera.to_world(structured_point_cloud(depth, frame.camera)[inside & (depth > 0)])
+    return frame.camera.to_world(unproject_depth(depth, frame.camera)[inside & (depth > 0)])
 
 
 def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
@@ -93,7 +93,7 @@ def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
     top, left, height, width = box
     inside = (frame.mask > 0.5) & (frame.depth > 0)
     depth = float(np.median(frame.depth[inside]))
-    radius = depth * max(width / frame.camera.focal[0], height / frame.camera.focal[1]) / 2
+    radius = depth * max(width / frame.camera.focal_length[0], height / frame.camera.focal_length[1]) / 2
     centre = frame.camera.unproject(np.array([left + width / 2, top + height / 2]), depth + _BALL_DEPTH * radius)
     directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))
     return centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)

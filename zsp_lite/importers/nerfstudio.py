@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from zsp_lite.annotations import decode
+from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes
-from zsp_lite.importers.capture import Capture, Shot, camera_of, listed_file
+from zsp_lite.importers.capture import Capture, CaptureFrame, camera_from_pose, listed_file
+from zsp_lite.io.files import read_bytes
 
 FILE = "transforms.json"
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -67,12 +67,14 @@ def read_nerfstudio(folder: str | Path) -> Capture:
             raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
         to_world = np.array(frame.transform_matrix) @ _TO_OPENCV
         size = int(given["h"]), int(given["w"])
-        camera = camera_of(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
+        camera = camera_from_pose(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
         files = [None if name is None else listed_file(Path(folder), name, where)
                  for name in (frame.file_path, frame.depth_file_path, frame.mask_path)]  # fmt: skip
         distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
         shots.append(
-            Shot(files[0], files[1], camera, float(number), content.depth_unit_scale_factor, distortion, files[2])
+            CaptureFrame(
+                files[0], files[1], camera, float(number), content.depth_unit_scale_factor, distortion, files[2]
+            )
         )
     if not shots:
         raise InputError(f"{path}: none of {len(content.frames)} frames has depth_file_path, expected RGB-D frames")

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.annotations import decode
+from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes
-from zsp_lite.importers.capture import Capture, Shot, camera_of, numbers, read_rows
+from zsp_lite.importers.capture import Capture, CaptureFrame, camera_from_pose, numbers, read_rows
+from zsp_lite.io.files import read_bytes
 
 _COLOURS = "color", "image", "rgb"
 _INTRINSICS = "camera_intrinsic.json", "intrinsic.json", "camera_primesense.json"
@@ -46,9 +46,9 @@ def read_open3d(folder: str | Path) -> Capture:
     shots = []
     for number, (colour, depth, pose) in enumerate(zip(colours, depths, poses)):
         # Open3D's pixel centres are at whole numbers, ours at half ones.
-        camera = camera_of(pose, matrix.diagonal()[:2], matrix[:2, 2] + 0.5, (given.height, given.width),
+        camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2] + 0.5, (given.height, given.width),
                            f"{trajectory}, pose {number}")  # fmt: skip
-        shots.append(Shot(colour, depth, camera, float(number)))
+        shots.append(CaptureFrame(colour, depth, camera, float(number)))
     return Capture(tuple(shots))
 
 

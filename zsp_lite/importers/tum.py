@@ -4,9 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.cameras import rotation_from_quaternion
+from zsp_lite.data.cameras import rotation_from_quaternion
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Capture, Shot, camera_of, image_size, listed_file, numbers, read_rows
+from zsp_lite.importers.capture import (
+    Capture,
+    CaptureFrame,
+    camera_from_pose,
+    image_size,
+    listed_file,
+    numbers,
+    read_rows,
+)
 
 # The benchmark's default camera; its pixel centres are at whole numbers, ours at half ones.
 DEFAULT_INTRINSICS, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (480, 640)
@@ -45,9 +53,9 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
         values = numbers(pose[1][1:8], where)
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = rotation_from_quaternion(values[3:], where), values[:3]
-        camera = camera_of(to_world, (fx, fy), (cx + 0.5, cy + 0.5), size, where)
+        camera = camera_from_pose(to_world, (fx, fy), (cx + 0.5, cy + 0.5), size, where)
         path = listed_file(folder, depth[1][1], f"{folder / 'depth.txt'}, line {depth[0]}")
-        shots.append(Shot(image, path, camera, float(time), _DEPTH_UNIT))
+        shots.append(CaptureFrame(image, path, camera, float(time), _DEPTH_UNIT))
     if not shots:
         raise InputError(f"capture {folder}: no picture has depth and a pose within {_FARTHEST} s, expected some")
     return Capture(tuple(shots))

@@ -6,10 +6,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from zsp_lite.annotations import SequenceAnnotation
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.annotations import SequenceAnnotation
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import crop_to_object, resize_frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import crop_to_object, resize_frame
 
 _SIDE = 128  # pixels of a thumbnail
 

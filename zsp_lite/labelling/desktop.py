@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.errors import InputError
+from zsp_lite.io.open3d import load_open3d
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import ACCEPTED, SKIPPED, Labelling
-from zsp_lite.open3d_import import load_open3d
 
 Cloud = tuple[np.ndarray, np.ndarray]
 # Cloud and title to the indices picked on it, in order; two clouds and a title, to be looked at; question to answer.

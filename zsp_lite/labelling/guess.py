@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.frames import Frame
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import look, object_crop
+from zsp_lite.views import extract_views, object_crop
 
 if TYPE_CHECKING:
-    from zsp_lite.backbones import Backbone
+    from zsp_lite.backbones.load import Backbone
 
 
 def guess_alignment(
@@ -28,7 +28,7 @@ def guess_alignment(
     """
     method = ZeroShotPose(backbone, solver="verified")
     first, second = _frames(dataset, category, reference, references), _frames(dataset, category, sequence, views)
-    seen = look(backbone, [object_crop(frame) for frame in (*first, *second)])
+    seen = extract_views(backbone, [object_crop(frame) for frame in (*first, *second)])
     found = [method.estimate_from_features(view, seen[len(first) :]) for view in seen[: len(first)]]
     best = int(np.argmax([estimate.confidence for estimate in found]))
     to_camera, from_camera = _rigid(first[best].camera), _rigid(found[best].target_camera).inverse()

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3, umeyama
+from zsp_lite.data.labels import PoseLabel
 from zsp_lite.errors import InputError
-from zsp_lite.labels import PoseLabel
 
 MIN_KEYPOINTS = 4
 
@@ -27,7 +27,7 @@ class Alignment:
     """
 
     sim3: Sim3
-    residuals: Float[np.ndarray, "n"]
+    residuals: Float[np.ndarray, " n"]
 
     @property
     def rms(self) -> float:

@@ -14,11 +14,11 @@ class Appearance:
 
     colour: Float[np.ndarray, "m 3"]
     second_colour: Float[np.ndarray, "m 3"]
-    texture_amount: Float[np.ndarray, "m"]
+    texture_amount: Float[np.ndarray, " m"]
     texture_wave: Float[np.ndarray, "m 3"]
     texture_warp: Float[np.ndarray, "m 3"]
-    texture_warp_amount: Float[np.ndarray, "m"]
-    texture_sharpness: Float[np.ndarray, "m"]
+    texture_warp_amount: Float[np.ndarray, " m"]
+    texture_sharpness: Float[np.ndarray, " m"]
     light: Float[np.ndarray, "3"]
     ambient: float
     diffuse: float

@@ -21,8 +21,8 @@ class Shape:
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    part: Int[np.ndarray, "v"]
-    material: Int[np.ndarray, "f"]
+    part: Int[np.ndarray, " v"]
+    material: Int[np.ndarray, " f"]
 
 
 class Assembly:

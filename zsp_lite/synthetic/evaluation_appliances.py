@@ -31,9 +31,7 @@ def hairdryer(a: Assembly) -> None:
         share = cone.vertices[:, 2:] / reach
         slot = 1 + share * (np.array([a.u(0.25, 0.45), a.u(1.0, 1.5), 1]) - 1)
         a.add(
-            Mesh(cone.vertices * np.where(np.arange(3) == 2, 1, slot), cone.faces)
-            .turned("y", np.pi / 2)
-            .moved(front),
+            Mesh(cone.vertices * np.where(np.arange(3) == 2, 1, slot), cone.faces).turned("y", np.pi / 2).moved(front),
             1,
         )
     else:
@@ -98,9 +96,7 @@ def toaster(a: Assembly) -> None:
         for x in halves:
             a.add(box((slot, 0.1, 0.02), (x * length, y * width, top + 0.016)), 3)
             if toasting:
-                a.add(
-                    rounded_box((slot * 0.9, 0.07, 0.5), (x * length, y * width, top + a.u(-0.12, 0.0)), 6), 6
-                )
+                a.add(rounded_box((slot * 0.9, 0.07, 0.5), (x * length, y * width, top + a.u(-0.12, 0.0)), 6), 6)
 
     end = length / 2
     travel = a.u(0.25, 0.45) * height
@@ -128,9 +124,7 @@ def toaster(a: Assembly) -> None:
     for x in (-0.36, 0.36):
         a.add(cylinder(0.06, 0.07, feet * 2).moved((x * length, width * 0.32, feet / 2)), 3, mirror=True)
     if a.chance(0.6):
-        a.add(
-            capsule((-end + 0.02, 0.1, feet + 0.1), (-end - a.u(0.1, 0.25), a.u(-0.2, 0.2), 0.03), 0.025), 3
-        )
+        a.add(capsule((-end + 0.02, 0.1, feet + 0.1), (-end - a.u(0.1, 0.25), a.u(-0.2, 0.2), 0.03), 0.025), 3)
     if a.chance(0.4):
         a.add(box((length * 0.8, width * 1.02, height * 0.08), (0, 0, feet + height * 0.12)), 7)
 
@@ -157,15 +151,11 @@ def laptop(a: Assembly) -> None:
                 1,
             )
     a.add(
-        box(
-            (field / n_rows * 0.75, width * 0.42, 0.03), (field_front - 0.5 * field / n_rows, 0, top + 0.012)
-        ),
+        box((field / n_rows * 0.75, width * 0.42, 0.03), (field_front - 0.5 * field / n_rows, 0, top + 0.012)),
         1,
     )
     a.add(
-        box(
-            (depth * 0.24, width * a.u(0.22, 0.36), 0.015), (depth / 2 - depth * 0.19, a.u(-0.08, 0.04), top)
-        ),
+        box((depth * 0.24, width * a.u(0.22, 0.36), 0.015), (depth / 2 - depth * 0.19, a.u(-0.08, 0.04), top)),
         2,
     )
 

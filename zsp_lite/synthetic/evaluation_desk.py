@@ -33,9 +33,7 @@ def book(a: Assembly) -> None:
         on_cover(box((0.08, width * a.u(0.35, 0.7), 0.02), (title + 0.13 * line, 0, board / 2)), 3)
     style = a.pick(3)
     if style == 0:
-        on_cover(
-            box((height * a.u(0.25, 0.4), width * a.u(0.5, 0.8), 0.015), (height * 0.15, 0, board / 2)), 4
-        )
+        on_cover(box((height * a.u(0.25, 0.4), width * a.u(0.5, 0.8), 0.015), (height * 0.15, 0, board / 2)), 4)
     elif style == 1:
         on_cover(cylinder(width * 0.25, width * 0.25, 0.02, 24).moved((height * 0.15, 0, board / 2)), 4)
     else:
@@ -163,9 +161,7 @@ def handbag(a: Assembly) -> None:
     loop, strap = top_width * a.u(0.2, 0.3), a.u(0.025, 0.045)
     rise = a.u(0.9, 1.6)
     for x in (0.0,) if a.chance(0.35) else (front * 0.7, -front * 0.7):
-        handle = torus(loop, strap, (1, 0, 0), (0, 0, 0), np.pi / 2, 1.5 * np.pi, sides=20).scaled(
-            (1, 1, rise)
-        )
+        handle = torus(loop, strap, (1, 0, 0), (0, 0, 0), np.pi / 2, 1.5 * np.pi, sides=20).scaled((1, 1, rise))
         a.add(handle.moved((x, 0, height * 0.95)), 2)
         for side in (1, -1):
             a.add(

@@ -63,9 +63,7 @@ def chair(a: Assembly) -> None:
             x, y = depth / 2 - 0.08, width / 2 - 0.08
             a.add(rod((side * x, y, height), (side * (x + splay), y + splay, 0), leg, foot), 2, mirror=True)
         if a.chance(0.4):
-            a.add(
-                rod((0, width / 2 - 0.05, height * 0.4), (0, -width / 2 + 0.05, height * 0.4), leg * 0.7), 2
-            )
+            a.add(rod((0, width / 2 - 0.05, height * 0.4), (0, -width / 2 + 0.05, height * 0.4), leg * 0.7), 2)
             y = width / 2 - 0.06
             a.add(rod((depth / 2, y, height * 0.4), (-depth / 2, y, height * 0.4), leg * 0.7), 2, mirror=True)
     if a.chance(0.45):
@@ -122,9 +120,7 @@ def toilet(a: Assembly) -> None:
         bowl_x - bowl_length - tank_depth / 2 - (0.12 if open_lid else 0),
         seat_height * a.u(0.85, 1.05),
     )
-    tank = rounded_box(
-        (tank_depth, tank_width, tank_height), (tank_x, 0, tank_base + tank_height / 2), a.u(5, 12)
-    )
+    tank = rounded_box((tank_depth, tank_width, tank_height), (tank_x, 0, tank_base + tank_height / 2), a.u(5, 12))
     a.add(tank, 0)
     a.add(
         rounded_box((tank_depth * 1.12, tank_width * 1.06, 0.09), (tank_x, 0, tank_base + tank_height), 8),
@@ -199,9 +195,7 @@ def hydrant(a: Assembly) -> None:
     )
     for angle in np.arange(8) * TAU / 8 + 0.2:
         a.add(
-            cylinder(0.035, 0.035, 0.05, 6).moved(
-                (radius * 1.27 * np.cos(angle), radius * 1.27 * np.sin(angle), 0.11)
-            ),
+            cylinder(0.035, 0.035, 0.05, 6).moved((radius * 1.27 * np.cos(angle), radius * 1.27 * np.sin(angle), 0.11)),
             2,
         )
     if a.chance(0.5):
@@ -244,9 +238,7 @@ def backpack(a: Assembly) -> None:
             a.add(box((0.06, 0.1, 0.08), (depth * 0.62, y * width, height * 0.56)), 5)
     else:
         a.add(
-            rounded_box(
-                (depth * 0.4, width * 0.6, height * a.u(0.18, 0.26)), (depth * 0.38, 0, height * 0.74), 4
-            ),
+            rounded_box((depth * 0.4, width * 0.6, height * a.u(0.18, 0.26)), (depth * 0.38, 0, height * 0.74), 4),
             2,
         )
         seam = torus(0.5, 0.015, (1, 0, 0), (0.05, 0, height * 0.55), np.pi / 2, 1.5 * np.pi, sides=20)
@@ -274,9 +266,7 @@ def backpack(a: Assembly) -> None:
     for start, end in zip(bends, bends[1:]):
         a.add(capsule(start, end, 0.05), 4, mirror=True)
     if a.chance(0.6):
-        side = lathe([[0.12, 0], [0.15, 0.35], [0.14, 0.35], [0.001, 0.3]], 14).moved(
-            (0, width / 2, height * 0.08)
-        )
+        side = lathe([[0.12, 0], [0.15, 0.35], [0.14, 0.35], [0.001, 0.3]], 14).moved((0, width / 2, height * 0.08))
         a.add(side, 2, mirror=True)
         if a.chance(0.5):
             a.add(cylinder(0.1, 0.1, 0.55).moved((0, width / 2, height * 0.08 + 0.35)), 6)

@@ -100,9 +100,7 @@ def toyplane(a: Assembly) -> None:
     )
     if jet:
         engine = (
-            (wing_x - sweep * 0.4, span * 0.4, levels[0] - 0.13)
-            if a.chance(0.6)
-            else (tail + 0.55, radius + 0.1, 0.08)
+            (wing_x - sweep * 0.4, span * 0.4, levels[0] - 0.13) if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08)
         )
         a.add(
             rod(np.add(engine, [-0.2, 0, 0]), np.add(engine, [0.2, 0, 0]), 0.08, a.u(0.1, 0.13)),
@@ -205,9 +203,7 @@ def toytruck(a: Assembly) -> None:
             box((0.06, width, wall), (load_length, 0, wall / 2)),
         ):
             a.add(mesh.turned("y", -tilt).moved((tail, 0, deck + 0.12)), 1)
-        a.add(
-            rod((load_x, 0, deck), (load_x + 0.1, 0, deck + 0.12 + load_length * 0.5 * np.sin(tilt)), 0.05), 2
-        )
+        a.add(rod((load_x, 0, deck), (load_x + 0.1, 0, deck + 0.12 + load_length * 0.5 * np.sin(tilt)), 0.05), 2)
     else:
         a.add(cylinder(width * 0.35, width * 0.35, 0.2).moved((load_x, 0, deck + 0.16)), 1)
         mast = np.array([load_x, 0, deck + 0.3])
@@ -231,9 +227,7 @@ def toybus(a: Assembly) -> None:
     if style == 2:
         bonnet = a.u(0.3, 0.45)
         a.add(
-            rounded_box(
-                (bonnet * 1.4, width * 0.8, height * 0.5), (nose - bonnet * 0.6, 0, floor + height * 0.25), 6
-            ),
+            rounded_box((bonnet * 1.4, width * 0.8, height * 0.5), (nose - bonnet * 0.6, 0, floor + height * 0.25), 6),
             0,
         )
         body_nose = nose - bonnet
@@ -241,9 +235,7 @@ def toybus(a: Assembly) -> None:
         body_nose = nose
     body_length, middle = body_nose - tail, (body_nose + tail) / 2
     a.add(rounded_box((body_length, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
-    a.add(
-        box((body_length * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)), 1
-    )
+    a.add(box((body_length * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)), 1)
     rows = (0.36, 0.78) if style == 1 else (0.66,)
     window_height = height * (0.2 if style == 1 else 0.3)
     n_windows = 4 + a.pick(4)
@@ -308,16 +300,14 @@ def toytrain(a: Assembly) -> None:
         chimney, flare = a.u(0.2, 0.45), a.u(0.9, 2.0)
         base = boiler + radius * 0.9
         a.add(
-            lathe(
-                [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [0.09 * flare, chimney], [0.001, chimney]]
-            ).moved((front - 0.2, 0, base)),
+            lathe([[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [0.09 * flare, chimney], [0.001, chimney]]).moved(
+                (front - 0.2, 0, base)
+            ),
             3,
         )
         a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (hood_rear + (front - hood_rear) * 0.42, 0, base)), 7)
         a.add(
-            rod(
-                (front + 0.03, 0, boiler + radius * 0.6), (front + 0.15, 0, boiler + radius * 0.6), 0.08, 0.1
-            ),
+            rod((front + 0.03, 0, boiler + radius * 0.6), (front + 0.15, 0, boiler + radius * 0.6), 0.08, 0.1),
             5,
         )
     else:

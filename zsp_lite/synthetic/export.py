@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.annotations import decode
-from zsp_lite.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
-from zsp_lite.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
+from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
-from zsp_lite.labels import PoseLabel, write_label
-from zsp_lite.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.synthetic.assembly import Shape, make_shape
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.sensor import observe

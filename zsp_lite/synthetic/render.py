@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from zsp_lite.cameras import Camera
-from zsp_lite.open3d_import import load_open3d
+from zsp_lite.data.cameras import Camera
+from zsp_lite.io.open3d import load_open3d
 from zsp_lite.synthetic.appearance import Appearance, backdrop, surface_albedo
 from zsp_lite.synthetic.assembly import Shape
 
@@ -79,7 +79,7 @@ class Scene:
         height, width = camera.size
         R, eye = camera.R.astype(np.float32), camera.centre.astype(np.float32)
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        plane = (np.stack([x, y], -1) - camera.principal_point) / camera.focal
+        plane = (np.stack([x, y], -1) - camera.principal_point) / camera.focal_length
         rays = np.concatenate([plane, np.ones_like(plane[..., :1])], -1).reshape(-1, 3).astype(np.float32) @ R
         hits = self._rays.cast_rays(self._tensor(np.concatenate([np.broadcast_to(eye, rays.shape), rays], 1)))
         distance = hits["t_hit"].numpy()

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from zsp_lite.co3d import SequenceData
-from zsp_lite.frames import Frame
+from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.frames import Frame
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 
@@ -84,9 +84,7 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], seed: int | np.random.Generator) ->
     """A segmentation network's probability (float32): a blurred edge that wanders by a pixel or two."""
     rng = np.random.default_rng(seed)
     inside = mask.astype(np.uint8)
-    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(
-        1 - inside, cv2.DIST_L2, 5
-    )
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     distance -= np.where(mask, 0.5, -0.5)
     wander = np.clip(0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape)), -1.5, 1.5)
     return (1 / (1 + np.exp(-np.clip((distance + wander) / 0.7, -20, 20)))).astype(np.float32)

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import Shape
 from zsp_lite.synthetic.primitives import TAU
@@ -31,10 +31,7 @@ class RenderedSequence:
 
     def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """World points of canonical object coordinates."""
-        return (
-            self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T
-            + self.object_pose[:3, 3]
-        )
+        return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
 
 
 def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
@@ -80,9 +77,7 @@ def handheld_sweep(
     return [Camera(R, t, focal, principal_point, size) for R, t in poses]
 
 
-def render_sequence(
-    shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int
-) -> RenderedSequence:
+def render_sequence(shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int) -> RenderedSequence:
     """Render `frames` views around `shape`; the same seed gives the same pictures.
 
     The shorter image side has `image_size` pixels. The world is the first camera's frame, so where the object
@@ -110,9 +105,7 @@ def render_sequence(
 def rescaled(sequence: RenderedSequence, factor: float) -> RenderedSequence:
     """The same sequence with the unit of its world changed: all lengths times `factor`; canonical stays."""
     views = tuple(
-        replace(
-            view, depth=view.depth * np.float32(factor), camera=replace(view.camera, t=view.camera.t * factor)
-        )
+        replace(view, depth=view.depth * np.float32(factor), camera=replace(view.camera, t=view.camera.t * factor))
         for view in sequence.views
     )
     pose = sequence.object_pose.copy()

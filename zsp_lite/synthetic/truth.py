@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.neighbors import NearestNeighbors
 
-from zsp_lite.annotations import decode
-from zsp_lite.co3d import Co3D
-from zsp_lite.depth import patch_points
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.depth import patch_points
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes
-from zsp_lite.frames import Frame
-from zsp_lite.pairs import Pair
+from zsp_lite.io.files import read_bytes
 from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
 from zsp_lite.views import object_crop, patch_mask
 

@@ -21,8 +21,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.files import write_atomic
+from zsp_lite.io.files import write_atomic
 from zsp_lite.training.batches import _crop_grids as crop_grids
 from zsp_lite.training.batches import _recolour as recolour
 from zsp_lite.training.batches import sample_batch
@@ -36,7 +37,6 @@ from zsp_lite.training.train import (
     held_out_accuracy,
     initialise,
 )
-from zsp_lite.vit import VisionTransformer
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def multi_crop(
 
 def distillation_loss(
     student: Float[Tensor, "crops batch outputs"], teacher: Float[Tensor, "2 batch outputs"],
-    centre: Float[Tensor, "outputs"], student_temperature: float, teacher_temperature: float,
+    centre: Float[Tensor, " outputs"], student_temperature: float, teacher_temperature: float,
 ) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """Cross-entropy between the teacher on one global crop and the student on each other crop (DINO, eq. 3).
 

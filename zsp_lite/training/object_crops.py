@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_arrays
-from zsp_lite.frames import Frame, crop_to_object, resize_frame
+from zsp_lite.io.files import read_arrays
 from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
@@ -31,7 +31,7 @@ class ObjectCrops:
     """
 
     rgb: UInt8[np.ndarray, "n size size 3"]
-    aspect: Float[np.ndarray, "n"]
+    aspect: Float[np.ndarray, " n"]
     rotation: Float[np.ndarray, "n 3 3"]
 
     def __len__(self) -> int:

@@ -21,10 +21,10 @@ from zsp_lite.baselines.posecontrast import (
     BINS,
     TINY_SIZE,
     TinyParts,
-    angles_of,
+    euler_to_rotation,
     pad_to_square,
     predicted_angles,
-    rotation_of,
+    rotation_to_euler,
 )
 from zsp_lite.baselines.swav import normalised
 from zsp_lite.errors import InputError
@@ -115,7 +115,7 @@ def sample(
     turned = np.zeros((config.batch, 3, 3))
     turned[:, 0, 0] = turned[:, 1, 1] = c
     turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = s, -s, 1
-    labels = torch.from_numpy(angles_of(turned @ crops.rotation[index]).astype(np.float32))
+    labels = torch.from_numpy(rotation_to_euler(turned @ crops.rotation[index]).astype(np.float32))
     first, second = (normalised(recolour(rng, images) * STD + MEAN) for _ in range(2))
     return first, second, labels
 
@@ -137,7 +137,7 @@ def pose_contrast(
 ) -> Float[Tensor, ""]:
     """Pose-aware contrastive loss: another picture counts as a negative by the angle between the poses, over 180."""
     first, second = F.normalize(first, dim=1), F.normalize(second, dim=1)
-    rotation = rotation_of(labels.numpy())
+    rotation = euler_to_rotation(labels.numpy())
     apart = torch.from_numpy(rotation_error(rotation[:, None], rotation[None])).to(first.dtype) / 180
     positive = ((first * second).sum(1) / temperature).exp()
     negative = ((first @ first.T / temperature).exp() * apart).sum(1)
@@ -150,7 +150,7 @@ def held_out_errors(model: TinyParts, crops: ObjectCrops, most: int = 400) -> di
     model.eval()
     index = np.arange(min(most, len(crops)))
     angles = predicted_angles(*model.estimator(model.network(normalised(_pictures(crops, index)))))
-    errors = rotation_error(rotation_of(angles.numpy()), crops.rotation[index])
+    errors = rotation_error(euler_to_rotation(angles.numpy()), crops.rotation[index])
     return {"held_out_median": round(float(median(errors)), 1), "held_out_acc30": round(float(accuracy(errors, 30)), 1)}
 
 

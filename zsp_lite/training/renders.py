@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_arrays
+from zsp_lite.io.files import read_arrays
 from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_sibling
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose

@@ -63,7 +63,10 @@ class Network(nn.Module):
         self.backbone = ResNet(TINY)
         dim = TINY.channels[-1]
         self.projection = nn.Sequential(
-            nn.Linear(dim, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, bottleneck),
+            nn.Linear(dim, hidden),
+            nn.BatchNorm1d(hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, bottleneck),
             nn.BatchNorm1d(bottleneck, affine=False),  # or else all pictures look alike for long
         )
         self.prototypes = nn.Parameter(torch.randn(prototypes, bottleneck))

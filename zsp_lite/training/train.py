@@ -23,14 +23,14 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from zsp_lite.annotations import decode
-from zsp_lite.backbones import IMAGENET_MEAN, IMAGENET_STD, TINY, load_backbone
+from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, TINY, load_backbone
+from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
+from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.training.batches import MEAN, STD, Batch, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
 from zsp_lite.training.renders import DEFORMATION, PROPORTIONS, VIEWS, RenderSet, training_and_held_out
-from zsp_lite.vit import TrainingTokens, VisionTransformer
 
 
 @dataclass(frozen=True)

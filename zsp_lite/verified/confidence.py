@@ -34,8 +34,8 @@ class Calibration:
     spread: float = 25.0
 
     def confidence(
-        self, margin: Float[np.ndarray, "m"], spread: float | Float[np.ndarray, "m"]
-    ) -> Float[np.ndarray, "m"]:
+        self, margin: Float[np.ndarray, " m"], spread: float | Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " m"]:
         """Confidences of hypotheses."""
         return 1 / (1 + np.exp(-(self.bias + self.margin * margin + self.spread * spread)))
 
@@ -51,7 +51,7 @@ def calibration_for(views: int) -> Calibration:
     return Calibration(*(float(np.interp(views, list(CALIBRATIONS), part)) for part in parts))
 
 
-def margins(score: Float[np.ndarray, "m"], apart: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "m"]:
+def margins(score: Float[np.ndarray, " m"], apart: Float[np.ndarray, "m m"]) -> Float[np.ndarray, " m"]:
     """Each hypothesis's lead over the best of those more than 30 degrees away, at most 8 nats either way.
 
     apart: degrees between their rotations.
@@ -61,7 +61,7 @@ def margins(score: Float[np.ndarray, "m"], apart: Float[np.ndarray, "m m"]) -> F
 
 
 def fit_calibration(
-    margin: Float[np.ndarray, "n"], spread: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"], ridge: float = 1e-3
+    margin: Float[np.ndarray, " n"], spread: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], ridge: float = 1e-3
 ) -> Calibration:
     """The calibration under which the outcomes `right` are likeliest (logistic regression by Newton's method).
 
@@ -95,8 +95,8 @@ class Reliability:
     calibration_error: float
     surest_half: float
     count: np.ndarray
-    confidence: Float[np.ndarray, "bins"]
-    accuracy: Float[np.ndarray, "bins"]
+    confidence: Float[np.ndarray, " bins"]
+    accuracy: Float[np.ndarray, " bins"]
 
     def __str__(self) -> str:
         lines = [f"{'n':>5} {'confidence':>11} {'right':>7}"]
@@ -110,7 +110,7 @@ class Reliability:
         return "\n".join(lines)
 
 
-def reliability(confidence: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"], bins: int = 10) -> Reliability:
+def reliability(confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
     """The reliability of some confidences, given which of the estimates were right.
 
     Raises InputError for unequal lengths and for fewer estimates than bins.
@@ -130,7 +130,7 @@ def reliability(confidence: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"]
     return Reliability(auroc(confidence, right), error, float(right[upper].mean()), count, mean, share)
 
 
-def auroc(confidence: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"]) -> float:
+def auroc(confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> float:
     """Chance that a right estimate is more confident than a wrong one, ties counting half; nan where one kind lacks."""
     sure, unsure = np.asarray(confidence)[right], np.asarray(confidence)[~np.asarray(right)]
     if not len(sure) or not len(unsure):

@@ -85,7 +85,7 @@ class Solution:
     """
 
     hypotheses: tuple[Hypothesis, ...]
-    view_angles: Float[np.ndarray, "n"]
+    view_angles: Float[np.ndarray, " n"]
     flags: tuple[str, ...]
     timings: dict[str, float]
     scene: Scene
@@ -164,7 +164,7 @@ def search(
 
 
 def _refined(scene: Scene, poses: Poses, weights: Weights, rng: np.random.Generator) -> Poses:
-    def score_with(points: tuple[int, int]) -> Callable[[Poses], Float[Tensor, "m"]]:
+    def score_with(points: tuple[int, int]) -> Callable[[Poses], Float[Tensor, " m"]]:
         there = len(scene.reference_points), len(scene.target_points)
         every = tuple(max(round(n / wanted), 1) for n, wanted in zip(there, points))
         return lambda tried: weights.score(verify(scene, tried, every))
@@ -178,7 +178,7 @@ def _refined(scene: Scene, poses: Poses, weights: Weights, rng: np.random.Genera
     return join([polished, poses[order[_POLISHED:]]])
 
 
-def equally_good(score: Float[Tensor, "m"], rotation: Float[Tensor, "m 3 3"]) -> list[int]:
+def equally_good(score: Float[Tensor, " m"], rotation: Float[Tensor, "m 3 3"]) -> list[int]:
     """The best hypothesis and all that are as good as it, within EQUALLY_GOOD nats and 30 degrees from one another."""
     modes = suppress(rotation, score, MODES_APART, len(score))
     return [int(i) for i in modes if score[modes[0]] - score[i] < EQUALLY_GOOD]

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.views import View
 
 # Finer maps than this change nothing that patches of 8 pixels could tell, and leave the processor's cache.
@@ -31,7 +31,8 @@ _DEPTH, _WEIGHT, _OFF, _PATCH = range(4)
 class ViewMaps:
     """v views' cameras in working units, and a row for each of their pixels.
 
-    rotation, translation: working frame to camera, `x_cam = rotation @ x + translation`.  focal: in pixels; the maps
+    rotation, translation: working frame to camera, `x_cam = rotation @ x + translation`.  focal_length: pixels;
+    the maps
     are sized so that it is the same along both axes.  centre: principal point (x, y).  size: (width, height), whole
     numbers.  start: the row of each view's first pixel.
     table: per pixel (row-major, view after view) its depth, the weight of that depth (the soft mask; 0 where the
@@ -41,15 +42,15 @@ class ViewMaps:
 
     rotation: Float[Tensor, "v 3 3"]
     translation: Float[Tensor, "v 3"]
-    focal: Float[Tensor, "v"]
+    focal_length: Float[Tensor, " v"]
     centre: Float[Tensor, "v 2"]
     size: Float[Tensor, "v 2"]
-    start: Int[Tensor, "v"]
+    start: Int[Tensor, " v"]
     table: Float[Tensor, "pixels 4"]
     zoom: Float[Tensor, "v 2"]
 
     def __len__(self) -> int:
-        return len(self.focal)
+        return len(self.focal_length)
 
     @property
     def camera_centres(self) -> Float[Tensor, "v 3"]:
@@ -78,7 +79,7 @@ def make_maps(
     views: Sequence[View],
     world_to_camera: Sequence[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]],
     frame: Sim3,
-    columns: Sequence[Int[np.ndarray, "patches"]],
+    columns: Sequence[Int[np.ndarray, " patches"]],
 ) -> ViewMaps:
     """The maps of some views.
 
@@ -97,7 +98,7 @@ def make_maps(
     return ViewMaps(
         tensor([rotation for rotation, _ in world_to_camera]),
         tensor([frame.scale * (rotation @ origin + translation) for rotation, translation in world_to_camera]),
-        tensor([np.sqrt(camera.focal.prod()) for camera in cameras]),
+        tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         tensor([camera.principal_point for camera in cameras]),
         tensor(sizes),
         torch.from_numpy(np.cumsum([0, *lengths[:-1]])),
@@ -122,7 +123,7 @@ def look_up(
     moved = (maps.rotation @ shift[:, None, :, None])[..., 0] + maps.translation
     in_camera = (turned @ points.T).view(m, v, 3, -1).add_(moved[..., None])
     depth = in_camera[:, :, 2]
-    pixels_per_unit = maps.focal[:, None] / depth.clamp_min(_NEAREST)
+    pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_NEAREST)
     x = in_camera[:, :, 0].mul_(pixels_per_unit).add_(maps.centre[:, :1])
     y = in_camera[:, :, 1].mul_(pixels_per_unit).add_(maps.centre[:, 1:])
     column = torch.minimum(x.floor().clamp_min_(0), maps.size[:, :1] - 1)
@@ -139,13 +140,13 @@ def look_up(
 def _map_camera(camera: Camera) -> Camera:
     """The camera of an image of about _MAP_PIXELS whose pixels are as high as wide in space."""
     height, width = camera.size
-    aspect = (height / camera.focal[1]) / (width / camera.focal[0])
+    aspect = (height / camera.focal_length[1]) / (width / camera.focal_length[0])
     rows = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
     return camera.resize((rows, max(round(_MAP_PIXELS / rows), 1)))
 
 
 def _table(
-    view: View, camera: Camera, columns: Int[np.ndarray, "patches"], scale: float
+    view: View, camera: Camera, columns: Int[np.ndarray, " patches"], scale: float
 ) -> Float[np.ndarray, "pixels 4"]:
     height, width = camera.size
     frame, grid = view.frame, view.features.grid

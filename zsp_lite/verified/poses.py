@@ -12,7 +12,7 @@ from torch import Tensor
 class Poses:
     """m similarities `y = scale * rotation @ x + translation`, in working units (see `scene.Scene`), float32."""
 
-    scale: Float[Tensor, "m"]
+    scale: Float[Tensor, " m"]
     rotation: Float[Tensor, "m 3 3"]
     translation: Float[Tensor, "m 3"]
 
@@ -71,8 +71,8 @@ def angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Flo
 
 
 def suppress(
-    rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, "m"], angle: float, keep: int
-) -> Int[Tensor, "kept"]:
+    rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], angle: float, keep: int
+) -> Int[Tensor, " kept"]:
     """Non-maximum suppression: at most `keep` indices, best score first, no two within `angle` degrees."""
     order = torch.argsort(score, descending=True, stable=True)
     near = (angles(rotation[order], rotation[order]) < angle).numpy()

@@ -36,8 +36,8 @@ _TOGETHER = 6
 
 
 def refine(
-    poses: Poses, score: Callable[[Poses], Float[Tensor, "m"]], search: Search, seed: int | np.random.Generator = 0
-) -> tuple[Poses, Float[Tensor, "m"]]:
+    poses: Poses, score: Callable[[Poses], Float[Tensor, " m"]], search: Search, seed: int | np.random.Generator = 0
+) -> tuple[Poses, Float[Tensor, " m"]]:
     """The poses after the search, and their scores: never worse than before.
 
     Of the changes that a round tries the best is kept; the weighted mean of the best six is tried in the next round,

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.verified.maps import ViewMaps, make_maps
@@ -45,9 +45,9 @@ class Scene:
 
     reference_points: Float[Tensor, "n 3"]
     target_points: Float[Tensor, "m 3"]
-    target_view: Int[Tensor, "m"]
-    target_column: Int[Tensor, "m"]
-    target_share: Float[Tensor, "m"]
+    target_view: Int[Tensor, " m"]
+    target_column: Int[Tensor, " m"]
+    target_share: Float[Tensor, " m"]
     similarity: Float[Tensor, "n columns"]
     reference_maps: ViewMaps
     target_maps: ViewMaps
@@ -55,7 +55,7 @@ class Scene:
     target_frame: Sim3
     cameras: tuple[Camera, ...]
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
-    likeness: Float[Tensor, "v"]
+    likeness: Float[Tensor, " v"]
 
     @property
     def spread(self) -> float:
@@ -155,7 +155,7 @@ def view_likeness(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
     return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
 
 
-def surface_shares(points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+def surface_shares(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """The share of the surface that each point stands for, by the density around it; their sum is 1.
 
     What three views saw has three times as many points as what one saw, and shall not count three times.
@@ -170,15 +170,15 @@ def _relative(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 3"], 
     return rotation, second.t - rotation @ first.t
 
 
-def _cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.ndarray, "patches"]]:
+def _cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.ndarray, " patches"]]:
     """Camera-frame points of all patches, and which are foreground with a known depth."""
     points, known = view.patch_points
     return points.reshape(-1, 3), (known & np.asarray(view.foreground.cpu())).ravel()
 
 
 def _working_frame(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]], chosen: Sequence[Bool[np.ndarray, "_"]], name: str
-) -> tuple[Sim3, list[Bool[np.ndarray, "_"]]]:
+    clouds: Sequence[Float[np.ndarray, "_ 3"]], chosen: Sequence[Bool[np.ndarray, " _"]], name: str
+) -> tuple[Sim3, list[Bool[np.ndarray, " _"]]]:
     """The similarity that gives the chosen points mean 0 and unit spread, and which of them are no strays."""
     points = np.concatenate([cloud[on] for cloud, on in zip(clouds, chosen)])
     if len(points) < MIN_POINTS:

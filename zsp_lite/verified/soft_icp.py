@@ -53,6 +53,6 @@ def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, features:
     return poses
 
 
-def spread_indices(n: int, count: int) -> Int[Tensor, "chosen"]:
+def spread_indices(n: int, count: int) -> Int[Tensor, " chosen"]:
     """At most `count` of n indices, evenly spread."""
     return torch.arange(min(n, count)) * n // min(n, count)

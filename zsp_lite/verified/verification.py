@@ -37,15 +37,15 @@ _CHUNK = 250_000
 class Terms:
     """The terms of m poses (see above): of sim, seen and view the more the better, of off and front the less."""
 
-    f_sim: Float[Tensor, "m"]
-    f_seen: Float[Tensor, "m"]
-    f_off: Float[Tensor, "m"]
-    f_front: Float[Tensor, "m"]
-    r_sim: Float[Tensor, "m"]
-    r_seen: Float[Tensor, "m"]
-    r_off: Float[Tensor, "m"]
-    r_front: Float[Tensor, "m"]
-    view: Float[Tensor, "m"]
+    f_sim: Float[Tensor, " m"]
+    f_seen: Float[Tensor, " m"]
+    f_off: Float[Tensor, " m"]
+    f_front: Float[Tensor, " m"]
+    r_sim: Float[Tensor, " m"]
+    r_seen: Float[Tensor, " m"]
+    r_off: Float[Tensor, " m"]
+    r_front: Float[Tensor, " m"]
+    view: Float[Tensor, " m"]
 
     def __getitem__(self, index) -> "Terms":
         """The terms of the poses at an index array, slice or mask."""
@@ -80,7 +80,7 @@ class Weights:
     r_front: float = -30.0
     view: float = 20.0
 
-    def score(self, terms: Terms) -> Float[Tensor, "m"]:
+    def score(self, terms: Terms) -> Float[Tensor, " m"]:
         """The weighted sum of the terms, the higher the better."""
         return terms.table() @ torch.tensor(astuple(self), dtype=torch.float32)
 
@@ -99,7 +99,7 @@ class Evidence:
     front: Float[Tensor, "m v n"]
     alike: Float[Tensor, "m v n"]
 
-    def terms(self, share: Float[Tensor, "n"]) -> Iterator[Float[Tensor, "m"]]:
+    def terms(self, share: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
         """sim, seen, off and front: averages over views, then over points that count by their shares."""
         share = share / share.sum()
         touch = torch.where(self.seen.patch < 0, 0, self.touch)
@@ -110,14 +110,14 @@ class Evidence:
         yield self.front.mean(dim=1) @ share
 
 
-def forward(scene: Scene, poses: Poses, rows: Int[Tensor, "n"] | None = None) -> Evidence:
+def forward(scene: Scene, poses: Poses, rows: Int[Tensor, " n"] | None = None) -> Evidence:
     """The reference's points (`rows` of them; default all) in all target views."""
     rows = torch.arange(len(scene.reference_points)) if rows is None else rows
     seen = look_up(scene.target_maps, poses.linear, poses.translation, scene.reference_points[rows])
     return _weigh(scene, seen, rows * scene.similarity.shape[1], 1)
 
 
-def reverse(scene: Scene, poses: Poses, chosen: Int[Tensor, "n"] | None = None) -> Evidence:
+def reverse(scene: Scene, poses: Poses, chosen: Int[Tensor, " n"] | None = None) -> Evidence:
     """The targets' points (the `chosen`; default all) in the reference view."""
     chosen = torch.arange(len(scene.target_points)) if chosen is None else chosen
     back = poses.inverse()
@@ -138,7 +138,7 @@ def verify(scene: Scene, poses: Poses, every: tuple[int, int] = (1, 1)) -> Terms
     return Terms(*(torch.cat(term) for term in zip(*parts)), same_side(scene, poses))
 
 
-def same_side(scene: Scene, poses: Poses) -> Float[Tensor, "m"]:
+def same_side(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
     """The view term: what the method chooses the best view by (sec. 4.2), as evidence for a pose among others.
 
     Each target view's likeness to the reference, less their mean, counts by how little the pose turns its camera
@@ -148,7 +148,7 @@ def same_side(scene: Scene, poses: Poses) -> Float[Tensor, "m"]:
     return torch.exp(-((away / SAME_SIDE) ** 2)) @ scene.likeness
 
 
-def _weigh(scene: Scene, seen: Seen, point: Int[Tensor, "n"], patch_stride: int) -> Evidence:
+def _weigh(scene: Scene, seen: Seen, point: Int[Tensor, " n"], patch_stride: int) -> Evidence:
     """point: where each point's similarities begin in the table; patch_stride: from there to the next patch's."""
     behind = seen.depth - seen.surface
     touch = seen.weight * torch.exp_(behind.square().mul_(-0.5 / TOUCH**2))

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.plots import BLUE, ORANGE, VERMILLION
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
 from zsp_lite.widgets.common import example_pair, explorer, load_ipywidgets, slider
 from zsp_lite.widgets.views import match_canvas
 
@@ -119,7 +119,7 @@ def example_ransac_settings() -> "VBox":
     """`ransac_settings` on a pair of sample views."""
     from zsp_lite.matching import match
     from zsp_lite.pipeline import match_points
-    from zsp_lite.plots import patch_centres
+    from zsp_lite.viz.plots import patch_centres
 
     views = example_pair()
     matches = match(views[0].features, views[1].features)

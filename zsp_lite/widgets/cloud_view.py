@@ -53,7 +53,7 @@ class ViewBox:
         return (np.asarray(points, dtype=np.float64) - self.centre) / self.radius
 
 
-def thin_out(points: Real[np.ndarray, "n 3"], most: int = SHOWN) -> Int[np.ndarray, "m"]:
+def subsample(points: Real[np.ndarray, "n 3"], most: int = SHOWN) -> Int[np.ndarray, " m"]:
     """Indices of at most `most` points, always the same ones, ordered so that neighbours follow each other.
 
     The order is that of Morton's curve: a slider that runs along it walks over the object.
@@ -109,11 +109,11 @@ class CloudView:
         """
         self._box = box = ViewBox.around(points)
         self._cloud, self._placed = np.asarray(points, dtype=np.float64), box.place(points)
-        kept = thin_out(points, SHOWN if overlay is None else SHOWN // 2)
+        kept = subsample(points, SHOWN if overlay is None else SHOWN // 2)
         drawn, paint = self._placed[kept], colours[kept]
         crosses = np.zeros(len(kept), np.uint8)
         if overlay is not None:
-            other = box.place(overlay[0])[thin_out(overlay[0], SHOWN // 2)]
+            other = box.place(overlay[0])[subsample(overlay[0], SHOWN // 2)]
             paint = np.repeat(np.array([overlay[2], overlay[1]], np.uint8), [len(kept), len(other)], axis=0)
             drawn, crosses = np.concatenate([drawn, other]), np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
         with self.widget.hold_sync():

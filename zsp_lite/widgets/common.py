@@ -169,9 +169,9 @@ def show(figure: Figure, alt: str) -> None:
 @cache
 def example_truth() -> "TruePair":
     """The true correspondences of a sample pair; for trying widgets out."""
-    from zsp_lite.co3d import Co3D
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import demo_pairs
-    from zsp_lite.doctor import sample_data
     from zsp_lite.synthetic.truth import true_pair
 
     dataset = Co3D(sample_data())
@@ -181,9 +181,9 @@ def example_truth() -> "TruePair":
 @cache
 def example_pair() -> tuple["View", "View"]:
     """The views of `example_truth`: different objects of one category from about the same side."""
-    from zsp_lite.backbones import load_backbone
-    from zsp_lite.views import look
+    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.views import extract_views
 
     truth = example_truth()
-    first, second = look(load_backbone("zsp-tiny", "cpu"), [truth.reference, truth.target])
+    first, second = extract_views(load_backbone("zsp-tiny", "cpu"), [truth.reference, truth.target])
     return first, second

@@ -9,15 +9,15 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from zsp_lite import plots
-from zsp_lite.backbones import Backbone, load_backbone, prepare_images
+from zsp_lite.backbones.facets import FACETS
+from zsp_lite.backbones.load import Backbone, load_backbone, prepare_images
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.errors import InputError
-from zsp_lite.facets import FACETS
 from zsp_lite.matching import plain_similarities, similarity
 from zsp_lite.synthetic.truth import hits
 from zsp_lite.views import View, patch_mask
-from zsp_lite.vit import VisionTransformer
+from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
     choice,
     example_pair,

@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from zsp_lite.co3d import Co3D
-from zsp_lite.doctor import sample_data
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.samples import sample_data
 from zsp_lite.errors import InputError
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import ACCEPTED, OPEN, SKIPPED, Labelling
-from zsp_lite.labels import read_labels
-from zsp_lite.plots import BLUE, ORANGE
-from zsp_lite.widgets.cloud_view import CloudView, thin_out
+from zsp_lite.viz.plots import BLUE, ORANGE
+from zsp_lite.widgets.cloud_view import CloudView, subsample
 from zsp_lite.widgets.common import load_ipywidgets
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
 
-    from zsp_lite.backbones import Backbone
+    from zsp_lite.backbones.load import Backbone
 
 _NEXT = -1  # in the menu of keypoints: the one to be picked next
 _SIGNS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
@@ -131,7 +131,7 @@ class _Desk:
         if self.on_reference or len(labelling.names) < MIN_KEYPOINTS:
             raise InputError(f"a guess needs {MIN_KEYPOINTS} keypoints on the reference, and another sequence chosen")
         self._say("The method looks at both objects. This takes some seconds.")
-        from zsp_lite.backbones import load_backbone
+        from zsp_lite.backbones.load import load_backbone
         from zsp_lite.labelling.guess import guess_alignment
 
         self.backbone = self.backbone or load_backbone("zsp-tiny")
@@ -401,7 +401,7 @@ class _Desk:
 
     def _kept(self, sequence: str) -> np.ndarray:
         if sequence not in self.kept:
-            self.kept[sequence] = thin_out(self.labelling.cloud(sequence)[0])
+            self.kept[sequence] = subsample(self.labelling.cloud(sequence)[0])
         return self.kept[sequence]
 
     def _slider_point(self) -> np.ndarray:

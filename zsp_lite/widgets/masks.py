@@ -7,14 +7,14 @@ import numpy as np
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
-from zsp_lite.plots import ORANGE, show_images
+from zsp_lite.viz.plots import ORANGE, show_images
 from zsp_lite.widgets.common import explorer, slider
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
 
-    from zsp_lite.cameras import Box
-    from zsp_lite.frames import Frame
+    from zsp_lite.data.cameras import Box
+    from zsp_lite.data.frames import Frame
 
 
 def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
@@ -61,11 +61,11 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
 @cache
 def example_box_to_mask() -> "VBox":
     """`box_to_mask` on a sample frame."""
-    from zsp_lite.co3d import Co3D
-    from zsp_lite.doctor import sample_data
-    from zsp_lite.frames import object_box
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.frames import mask_to_bbox
+    from zsp_lite.data.samples import sample_data
 
     dataset = Co3D(sample_data())
     category = dataset.categories()[0]
     frame = dataset.load(dataset.frames(category, dataset.sequences(category)[0].sequence_name)[0])
-    return box_to_mask(frame, object_box(frame.mask))
+    return box_to_mask(frame, mask_to_bbox(frame.mask))

@@ -10,11 +10,11 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.patheffects import Normal, Stroke
 from torch import Tensor
 
-from zsp_lite import plots
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import match, nearest_neighbours, similarity
 from zsp_lite.synthetic.truth import hits
 from zsp_lite.views import View
+from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
     choice,
     example_pair,

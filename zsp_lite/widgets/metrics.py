@@ -9,7 +9,7 @@ from jaxtyping import Float, Real
 from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.errors import InputError
-from zsp_lite.plots import BLUE, ORANGE
+from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.common import choice, explorer, slider
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _STEP = 5  # degrees between the turns whose distances are worked out beforehand
 
 
-def binomial(n: int, p: float) -> Float[np.ndarray, "_"]:
+def binomial(n: int, p: float) -> Float[np.ndarray, " _"]:
     """Chances (n + 1,) of 0 to n successes in n trials of chance p each."""
     if n < 1 or not 0 <= p <= 1:
         raise InputError(f"binomial: n={n}, p={p}, expected n >= 1 and p in [0, 1]")
@@ -79,8 +79,8 @@ def measured_accuracy() -> "VBox":
 
 
 def turned_distance(
-    cloud: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"], degrees: Real[np.ndarray, "k"]
-) -> Float[np.ndarray, "k"]:
+    cloud: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"], degrees: Real[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
     """Mean distance from the cloud's points, turned about the z axis, to the nearest points of the other cloud.
 
     With the cloud itself as the other it is the symmetric objects' metric of Hinterstoisser et al. for a pose that is

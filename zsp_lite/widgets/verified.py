@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from zsp_lite.errors import InputError
-from zsp_lite.plots import BLUE, ORANGE
 from zsp_lite.verified import Solution
 from zsp_lite.verified.poses import angles
 from zsp_lite.verified.verification import TERMS, Weights, forward
-from zsp_lite.verified_plots import KINDS, contributions, point_kinds
+from zsp_lite.viz.plots import BLUE, ORANGE
+from zsp_lite.viz.verified import KINDS, contributions, point_kinds
 from zsp_lite.widgets.common import explorer, slider
 
 if TYPE_CHECKING:
@@ -133,20 +133,20 @@ def _upright(points: np.ndarray) -> np.ndarray:
 @cache
 def _example_solution() -> tuple[Solution, tuple["View", ...]]:
     """A sample pair of toy trucks, solved."""
-    from zsp_lite.backbones import load_backbone
-    from zsp_lite.co3d import Co3D
+    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import demo_pairs
-    from zsp_lite.doctor import sample_data
     from zsp_lite.pipeline import ZeroShotPose
     from zsp_lite.verified import solve
-    from zsp_lite.views import look, object_crop
+    from zsp_lite.views import extract_views, object_crop
 
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset, n_targets=3)[-1]
     names = [(pair.reference_sequence, pair.reference_frame), *((pair.target_sequence, n) for n in pair.target_frames)]
     method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
     frames = [object_crop(dataset.load(dataset.frame(pair.category, *name))) for name in names]
-    reference, *targets = look(method.backbone, frames)
+    reference, *targets = extract_views(method.backbone, frames)
     similarities = method.similarities(reference, targets)
     matches = [method.compare(reference, *pair).matches for pair in zip(targets, similarities)]
     return solve(reference, targets, similarities, matches), tuple(targets)

@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 
-from zsp_lite.best_view import VIEW_SELECTORS, Comparison
-from zsp_lite.cameras import Camera
+from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
-from zsp_lite.plots import BLUE, CHOSEN, patch_centres
 from zsp_lite.views import View
+from zsp_lite.viz.plots import BLUE, CHOSEN, patch_centres
 from zsp_lite.widgets.common import choice, explorer, slider
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class MatchCanvas:
         self,
         first: Real[np.ndarray, "n 2"],
         second: Real[np.ndarray, "n 2"],
-        inliers: Bool[np.ndarray, "n"] | None = None,
+        inliers: Bool[np.ndarray, " n"] | None = None,
     ) -> None:
         """Lines between pixels (x, y) of the two images; those of outliers are thin, dashed and grey."""
         segments = np.stack([first, np.asarray(second) + (self.offset, 0)], axis=1)
@@ -98,9 +98,9 @@ def evenly(n: int, count: int, first: int) -> np.ndarray:
 def best_view(
     reference: View,
     targets: Sequence[View],
-    comparisons: Sequence[Comparison],
+    comparisons: Sequence[ViewPair],
     places: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
-    angles: Float[np.ndarray, "n"],
+    angles: Float[np.ndarray, " n"],
 ) -> "VBox":
     """Widget: which of N target views each of the four scores chooses, and the matches that it goes on with.
 
@@ -175,7 +175,7 @@ def best_view(
     return explorer(figure, controls, update, alt)
 
 
-def _match_pixels(reference: View, target: View, comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+def _match_pixels(reference: View, target: View, comparison: ViewPair) -> tuple[np.ndarray, np.ndarray]:
     matches = comparison.matches
     return tuple(
         patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
@@ -185,14 +185,14 @@ def _match_pixels(reference: View, target: View, comparison: Comparison) -> tupl
 
 def example_best_view() -> "VBox":
     """`best_view` on sample data: one object against four views of another."""
-    from zsp_lite.backbones import load_backbone
-    from zsp_lite.co3d import Co3D
+    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.labels import read_labels, relative_pose
+    from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import demo_pairs
-    from zsp_lite.doctor import sample_data
-    from zsp_lite.labels import read_labels, relative_pose
     from zsp_lite.metrics import rotation_error
     from zsp_lite.pipeline import ZeroShotPose
-    from zsp_lite.views import look, object_crop
+    from zsp_lite.views import extract_views, object_crop
 
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset)[0]
@@ -202,7 +202,7 @@ def example_best_view() -> "VBox":
     names = [(pair.reference_sequence, pair.reference_frame), *((pair.target_sequence, i) for i in (0, 6, 12, 18))]
     frames = [object_crop(dataset.load(dataset.frame(pair.category, *name))) for name in names]
     backbone = load_backbone("zsp-tiny", "cpu")
-    reference, *targets = look(backbone, frames)
+    reference, *targets = extract_views(backbone, frames)
     method = ZeroShotPose(backbone)
     compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     truths = [relative_pose(first, frames[0].camera, second, frame.camera) for frame in frames[1:]]

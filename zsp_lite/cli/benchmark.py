@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from zsp_lite.cli import _add_backbone, _add_data, _backbone, _command, _count, _names, _seed
+from zsp_lite.cli.main import _add_backbone, _add_data, _backbone, _command, _count, _names, _seed
 from zsp_lite.errors import InputError
 
 _SHOWN = 4  # rows of the table by category that a terminal has room for
@@ -66,7 +66,7 @@ def _benchmark(arguments: argparse.Namespace) -> None:
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate
     from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
-    from zsp_lite.doctor import data_folders
+    from zsp_lite.data.samples import data_folders
 
     root = data_folders(arguments.data)[0][1]
     if arguments.plan:

@@ -17,13 +17,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from zsp_lite.checkpoints import build_vit, read_checkpoint
-from zsp_lite.download import cache_folder, fetch, has_size_and_hash
+from zsp_lite.backbones.checkpoints import build_vit, read_checkpoint
+from zsp_lite.backbones.facets import Facet, block_index, check_facet, extract
+from zsp_lite.backbones.huggingface import PREFIX, HuggingFaceViT, load_huggingface, model_folder, nearest_multiple
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.facets import Facet, block_index, check_facet, extract
 from zsp_lite.features import FeatureMap
-from zsp_lite.huggingface import PREFIX, HuggingFaceViT, load_huggingface, model_folder, nearest_multiple
-from zsp_lite.vit import VisionTransformer
+from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 Precision = Literal["float32", "bfloat16"]
@@ -31,11 +31,11 @@ Precision = Literal["float32", "bfloat16"]
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # $ZSP_LITE_DINO_URL overrides it
-TINY = Path(__file__).parent / "weights" / "zsp-tiny.safetensors"
+TINY = Path(__file__).parents[1] / "weights" / "zsp-tiny.safetensors"
 
 
 @dataclass(frozen=True)
-class BackboneChoice:
+class BackboneConfig:
     """A backbone by name, with the options that decide what it says of a picture; not loaded yet.
 
     Small enough to be sent to other machines, and as good as a name for `load_backbone`, which explains the options.
@@ -52,7 +52,7 @@ class BackboneChoice:
 
 
 @dataclass(frozen=True)
-class Release:
+class PretrainedWeights:
     """A checkpoint that others host."""
 
     file: str  # below DINO_URL
@@ -68,11 +68,11 @@ class Release:
         return cache_folder() / Path(self.file).name
 
 
-RELEASES = {
-    "dino_vits8": Release("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
-    "dino_vits16": Release("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
-    "dino_vitb8": Release("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
-    "dino_vitb16": Release("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
+PRETRAINED = {
+    "dino_vits8": PretrainedWeights("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
+    "dino_vits16": PretrainedWeights("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
+    "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
+    "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
 }
 
 
@@ -150,7 +150,7 @@ class Backbone:
 
 
 def load_backbone(
-    name_or_path: str | Path | BackboneChoice = "zsp-tiny",
+    name_or_path: str | Path | BackboneConfig = "zsp-tiny",
     device: str | torch.device | None = None,
     *,
     num_heads: int | None = None,
@@ -174,9 +174,9 @@ def load_backbone(
     the paper's depth (three quarters of the blocks) and all heads.
     device: None takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises
     InputError for unknown names, layers and facets, downloads that fail (saying what to do) and files that are not
-    such a checkpoint. A `BackboneChoice` has layer, facet and image_size of its own; others beside it are not used.
+    such a checkpoint. A `BackboneConfig` has layer, facet and image_size of its own; others beside it are not used.
     """
-    if isinstance(name_or_path, BackboneChoice):
+    if isinstance(name_or_path, BackboneConfig):
         own = asdict(name_or_path)
         others = dict(num_heads=num_heads, saliency_heads=saliency_heads, precision=precision, batch_size=batch_size)
         return load_backbone(own.pop("name"), device, **own, **others)
@@ -224,7 +224,7 @@ def load_backbone(
 
 def available_backbones() -> dict[str, Path | None]:
     """Every backbone that has a name, with its file, or None where that is not at hand."""
-    paths = {"zsp-tiny": TINY} | {name: release.path for name, release in RELEASES.items()}
+    paths = {"zsp-tiny": TINY} | {name: release.path for name, release in PRETRAINED.items()}
     return {name: path if path.is_file() else None for name, path in paths.items()}
 
 
@@ -239,9 +239,9 @@ def download(name: str) -> Path:
         if not TINY.is_file():
             raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")
         return TINY
-    if name not in RELEASES:
+    if name not in PRETRAINED:
         raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
-    release = RELEASES[name]
+    release = PRETRAINED[name]
     try:
         return fetch(release.url, release.path, release.size, release.md5_prefix)
     except InputError as error:
@@ -256,7 +256,7 @@ def verify(name_or_path: str | Path) -> None:
     backbones = available_backbones()
     if name in backbones and backbones[name] is None:
         raise InputError(f"{name} is not at hand; zsp-lite weights fetch {name}")
-    release = RELEASES.get(name)
+    release = PRETRAINED.get(name)
     if release is not None and not has_size_and_hash(release.path, release.size, release.md5_prefix):
         raise InputError(
             f"{name}: {release.path} is not the released file, expected "

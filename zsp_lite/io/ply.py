@@ -6,15 +6,14 @@ import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 _SIZED_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _TYPES = dict(zip(_NAMES + _SIZED_NAMES, _CODES + _CODES, strict=True))
 _VERTEX = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    + [(name, "u1") for name in ("red", "green", "blue")]
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
 )
 
 
@@ -35,8 +34,7 @@ def write_ply(
             continue
         if np.shape(values) != (len(vertices), 3):
             raise InputError(
-                f"point cloud {path} has {tuple(names)} of shape {np.shape(values)}, "
-                f"expected {(len(vertices), 3)}"
+                f"point cloud {path} has {tuple(names)} of shape {np.shape(values)}, expected {(len(vertices), 3)}"
             )
         for axis, name in enumerate(names):
             vertices[name] = np.asarray(values)[:, axis]

@@ -19,9 +19,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
 
 
-def fetch(
-    url: str, path: str | Path, size: int | None = None, md5_prefix: str = "", timeout: float = 30.0
-) -> Path:
+def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str = "", timeout: float = 30.0) -> Path:
     """Fetch `url` to `path` unless it is there; returns `path`.
 
     Bytes gather in `path`.part; a later call, or the next of three attempts, asks the server for the rest
@@ -39,8 +37,7 @@ def fetch(
                 break
         else:
             raise InputError(
-                f"download of {url} broke off three times, last at {part.stat().st_size} bytes; "
-                f"call again to resume"
+                f"download of {url} broke off three times, last at {part.stat().st_size} bytes; call again to resume"
             )
         if not has_size_and_hash(part, size, md5_prefix):
             received = part.stat().st_size

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 from jaxtyping import Float
 from torch import Tensor
 
+from zsp_lite.backbones.vit import Tokens, VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.vit import Tokens, VisionTransformer
 
 if TYPE_CHECKING:
-    from zsp_lite.huggingface import HuggingFaceViT
+    from zsp_lite.backbones.huggingface import HuggingFaceViT
 
 # What a block makes of its normalised input for its attention, or ("token") its output as it is, not normalised.
 Facet = Literal["key", "query", "value", "token"]

@@ -12,13 +12,13 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from zsp_lite.alignment import Sim3, umeyama
-from zsp_lite.co3d import Co3D
-from zsp_lite.download import cache_folder, fetch
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels
+from zsp_lite.data.pairs import check_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.download import cache_folder, fetch
+from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import rigid_label
-from zsp_lite.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels
-from zsp_lite.pairs import check_upstream_pairs
 
 # Cameras of the same frames in v1 and v2 differ by a similarity, up to what the reconstruction was improved by.
 MAX_RESIDUAL = 0.05
@@ -30,7 +30,7 @@ _BROKEN = (
 )  # fmt: skip
 
 
-def bring_labels(
+def import_labels(
     source: str | Path, root: str | Path, sha256: str | None = None, replace: bool = False
 ) -> dict[str, int]:
     """Bring labels and evaluation pairs from upstream's repository into the data folder `root`.
@@ -66,7 +66,7 @@ def bring_labels(
     return {kind: kinds.count(kind) for kind in ("class_labels", "determ_eval")}
 
 
-def carry_labels(
+def transfer_labels(
     source: str | Path, target: str | Path, category: str, max_residual: float = MAX_RESIDUAL, replace: bool = False
 ) -> dict[str, float]:
     """Labels made on `source` (CO3D v1) written for the same sequences of `target` (v2), whose worlds differ.

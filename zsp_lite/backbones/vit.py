@@ -189,9 +189,7 @@ class VisionTransformer(nn.Module):
         """Input of the first block (batch, 1 + n, dim) and the patch grid."""
         p = self.patch_size
         if images.ndim != 4 or images.shape[1] != 3 or any(side < p or side % p for side in images.shape[2:]):
-            raise InputError(
-                f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}"
-            )
+            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}")
         grid = (images.shape[2] // p, images.shape[3] // p)
         patches = self.patch_embed(images)
         x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
@@ -218,9 +216,7 @@ class VisionTransformer(nn.Module):
             keys = last_keys[:, 1:]
         return Tokens(keys, logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
 
-    def forward_training(
-        self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9
-    ) -> TrainingTokens:
+    def forward_training(self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9) -> TrainingTokens:
         """All output tokens, keys of block `key_block` and the last block's CLS logits, with gradients."""
         key_block = self._checked(key_block)
         x, grid = self.embed(images)

@@ -14,9 +14,9 @@ from typing import Any
 
 import msgspec
 
-from zsp_lite.cameras import NDC_NORM_IMAGE_BOUNDS
+from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes
+from zsp_lite.io.files import read_bytes
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
 
@@ -37,9 +37,7 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     depth = np.ascontiguousarray(depth, dtype=np.float32)
     known = np.isfinite(depth) & (depth > 0)
     if not known.any():
-        raise InputError(
-            f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0"
-        )
+        raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
     if known.all():
         return depth.copy()
     low, high = depth[known].min(), depth[known].max()
@@ -48,7 +46,7 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     return np.where(known, depth, filled.clip(low, high))
 
 
-def structured_point_cloud(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
+def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """The camera-frame point behind each pixel's centre; unknown depth (0) gives the origin."""
     depth = np.asarray(depth, dtype=np.float64)
     _check_size(depth, camera)

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.vit import Tokens
 from zsp_lite.errors import InputError
-from zsp_lite.vit import Tokens
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's

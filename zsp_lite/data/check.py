@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from zsp_lite.annotations import SEQUENCES_FILE, FrameAnnotation
-from zsp_lite.cameras import NDC_ISOTROPIC
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
+from zsp_lite.data.cameras import NDC_ISOTROPIC
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import label_folder, read_labels
+from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.files import path_inside
-from zsp_lite.labels import label_folder, read_labels
-from zsp_lite.pairs import read_upstream_pairs
+from zsp_lite.io.files import path_inside
 
 _FEWEST_FRAMES = 2  # a reference and something to choose a view from
 

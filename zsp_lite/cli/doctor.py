@@ -12,10 +12,9 @@ from pathlib import Path
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.specifiers import SpecifierSet
 
+from zsp_lite.data.samples import DATA_VARIABLE, REPOSITORY, data_folders
 from zsp_lite.errors import InputError
 
-DATA_VARIABLE = "ZSP_LITE_DATA"  # one's own CO3D folder
-REPOSITORY = Path(__file__).resolve().parent.parent
 OK, NOTE, BAD = "ok", "note", "bad"
 # What works without: extra to the modules that it stands for and what they give.
 EXTRAS = {
@@ -30,37 +29,23 @@ EXTRAS = {
 @dataclass(frozen=True)
 class Check:
     """One thing looked at. `state` is "ok", "note" (works without) or "bad" (an essential is missing);
-    `remedy` is the command or step that mends it, empty where there is nothing to mend.
+    `fix` is the command or step that mends it, empty where there is nothing to mend.
     """
 
     name: str
     state: str
     found: str
-    remedy: str = ""
+    fix: str = ""
 
 
-def examine(data: Path | None = None) -> list[Check]:
+def run_checks(data: Path | None = None) -> list[Check]:
     """All checks, in the order in which one would mend them. `data`: a CO3D folder besides the usual ones."""
     return [_python(), *_packages(), *_torch(), _open3d(), *_backbones(), *_extras(), *_data(data), _jupyter()]
 
 
-def healthy(checks: list[Check]) -> bool:
+def ok(checks: list[Check]) -> bool:
     """Whether every essential is there."""
     return all(check.state != BAD for check in checks)
-
-
-def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
-    """Where data is looked for, first match first: (how it was named, folder)."""
-    folders = [("--data", data)] if data is not None else []
-    if os.environ.get(DATA_VARIABLE):
-        folders.append((DATA_VARIABLE, Path(os.environ[DATA_VARIABLE])))
-    return [*folders, ("data_samples", sample_data())]
-
-
-def sample_data() -> Path:
-    """The sample data: `data_samples/` of the current folder, or else of the repository that the package is in."""
-    here = Path("data_samples")
-    return here if here.is_dir() else REPOSITORY / "data_samples"
 
 
 def compare(requirement: Requirement, installed: str | None, pinned: str | None) -> Check:
@@ -138,20 +123,20 @@ def _torch() -> Iterator[Check]:
 
 
 def _open3d() -> Check:
-    from zsp_lite.open3d_import import load_open3d
+    from zsp_lite.io.open3d import load_open3d
 
     try:
         version = load_open3d().__version__
     except (ImportError, OSError) as error:
         wheel = "open3d-cpu libusb-package" if sys.platform.startswith("linux") else "open3d"
-        remedy = f"{_pip()} install {wheel}"
-        return Check("open3d loads", BAD, f"cannot be loaded: {_one_line(error)}", remedy)
+        fix = f"{_pip()} install {wheel}"
+        return Check("open3d loads", BAD, f"cannot be loaded: {_one_line(error)}", fix)
     return Check("open3d loads", OK, version)
 
 
 def _backbones() -> Iterator[Check]:
     try:
-        from zsp_lite.backbones import available_backbones
+        from zsp_lite.backbones.load import available_backbones
     except (ImportError, OSError) as error:
         yield Check("backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
         return
@@ -173,7 +158,7 @@ def _extras() -> Iterator[Check]:
     """Whether each optional extra is there, in a version that will do, and what it gives."""
     requirements = _requirements_of_extras()
     for extra, (modules, gives) in EXTRAS.items():
-        remedy = f"{_pip()} install 'zsp-lite[{extra}]'"
+        fix = f"{_pip()} install 'zsp-lite[{extra}]'"
         installed = {module: _version(module) for module in modules}
         missing = [module for module, version in installed.items() if version is None]
         old = [
@@ -183,9 +168,9 @@ def _extras() -> Iterator[Check]:
         ]
         if missing:
             found = f"{', '.join(missing)} not installed (only for {gives})"
-            yield Check(f"extra {extra}", NOTE, found, remedy)
+            yield Check(f"extra {extra}", NOTE, found, fix)
         elif old:
-            yield Check(f"extra {extra}", NOTE, f"{'; '.join(old)} (only for {gives})", remedy)
+            yield Check(f"extra {extra}", NOTE, f"{'; '.join(old)} (only for {gives})", fix)
         else:
             there = ", ".join(f"{module} {version}" for module, version in installed.items())
             yield Check(f"extra {extra}", OK, f"{there}: {gives}")
@@ -216,34 +201,34 @@ def _requirements_of_extras() -> dict[str, SpecifierSet]:
 
 def _data(data: Path | None) -> Iterator[Check]:
     try:
-        from zsp_lite.co3d import Co3D
+        from zsp_lite.data.co3d import Co3D
     except (ImportError, OSError) as error:
         yield Check("data", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
         return
     for name, folder in data_folders(data):
         sample = name == "data_samples"
-        remedy = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"
+        fix = "zsp-lite synth --preset samples --out data_samples" if sample else f"point {name} at a CO3D folder"
         try:
             categories = Co3D(folder).categories()
         except InputError as error:
-            yield Check(f"data: {name}", NOTE if sample else BAD, str(error), remedy)
+            yield Check(f"data: {name}", NOTE if sample else BAD, str(error), fix)
             continue
         if categories:
             listed = ", ".join(categories[:6]) + (", ..." if len(categories) > 6 else "")
             yield Check(f"data: {name}", OK, f"{folder}: {len(categories)} categories ({listed})")
         else:
             found = f"{folder}: no category (a folder with frame_annotations.jgz)"
-            yield Check(f"data: {name}", NOTE if sample else BAD, found, remedy)
+            yield Check(f"data: {name}", NOTE if sample else BAD, found, fix)
     if data is None and not os.environ.get(DATA_VARIABLE):
-        remedy = f"export {DATA_VARIABLE}=/path/to/co3d (only to use your own data)"
-        yield Check(f"data: {DATA_VARIABLE}", NOTE, "not set", remedy)
+        fix = f"export {DATA_VARIABLE}=/path/to/co3d (only to use your own data)"
+        yield Check(f"data: {DATA_VARIABLE}", NOTE, "not set", fix)
 
 
 def _jupyter() -> Check:
     missing = [name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None]
     if missing:
-        remedy = f"{_pip()} install {' '.join(missing)}"
-        return Check("Jupyter", NOTE, f"{', '.join(missing)} not installed (only for the notebooks)", remedy)
+        fix = f"{_pip()} install {' '.join(missing)}"
+        return Check("Jupyter", NOTE, f"{', '.join(missing)} not installed (only for the notebooks)", fix)
     return Check("Jupyter", OK, f"jupyterlab {importlib.metadata.version('jupyterlab')}")
 
 

@@ -4,7 +4,7 @@ import argparse
 import math
 from pathlib import Path
 
-from zsp_lite.cli import _command, _count, _names, _positive
+from zsp_lite.cli.main import _command, _count, _names, _positive
 from zsp_lite.errors import InputError
 
 
@@ -56,7 +56,7 @@ def _label(arguments: argparse.Namespace) -> None:
 
     guess = None
     if arguments.guess:
-        from zsp_lite.backbones import load_backbone
+        from zsp_lite.backbones.load import load_backbone
         from zsp_lite.labelling.guess import guess_alignment
 
         backbone = load_backbone(arguments.backbone)
@@ -154,7 +154,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from zsp_lite.benchmark.plan import size
-    from zsp_lite.data_check import check_folder
+    from zsp_lite.data.check import check_folder
 
     checks = check_folder(arguments.root, arguments.deep, lambda names: tqdm(names, "checking", disable=None))
     table = Table(title=f"{arguments.root}: {len(checks)} categories, {size(sum(check.size for check in checks))}")
@@ -176,16 +176,16 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _bring(arguments: argparse.Namespace) -> None:
-    from zsp_lite.data_labels import bring_labels
+    from zsp_lite.data.label_import import import_labels
 
-    counts = bring_labels(arguments.source, arguments.root, arguments.sha256, arguments.replace)
+    counts = import_labels(arguments.source, arguments.root, arguments.sha256, arguments.replace)
     print(f"Written to {arguments.root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
 
 
 def _carry(arguments: argparse.Namespace) -> None:
-    from zsp_lite.data_labels import carry_labels
+    from zsp_lite.data.label_import import transfer_labels
 
-    residuals = carry_labels(
+    residuals = transfer_labels(
         arguments.source, arguments.target, arguments.category, arguments.max_residual, arguments.replace
     )
     for name, residual in residuals.items():

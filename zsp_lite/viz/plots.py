@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from zsp_lite.cameras import Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
 # Okabe and Ito's palette: distinguishable with any of the common colour-vision deficiencies.
@@ -39,17 +39,13 @@ def show_images(
     if len(images) == 0:
         raise InputError("images is empty, expected at least one (H, W, 3) array")
     if titles is not None and len(titles) != len(images):
-        raise InputError(
-            f"titles has {len(titles)} entries, expected one for each of the {len(images)} images"
-        )
+        raise InputError(f"titles has {len(titles)} entries, expected one for each of the {len(images)} images")
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
     title_height = 0.1 + 0.2 * max((title.count("\n") + 1 for title in titles or []), default=0)
     height = (size * aspect + title_height) * rows
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(size * columns, height), squeeze=False, layout="constrained"
-    )
+    figure, grid = plt.subplots(rows, columns, figsize=(size * columns, height), squeeze=False, layout="constrained")
     axes = list(grid.flat)
     for axis in axes:
         axis.set_axis_off()
@@ -95,13 +91,9 @@ def overlay_map(
 def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
     """Frame the image of `axis` and write `text` into its corner: the marked one differs by more than its colour."""
     axis.add_patch(
-        Rectangle(
-            (0, 0), 1, 1, transform=axis.transAxes, fill=False, edgecolor=colour, linewidth=5, zorder=10
-        )
+        Rectangle((0, 0), 1, 1, transform=axis.transAxes, fill=False, edgecolor=colour, linewidth=5, zorder=10)
     )
-    axis.text(
-        0.04, 0.95, text, transform=axis.transAxes, va="top", fontsize=_FONT, weight="bold", bbox=_WHITE_BOX
-    )
+    axis.text(0.04, 0.95, text, transform=axis.transAxes, va="top", fontsize=_FONT, weight="bold", bbox=_WHITE_BOX)
 
 
 def patch_centres(
@@ -117,7 +109,7 @@ def draw_matches(
     target: np.ndarray,
     reference_pixels: Real[np.ndarray, "n 2"],
     target_pixels: Real[np.ndarray, "n 2"],
-    inliers: Bool[np.ndarray, "n"] | None = None,
+    inliers: Bool[np.ndarray, " n"] | None = None,
     titles: tuple[str, str] = ("reference", "target"),
     size: float = 3.4,
 ) -> Figure:
@@ -171,13 +163,9 @@ def pca_colours(
     features = [np.asarray(features, dtype=np.float64) for features in maps]
     if foreground is None:
         foreground = [np.ones(features.shape[:2], bool) for features in features]
-    inside = np.concatenate(
-        [feature[np.asarray(where, bool)] for feature, where in zip(features, foreground)]
-    )
+    inside = np.concatenate([feature[np.asarray(where, bool)] for feature, where in zip(features, foreground)])
     if len(inside) < 3 or inside.shape[1] < 3:
-        raise InputError(
-            f"{inside.shape[0]} patches of {inside.shape[1]} features, expected at least 3 of each"
-        )
+        raise InputError(f"{inside.shape[0]} patches of {inside.shape[1]} features, expected at least 3 of each")
     mean = inside.mean(axis=0)
     axes = np.linalg.eigh((inside - mean).T @ (inside - mean))[1][:, :-4:-1]
     low, high = np.percentile((inside - mean) @ axes, [2, 98], axis=0)

@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.annotations import decode
-from zsp_lite.cameras import Camera
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
-from zsp_lite.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 
 # Labels are printed numbers; what deviates more than this from a rotation is no rigid motion.
 _RIGID_TOLERANCE = 1e-3
@@ -42,19 +42,13 @@ class PoseLabel:
         try:
             trans = np.array(self.trans, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(
-                f"label of {self.seq} has trans {self.trans!r}, expected a 4x4 matrix"
-            ) from error
+            raise InputError(f"label of {self.seq} has trans {self.trans!r}, expected a 4x4 matrix") from error
         if trans.shape != (4, 4) or not np.isfinite(trans).all():
             raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a finite 4x4 matrix")
         rotation = trans[:3, :3]
-        deviation = max(
-            np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max()
-        )
+        deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
         if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise InputError(
-                f"label of {self.seq} has trans {trans.tolist()}, expected a rigid motion of unit scale"
-            )
+            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid motion of unit scale")
         object.__setattr__(self, "trans", trans)
 
 
@@ -62,9 +56,7 @@ def label_folder(root: str | Path, category: str) -> Path:
     """Where the category's labels are or would be: ROOT/class_labels, or upstream's
     ROOT/data/class_labels.
     """
-    folders = [
-        Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")
-    ]
+    folders = [Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 

@@ -29,7 +29,7 @@ _EXACT = 1e-6  # what float32 leaves of one
 class Camera:
     """A calibrated view of the world.
 
-    `R` (3, 3) and `t` (3,): world to camera; `focal` (2,) and `principal_point` (2,): (x, y), pixels; `size`:
+    `R` (3, 3) and `t` (3,): world to camera; `focal_length` (2,) and `principal_point` (2,): (x, y), pixels; `size`:
     image (height, width), pixels. Lengths are in the unit of the world. Raises InputError on values that are
     not finite, an `R` that is not a rotation (to 1e-3; the nearest one is kept), a focal length or size that is
     not positive.
@@ -37,23 +37,21 @@ class Camera:
 
     R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]
-    focal: Float[np.ndarray, "2"]
+    focal_length: Float[np.ndarray, "2"]
     principal_point: Float[np.ndarray, "2"]
     size: tuple[int, int]
 
     def __post_init__(self):
-        for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("principal_point", (2,))):
+        for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal_length", (2,)), ("principal_point", (2,))):
             object.__setattr__(self, name, _finite(getattr(self, name), shape, f"camera {name}"))
         deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
         if deviation > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
-            raise InputError(
-                f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1"
-            )
+            raise InputError(f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
         if deviation > _EXACT:  # written with few decimals: what follows takes it for a rotation
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        if (self.focal <= 0).any():
-            raise InputError(f"camera focal is {self.focal.tolist()}, expected positive pixels")
+        if (self.focal_length <= 0).any():
+            raise InputError(f"camera focal_length is {self.focal_length.tolist()}, expected positive pixels")
         object.__setattr__(self, "size", _image_size(self.size))
 
     @classmethod
@@ -78,9 +76,7 @@ class Camera:
         size = _image_size(size)
         scale, centre = _ndc(size, intrinsics_format)
         # NDC's axes point left and up like the camera's, pixels' right and down: hence the minus.
-        return cls(
-            _AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size
-        )
+        return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
         """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy float64."""
@@ -88,7 +84,7 @@ class Camera:
         return {
             "R": (_AXES[:, None] * self.R).T,
             "T": _AXES * self.t,
-            "focal_length": self.focal / scale,
+            "focal_length": self.focal_length / scale,
             "principal_point": (centre - self.principal_point) / scale,
             "intrinsics_format": intrinsics_format,
         }
@@ -96,7 +92,7 @@ class Camera:
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix, pixels: `pixel ~ K @ x_cam`."""
-        (fx, fy), (cx, cy) = self.focal, self.principal_point
+        (fx, fy), (cx, cy) = self.focal_length, self.principal_point
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -130,7 +126,7 @@ class Camera:
         in_camera = self.to_camera(points)
         depth = in_camera[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = in_camera[..., :2] / depth[..., None] * self.focal + self.principal_point
+            pixels = in_camera[..., :2] / depth[..., None] * self.focal_length + self.principal_point
         return pixels, depth
 
     def unproject_camera(
@@ -138,7 +134,7 @@ class Camera:
     ) -> Float[np.ndarray, "*batch 3"]:
         """Camera-frame points seen at `pixels` (x, y) at `depth` along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
-        rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal
+        rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
 
     def unproject(
@@ -157,7 +153,7 @@ class Camera:
         size = _image_size(size)
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
         return replace(
-            self, focal=self.focal * scale, principal_point=self.principal_point * scale, size=size
+            self, focal_length=self.focal_length * scale, principal_point=self.principal_point * scale, size=size
         )
 
 

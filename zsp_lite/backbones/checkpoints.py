@@ -7,8 +7,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.vit import VisionTransformer
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -38,9 +38,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
     return {key: x for key, x in plain.items() if not key.startswith("head.")}, {}
 
 
-def build_vit(
-    weights: dict[str, Tensor], num_heads: int | None = None, name: str = "checkpoint"
-) -> VisionTransformer:
+def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: str = "checkpoint") -> VisionTransformer:
     """The transformer with these weights; sizes come from their shapes, heads have 64 channels unless told.
 
     Raises InputError where keys or shapes are not those of the DINO layout, or a weight is not finite.

@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
 from zsp_lite.errors import InputError
-from zsp_lite.plots import BLUE, ORANGE, VERMILLION
 from zsp_lite.verified.confidence import Reliability
 from zsp_lite.verified.maps import ViewMaps
 from zsp_lite.verified.verification import TERMS, Evidence, Weights
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
 
 # What becomes of a point in a view, each with its colour and its marker.
 KINDS: dict[str, tuple[str, str]] = {
@@ -159,8 +159,8 @@ def draw_reliability(axis: Axes, reliability: Reliability) -> None:
 
 
 def _wilson(
-    share: Float[np.ndarray, "bins"], count: Int[np.ndarray, "bins"]
-) -> tuple[Float[np.ndarray, "bins"], Float[np.ndarray, "bins"]]:
+    share: Float[np.ndarray, " bins"], count: Int[np.ndarray, " bins"]
+) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
     square = _NORMAL_95**2 / count
     middle = (share + square / 2) / (1 + square)
     half = np.sqrt(share * (1 - share) * square + square**2 / 4) / (1 + square)

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
-from zsp_lite import plots
+from zsp_lite.data.frames import Frame
 from zsp_lite.demo import DemoResult, object_cloud
-from zsp_lite.files import write_atomic
-from zsp_lite.frames import Frame
+from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.pipeline import object_crop
-from zsp_lite.scene3d import aligned_clouds
+from zsp_lite.viz import plots
+from zsp_lite.viz.scene3d import aligned_clouds
 
 _DPI = 110
 _OVERVIEW_FRAMES = 4
@@ -51,9 +51,7 @@ img { max-width: 100%; height: auto; display: block; }
 """
 
 
-def write_report(
-    path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str
-) -> Path:
+def write_report(path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str) -> Path:
     """Write the page for `results` and return its path. `data` names the folder, `data_note` says what is in it."""
     path = Path(path)
     write_atomic(path, page(results, data, data_note, backbone).encode())
@@ -124,9 +122,7 @@ def table_row(result: DemoResult) -> tuple[str, str, str, str, str]:
 def _row(index: int, result: DemoResult) -> str:
     category, *cells = map(html.escape, table_row(result))
     return (
-        f'<tr><td><a href="#pair-{index}">{category}</a></td>'
-        + "".join(f"<td>{cell}</td>" for cell in cells)
-        + "</tr>"
+        f'<tr><td><a href="#pair-{index}">{category}</a></td>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     )
 
 
@@ -188,9 +184,7 @@ Time per stage: {html.escape(timings)}.</p>{flag}
 def _views(result: DemoResult) -> Figure:
     estimate = result.estimate
     views = [estimate.reference_view, *estimate.target_views]
-    titles = ["reference"] + [
-        f"target {i + 1}\nscore {score:.1f}" for i, score in enumerate(estimate.view_scores)
-    ]
+    titles = ["reference"] + [f"target {i + 1}\nscore {score:.1f}" for i, score in enumerate(estimate.view_scores)]
     figure, axes = plots.show_images([view.frame.rgb for view in views], titles, size=1.9)
     plots.mark(axes[1 + estimate.view], "chosen")
     return figure
@@ -198,9 +192,7 @@ def _views(result: DemoResult) -> Figure:
 
 def _saliency(result: DemoResult) -> Figure:
     views = _best_views(result)
-    figure, axes = plots.show_images(
-        [view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7
-    )
+    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
     for axis, view in zip(axes, views):
         plots.overlay_map(axis, view.features.saliency.cpu().numpy(), limits=(0, 1), label="saliency")
     return figure
@@ -208,17 +200,11 @@ def _saliency(result: DemoResult) -> Figure:
 
 def _cycles(result: DemoResult) -> Figure:
     views = _best_views(result)
-    figure, axes = plots.show_images(
-        [view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7
-    )
+    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
     sim = similarity(views[0].features, views[1].features)
     for axis, start, end, table in ((axes[0], *views, sim), (axes[1], *views[::-1], sim.T)):
-        distances = cyclical_distances(
-            table, start.features.grid, end.features.grid, start.foreground, end.foreground
-        )
-        plots.overlay_map(
-            axis, distances.cpu().numpy(), limits=(-10, 0), cmap="cividis", label="− distance (patches)"
-        )
+        distances = cyclical_distances(table, start.features.grid, end.features.grid, start.foreground, end.foreground)
+        plots.overlay_map(axis, distances.cpu().numpy(), limits=(-10, 0), cmap="cividis", label="− distance (patches)")
     return figure
 
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
-from zsp_lite.annotations import (
+from zsp_lite.data.annotations import (
     FRAMES_FILE,
     SEQUENCES_FILE,
     DepthAnnotation,
@@ -26,10 +26,8 @@ from zsp_lite.annotations import (
     decompress,
     read_frame_index,
 )
-from zsp_lite.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
-from zsp_lite.errors import InputError
-from zsp_lite.files import path_inside, plain_name, read_bytes, write_atomic
-from zsp_lite.frames import (
+from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
+from zsp_lite.data.frames import (
     Frame,
     read_depth,
     read_image,
@@ -39,7 +37,9 @@ from zsp_lite.frames import (
     write_image,
     write_mask,
 )
-from zsp_lite.ply import read_ply, write_ply
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import path_inside, plain_name, read_bytes, write_atomic
+from zsp_lite.io.ply import read_ply, write_ply
 
 
 class Co3D:
@@ -170,9 +170,7 @@ class Co3D:
         path = path_inside(self.root, relative)
         image = reader(path)
         if image.shape[:2] != tuple(size):
-            raise InputError(
-                f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}"
-            )
+            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}")
         return image
 
     def _category_folder(self, category: str) -> Path:
@@ -245,9 +243,7 @@ def _write_sequence(
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     if len(sequence.frames) != len(sequence.timestamps):
-        raise InputError(
-            f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps"
-        )
+        raise InputError(f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps")
     annotations = []
     for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps, strict=True)):
         stem = f"frame{number + 1:06d}"
@@ -269,9 +265,7 @@ def _write_sequence(
         view = Viewpoint(**view | arrays)
         is_v2 = intrinsics_format == NDC_ISOTROPIC
         meta = {"frame_splits": [], "eval_batch_maps": []} if is_v2 else msgspec.UNSET
-        annotations.append(
-            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta)
-        )
+        annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta))
     cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
     return annotations, SequenceAnnotation(sequence.name, category, None, cloud, sequence.viewpoint_quality)

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
-from zsp_lite.cameras import Box, Camera
-from zsp_lite.depth import decode_depth, encode_depth
+from zsp_lite.data.cameras import Box, Camera
+from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import InputError
-from zsp_lite.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,27 +30,19 @@ class Frame:
     def __post_init__(self):
         rgb = np.asarray(self.rgb)
         if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-            raise InputError(
-                f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)"
-            )
+            raise InputError(f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)")
         if rgb.shape[:2] != self.camera.size:
-            raise InputError(
-                f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's {self.camera.size}"
-            )
+            raise InputError(f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's {self.camera.size}")
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", np.inf), ("mask", 1.0)):
             if getattr(self, name) is None:
                 continue
             values = np.asarray(getattr(self, name), dtype=np.float32)
             if values.shape != rgb.shape[:2]:
-                raise InputError(
-                    f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}"
-                )
+                raise InputError(f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}")
             if not np.isfinite(values).all() or values.min() < 0 or values.max() > top:
                 expected = "values in [0, 1]" if name == "mask" else "finite values, 0 where unknown"
-                raise InputError(
-                    f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}"
-                )
+                raise InputError(f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}")
             object.__setattr__(self, name, values)
 
     @property
@@ -58,7 +50,7 @@ class Frame:
         return f"frame {self.name}" if self.name else "frame"
 
 
-def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
+def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
     """The object's box (top, left, height, width): where `mask` passes `threshold`, grown, within the image.
 
     Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where
@@ -67,7 +59,7 @@ def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: f
     """
     mask = np.asarray(mask)
     if not 0 <= threshold <= 1:
-        raise InputError(f"object_box: threshold is {threshold}, expected 0 to 1")
+        raise InputError(f"mask_to_bbox: threshold is {threshold}, expected 0 to 1")
     if mask.ndim != 2 or not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected (H, W) with a pixel above 0")
     while not (inside := mask > max(threshold, 0.0)).any():
@@ -78,14 +70,14 @@ def object_box(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: f
 
 
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
-    """The frame cut to its object's box (see `object_box`).
+    """The frame cut to its object's box (see `mask_to_bbox`).
 
     Raises InputError without a mask or with an empty one.
     """
     if frame.mask is None:
         raise InputError(f"{frame._label} has no object mask, expected one to crop to")
     try:
-        return crop_frame(frame, object_box(frame.mask, threshold, padding))
+        return crop_frame(frame, mask_to_bbox(frame.mask, threshold, padding))
     except InputError as error:
         raise InputError(f"{frame._label}: {error}") from error
 
@@ -95,9 +87,7 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
     top, left, height, width = box
     image_height, image_width = frame.camera.size
     if min(box) < 0 or height == 0 or width == 0 or top + height > image_height or left + width > image_width:
-        raise InputError(
-            f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}"
-        )
+        raise InputError(f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}")
     cut = np.s_[top : top + height, left : left + width]
     return replace(
         frame,
@@ -117,18 +107,14 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     shrinks = height <= old_height and width <= old_width
-    rgb = cv2.resize(
-        frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
+    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
         depth = depth[np.ix_(rows, cols)]
     if mask is not None:
-        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(
-            0, 1
-        )
+        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
 
 
@@ -204,9 +190,7 @@ def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     except cv2.error:  # a header that promises more pixels than OpenCV accepts
         image = None
     if image is None:
-        raise InputError(
-            f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG"
-        )
+        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG")
     return image
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from zsp_lite.co3d import Co3D
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.files import plain_name, read_bytes, write_atomic
-from zsp_lite.labels import read_labels
+from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 
 _FIELDS = ("class", "reference_seq_name", "reference_frame_id", "target_seq_name", "all_target_id")
 
@@ -68,9 +68,7 @@ def sample_pairs(
     for name in sequences:
         count = len(numbers.get(name, ()))
         if count < n_targets:
-            raise InputError(
-                f"labelled sequence {category}/{name} has {count} frames, expected at least {n_targets}"
-            )
+            raise InputError(f"labelled sequence {category}/{name} has {count} frames, expected at least {n_targets}")
     numbers = {name: sorted(numbers[name]) for name in sequences}
 
     pairs = []
@@ -171,9 +169,7 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
     """Write pairs in the upstream form; InputError where the data set lacks one of their frames."""
     positions = {
-        category: {
-            (key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))
-        }
+        category: {(key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))}
         for category in dict.fromkeys(pair.category for pair in pairs)
     }
     items = []
@@ -199,9 +195,7 @@ def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: 
     if not isinstance(position, int) or not 0 <= position < len(frames):
         raise InputError(f"{where}: frame id is {position!r}, expected 0 to {len(frames) - 1}")
     if frames[position].sequence_name != sequence:
-        raise InputError(
-            f"{where}: frame id {position} is of {frames[position].sequence_name}, expected {sequence}"
-        )
+        raise InputError(f"{where}: frame id {position} is of {frames[position].sequence_name}, expected {sequence}")
     return frames[position].frame_number
 
 

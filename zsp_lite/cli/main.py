@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from zsp_lite.errors import InputError
 
 if TYPE_CHECKING:
-    from zsp_lite.backbones import BackboneChoice
+    from zsp_lite.backbones.load import BackboneConfig
 
 SYNTHETIC_NOTE = (
     "synthetic: objects composed of primitives by zsp_lite.synthetic and rendered, with depth holes and "
@@ -51,8 +51,10 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr, exit code 2.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    from zsp_lite import cli_benchmark as benchmark  # which take their helpers from here
-    from zsp_lite import cli_data as data
+    from zsp_lite.cli import (
+        benchmark,  # which take their helpers from here
+        data,
+    )
 
     for add in (
         _add_demo, benchmark.add_benchmark, benchmark.add_tables, benchmark.add_compare, _add_synth, _add_weights,
@@ -131,12 +133,12 @@ def _add_backbone(parser: Parser) -> None:
     )  # fmt: skip
 
 
-def _backbone(arguments: argparse.Namespace) -> "str | BackboneChoice":
+def _backbone(arguments: argparse.Namespace) -> "str | BackboneConfig":
     """What `load_backbone` takes for the options of `_add_backbone`: a name alone where nothing else was asked for."""
-    from zsp_lite.backbones import BackboneChoice
+    from zsp_lite.backbones.load import BackboneConfig
 
-    choice = BackboneChoice(arguments.backbone, arguments.layer, arguments.facet, arguments.image_size)
-    return arguments.backbone if choice == BackboneChoice(arguments.backbone) else choice
+    choice = BackboneConfig(arguments.backbone, arguments.layer, arguments.facet, arguments.image_size)
+    return arguments.backbone if choice == BackboneConfig(arguments.backbone) else choice
 
 
 def _add_demo(commands) -> None:
@@ -160,12 +162,12 @@ def _demo(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from zsp_lite.backbones import load_backbone
-    from zsp_lite.co3d import Co3D
+    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo
-    from zsp_lite.doctor import sample_data
-    from zsp_lite.report import table_row, write_overview, write_report
     from zsp_lite.synthetic.export import SETTINGS_FILE
+    from zsp_lite.viz.report import table_row, write_overview, write_report
 
     console = Console()
     folder = arguments.data or sample_data()
@@ -243,7 +245,7 @@ def _add_weights(commands) -> None:
 def _weights(arguments: argparse.Namespace) -> None:
     if arguments.action == "list" and arguments.name:
         raise InputError(f"weights list takes no name, got {arguments.name}")
-    from zsp_lite.backbones import available_backbones, download, verify
+    from zsp_lite.backbones.load import available_backbones, download, verify
 
     backbones, name = available_backbones(), arguments.name
     if arguments.action == "list":
@@ -341,14 +343,14 @@ def _add_doctor(commands) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from zsp_lite.doctor import BAD, examine, healthy
+    from zsp_lite.cli.doctor import BAD, ok, run_checks
 
-    checks = examine(arguments.data)
+    checks = run_checks(arguments.data)
     width = max(len(check.name) for check in checks)
     for check in checks:
         print(f"{check.state:4}  {check.name:{width}}  {check.found}")
-        if check.remedy:
-            print(f"{'':4}  {'':{width}}  -> {check.remedy}")
+        if check.fix:
+            print(f"{'':4}  {'':{width}}  -> {check.fix}")
     missing = [check.name for check in checks if check.state == BAD]
     print("All essentials are there." if not missing else f"Missing or broken: {', '.join(missing)}.")
-    return 0 if healthy(checks) else 1
+    return 0 if ok(checks) else 1

@@ -5,7 +5,7 @@ import plotly.graph_objects as go
 from jaxtyping import Real
 
 from zsp_lite.errors import InputError
-from zsp_lite.plots import BLUE, ORANGE
+from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 4000  # of both clouds together: beyond that browsers and notebooks grow heavy and nothing more is seen
 
