@@ -24,7 +24,7 @@ from zsp_lite.verified.confidence import (
     reliability,
 )
 from zsp_lite.verified.maps import look_up, make_maps
-from zsp_lite.verified.poses import Poses, angles, fit_poses, join, suppress
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, angles, fit_poses, join, suppress
 from zsp_lite.verified.proposals import from_matches, propose, view_rotations
 from zsp_lite.verified.refinement import Search, refine, rotations
 from zsp_lite.verified.scene import contrast, make_scene, surface_shares
@@ -253,6 +253,15 @@ def test_without_matches_the_views_still_propose(views):
     assert len(propose(make_scene(views[0], views[1:], zeros))) == 3
 
 
+@pytest.mark.parametrize(("scale", "allowed"), [(0.45, False), (0.55, True), (1.9, True), (2.1, False)])
+def test_proposals_have_scales_from_a_half_to_two(scale, allowed):
+    source = torch.tensor(np.random.default_rng(0).normal(size=(30, 3)), dtype=torch.float32)
+    found = from_matches(source, scale * source)
+    assert (len(found) > 0) == allowed
+    if allowed:
+        assert float(found.scale[0]) == pytest.approx(scale, rel=1e-3)
+
+
 # Soft ICP
 
 
@@ -283,6 +292,18 @@ def test_a_pose_is_aligned_by_itself(scene, truth):
 def test_spread_indices_are_spread():
     assert spread_indices(10, 4).tolist() == [0, 2, 5, 7]
     assert spread_indices(3, 10).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("scale", "reached"), [(0.3, 0.5), (0.6, 0.6), (1.8, 1.8), (3.0, 2.0)])
+def test_soft_icp_reaches_scales_from_a_half_to_two(scene, scale, reached):
+    points, n = scene.reference_points, len(scene.reference_points)
+    columns = torch.arange(n)
+    larger = replace(
+        scene, target_points=scale * points, target_view=0 * columns, target_column=columns,
+        target_share=torch.full((n,), 1 / n), similarity=torch.eye(n),
+    )  # fmt: skip
+    start = as_poses(Sim3(min(max(0.9 * scale, 0.5), 2.0), np.eye(3), np.zeros(3)))
+    assert float(soft_icp(larger, start, iterations=30).scale) == pytest.approx(reached, rel=0.05)
 
 
 # Verification
@@ -452,6 +473,22 @@ def test_refinement_climbs_and_never_descends():
     assert (angles(found.rotation, goal.rotation)[:, 0] < 4).all()
     still, same = refine(goal, score, search)
     assert float(same) == pytest.approx(float(score(goal)), abs=1e-4) and len(still) == 1
+
+
+@pytest.mark.parametrize("scale", [0.51, 1.95])
+def test_refinement_reaches_the_ends_of_the_scale_range(scale):
+    """Proposals and soft ICP reach scales up to 2; refinement once stopped at 1.6."""
+    start = as_poses(Sim3(0.9 * scale if scale > 1 else 1.1 * scale, np.eye(3), np.zeros(3)))
+    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.06, shrink=0.8)
+    found, _ = refine(start, lambda poses: -(poses.scale / scale).log().square(), search)
+    assert float(found.scale) == pytest.approx(scale, rel=0.005)
+
+
+def test_refinement_stays_within_the_scale_range():
+    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.2, shrink=0.9)
+    for sign, end in zip((-1, 1), SCALE_RANGE):
+        found, _ = refine(as_poses(Sim3.identity()), lambda poses: sign * poses.scale, search)
+        assert float(found.scale) == pytest.approx(end)
 
 
 @given(seeds)

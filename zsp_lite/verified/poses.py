@@ -7,6 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+# Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds have unit spread, so
+# a scale differs from 1 only where the views show different parts of the two objects, or their proportions differ.
+SCALE_RANGE = (0.5, 2.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Poses:

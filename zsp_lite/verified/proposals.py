@@ -9,13 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import Poses, fit_poses, join, suppress
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, fit_poses, join, suppress
 from zsp_lite.verified.scene import Scene
 
 TRIALS = 300
 PER_VIEW = 6
-# Clouds of unit spread: a part seen of one object and all seen of another differ by no more.
-SCALES = (0.5, 2.0)
 _INLIER = 0.3
 _APART = 20.0  # degrees
 _POOL = 200
@@ -47,7 +45,8 @@ def from_matches(
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     sample = torch.from_numpy(np.argsort(rng.random((trials, len(source))), axis=1)[:, :3].copy())
     poses = fit_poses(source[sample], target[sample])
-    poses = poses[(poses.scale > SCALES[0]) & (poses.scale < SCALES[1])]
+    smallest, largest = SCALE_RANGE
+    poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
     residual = (poses.apply(source) - target).square_().sum(dim=2)
     score = (1 - residual / _INLIER**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]

@@ -11,9 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import Poses
-
-_SCALES = (0.5, 1.6)
+from zsp_lite.verified.poses import SCALE_RANGE, Poses
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def refine(
 def _moved(poses: Poses, steps: Float[Tensor, "m tries 7"], search: Search) -> Poses:
     """Each pose changed by each of its steps: three of rotation, three of translation, one of scale."""
     turn = rotations(torch.deg2rad(search.rotation * steps[..., :3]).flatten(0, 1)).view(*steps.shape[:2], 3, 3)
-    scale = (poses.scale[:, None] * torch.exp(search.scale * steps[..., 6])).clamp(*_SCALES)
+    scale = (poses.scale[:, None] * torch.exp(search.scale * steps[..., 6])).clamp(*SCALE_RANGE)
     translation = poses.translation[:, None] + search.translation * steps[..., 3:6]
     return Poses(scale.flatten(), (turn @ poses.rotation[:, None]).flatten(0, 1), translation.flatten(0, 1))
 

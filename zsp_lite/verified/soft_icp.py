@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from zsp_lite.verified.poses import Poses, nearest_rotation
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, nearest_rotation
 from zsp_lite.verified.scene import Scene
 
 ITERATIONS = 6
@@ -20,7 +20,6 @@ _WIDTHS = 0.5, 0.15
 _FEATURES = 8.0
 # a0 per target point: the affinity that a partner must outweigh to count more than a half.
 _UNBOUND = 0.01
-_SCALES = (0.5, 2.0)
 
 
 def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, features: float = _FEATURES) -> Poses:
@@ -47,7 +46,7 @@ def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, features:
         # Means of many shrink towards each other, which least squares would answer with an ever smaller scale: the
         # ratio of spreads does not, and half a step at a time it settles.
         spreads = (weight * y.square()).sum(dim=(1, 2)) / (weight * x.square()).sum(dim=(1, 2)).clamp_min(1e-9)
-        scale = (spreads.sqrt().clamp(*_SCALES) + poses.scale) / 2
+        scale = (spreads.sqrt().clamp(*SCALE_RANGE) + poses.scale) / 2
         turned = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * turned)
     return poses
