@@ -135,8 +135,8 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run, folder
         labels = read_labels(folder, category)
         for pair in sample_pairs(dataset, category, 6, 5):
             a, b = pair.reference_sequence, pair.target_sequence
-            reference = dataset.load(dataset.frame(category, a, pair.reference_frame)).camera
-            cameras = [dataset.load(dataset.frame(category, b, number)).camera for number in pair.target_frames]
+            frame, targets = dataset.load_pair(pair)
+            reference, cameras = frame.camera, [target.camera for target in targets]
             # The object's axes as each camera sees them.
             turns = [camera.R @ labels[b].trans[:3, :3] for camera in cameras]
             angles = [rotation_error(turn, reference.R @ labels[a].trans[:3, :3]) for turn in turns]

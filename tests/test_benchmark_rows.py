@@ -52,13 +52,12 @@ def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
     _, records = run
     dataset, labels = Co3D(small_folder()), read_labels(small_folder(), "pebble")
     (pair, *_) = pairs_of_rows(small_folder(), resolve(["ours"]), 6, 5, categories=["pebble"])["ours"]
-    frames = [dataset.load(dataset.frame("pebble", pair.reference_sequence, pair.reference_frame))]
-    frames += [dataset.load(dataset.frame("pebble", pair.target_sequence, n)) for n in pair.target_frames]
+    reference, targets = dataset.load_pair(pair)
     for name in ("ours", "ours-published", "ours-k70-nokmeans", "ours-transport", "ours-saliencyiou"):
-        estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(frames[0], frames[1:])
+        estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(reference, targets)
         camera = estimate.target_camera
         truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
-        truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ frames[0].camera.R.T
+        truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ reference.camera.R.T
         found = records[pair.key]["methods"][name]
         assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-9)
         assert found["view"] == estimate.view and found["inliers"] == estimate.inliers.sum()

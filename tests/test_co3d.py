@@ -10,6 +10,7 @@ from co3d_folders import edit_json, sequence_data
 from zsp_lite.benchmark.annotations import annotation_benchmark
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.ply import read_ply, write_ply
 
@@ -41,6 +42,19 @@ def change_first_frame(root, **changes):
 def first(root):
     """The entry that `change_first_frame` changes."""
     return Co3D(root).frame("chair", "b_2", 0)
+
+
+def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(root):
+    reference, targets = Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (3, 0)))
+    assert reference.name == "a_1/2" and [target.name for target in targets] == ["b_2/3", "b_2/0"]
+    with pytest.raises(InputError, match="chair/b_2 has no frame number 9"):
+        Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,)))
+
+
+def test_a_frame_key_cannot_be_loaded_and_the_error_names_the_alternative(root):
+    dataset = Co3D(root)
+    with pytest.raises(InputError, match=r"got a FrameKey, expected a FrameAnnotation as Co3D\.frame"):
+        dataset.load(dataset.frame_list("chair")[0])
 
 
 @pytest.mark.parametrize("intrinsics_format", [V1, V2])

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import huggingface_hub
@@ -328,8 +328,7 @@ def test_half_precision_weights_are_computed_with_in_float32(tmp_path, pictures)
 def test_the_pipeline_estimates_a_pose_with_it(folders):
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset)[0]
-    reference = dataset.load(dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame))
-    targets = [dataset.load(dataset.frame(pair.category, pair.target_sequence, n)) for n in pair.target_frames[:2]]
+    reference, targets = dataset.load_pair(replace(pair, target_frames=pair.target_frames[:2]))
     method = ZeroShotPose(load_backbone(f"hf:{folders['dinov2_with_registers']}", "cpu"), k=20)
     estimate = method.estimate(reference, targets)
     assert estimate.reference_view.features.grid == (16, 16)

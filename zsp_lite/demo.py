@@ -59,10 +59,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
 
     Raises InputError where a frame or a label of the pair is missing.
     """
-    reference = dataset.load(dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame))
-    targets = [
-        dataset.load(dataset.frame(pair.category, pair.target_sequence, number)) for number in pair.target_frames
-    ]
+    reference, targets = dataset.load_pair(pair)
 
     start = time.perf_counter()
     estimate = method.estimate(reference, targets)

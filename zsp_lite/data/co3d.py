@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -40,6 +41,9 @@ from zsp_lite.data.frames import (
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside, plain_name, read_bytes, write_atomic
 from zsp_lite.io.ply import read_ply, write_ply
+
+if TYPE_CHECKING:
+    from zsp_lite.data.pairs import Pair
 
 
 class Co3D:
@@ -131,6 +135,11 @@ class Co3D:
         has no viewpoint, a path leaves the data folder, or a file is missing,
         corrupt or of another size than annotated.
         """
+        if not isinstance(annotation, FrameAnnotation):
+            raise InputError(
+                f"Co3D.load got a {type(annotation).__name__}, expected a FrameAnnotation as "
+                "Co3D.frame(category, sequence, frame_number) returns it"
+            )
         camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         rgb = self._read(read_image, annotation.image.path, size)
@@ -143,6 +152,22 @@ class Co3D:
                 usable = self._read(read_mask, annotation.depth.mask_path, size) > 0
                 depth = np.where(usable, depth, np.float32(0))
         return Frame(rgb, depth, mask, camera, name)
+
+    def load_pair(self, pair: "Pair") -> tuple[Frame, list[Frame]]:
+        """Load the frames of an evaluation pair.
+
+        Args:
+            pair: Category, sequences and frame numbers (`zsp_lite.data.pairs.Pair`).
+
+        Returns:
+            The reference frame and the target frames, in the order of `pair.target_frames`.
+
+        Raises:
+            InputError: If a frame is not in the data set or cannot be loaded.
+        """
+        reference = self.load(self.frame(pair.category, pair.reference_sequence, pair.reference_frame))
+        targets = [self.load(self.frame(pair.category, pair.target_sequence, n)) for n in pair.target_frames]
+        return reference, targets
 
     def point_cloud(
         self, category: str, sequence: str

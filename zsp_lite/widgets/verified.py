@@ -143,10 +143,9 @@ def _example_solution() -> tuple[Solution, tuple["View", ...]]:
 
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset, n_targets=3)[-1]
-    names = [(pair.reference_sequence, pair.reference_frame), *((pair.target_sequence, n) for n in pair.target_frames)]
+    reference, targets = dataset.load_pair(pair)
     method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
-    frames = [object_crop(dataset.load(dataset.frame(pair.category, *name))) for name in names]
-    reference, *targets = extract_views(method.backbone, frames)
+    reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
     similarities = method.similarities(reference, targets)
     matches = [method.compare(reference, *pair).matches for pair in zip(targets, similarities)]
     return solve(reference, targets, similarities, matches), tuple(targets)

@@ -1,7 +1,7 @@
 """Choosing the best view, to be played with: the target views around their object, their scores, the chosen matches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
@@ -199,8 +199,8 @@ def example_best_view() -> "VBox":
     first, second = (
         read_labels(dataset.root, pair.category)[s] for s in (pair.reference_sequence, pair.target_sequence)
     )
-    names = [(pair.reference_sequence, pair.reference_frame), *((pair.target_sequence, i) for i in (0, 6, 12, 18))]
-    frames = [object_crop(dataset.load(dataset.frame(pair.category, *name))) for name in names]
+    reference, targets = dataset.load_pair(replace(pair, target_frames=(0, 6, 12, 18)))
+    frames = [object_crop(frame) for frame in (reference, *targets)]
     backbone = load_backbone("zsp-tiny", "cpu")
     reference, *targets = extract_views(backbone, frames)
     method = ZeroShotPose(backbone)
