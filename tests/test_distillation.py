@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.precision import autocast
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.distillation import (
@@ -136,7 +137,7 @@ def test_centre_and_teacher_are_running_averages(pictures, backbone):
     rng = np.random.default_rng([TINY.seed, 3, 1])
     chosen = pictures[rng.integers(8, size=8), rng.integers(2, size=8)]
     large, _ = multi_crop(chosen, rng, TINY)
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+    with torch.no_grad(), autocast("cpu", run.precision):
         said = before(large.flatten(0, 1)).float()
     run.step(pictures)
     torch.testing.assert_close(run.centre, 0.9 * centre + 0.1 * said.mean(0))

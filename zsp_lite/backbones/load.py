@@ -9,7 +9,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,13 +19,13 @@ from torch import Tensor
 from zsp_lite.backbones.checkpoints import build_vit, read_checkpoint
 from zsp_lite.backbones.facets import Facet, block_index, check_facet, extract
 from zsp_lite.backbones.huggingface import PREFIX, HuggingFaceViT, load_huggingface, model_folder, nearest_multiple
+from zsp_lite.backbones.precision import Precision, autocast, supported_precision
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
-Precision = Literal["float32", "bfloat16"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -115,10 +114,11 @@ class Backbone:
             )
         self.name, self.key_block, self.saliency_heads = name, key_block, saliency_heads
         self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
-        self.precision, self.batch_size = precision, batch_size
+        self.batch_size = batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
         self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
         self.device = _device(device)
+        self.precision = supported_precision(precision, self.device.type)
         self.model = model.to(self.device).eval().requires_grad_(False)
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
@@ -136,8 +136,7 @@ class Backbone:
         return features
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
-        half = self.precision == "bfloat16"
-        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=half):
+        with torch.inference_mode(), autocast(self.device.type, self.precision):
             mean, std = (batch.new_tensor(x).view(3, 1, 1) for x in (self.mean, self.std))
             tokens = extract(self.model, (batch - mean) / std, self.key_block, self.facet)
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
@@ -172,7 +171,8 @@ def load_backbone(
     output). image_size: pixels, to the nearest multiple of the patch size; default the checkpoint's, 224 for hf:NAME.
     num_heads, layer and saliency_heads default to the file's metadata, then to the DINO conventions; for hf:NAME to
     the paper's depth (three quarters of the blocks) and all heads.
-    device: None takes a GPU if there is one. precision="bfloat16" is faster where the hardware has it. Raises
+    device: None takes a GPU if there is one. precision="bfloat16" is faster on hardware with
+    bfloat16 instructions; elsewhere float32 is used, with a logged warning (see `precision`). Raises
     InputError for unknown names, layers and facets, downloads that fail (saying what to do) and files that are not
     such a checkpoint. A `BackboneConfig` has layer, facet and image_size of its own; others beside it are not used.
     """

@@ -48,7 +48,7 @@ def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
     rng, total = np.random.default_rng(0), 0.0
     for _ in range(60):
         images = sample_batch(renders, rng, 1, VIEWS, SIDE, (0.85, 1.0)).images
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad():
             total = total + model(images).keys.float().mean(0)
     return total / 60
 

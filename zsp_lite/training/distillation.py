@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from zsp_lite.backbones.precision import autocast, choose_precision
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
@@ -173,6 +174,7 @@ class Distillation:
     def __init__(self, config: DistillationConfig, backbone: VisionTransformer):
         torch.manual_seed(config.seed)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.precision = choose_precision(device.type)
         self.config, self.steps_done = config, 0
         self.student = Network(copy.deepcopy(backbone), config).to(device).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
@@ -190,7 +192,7 @@ class Distillation:
         large, small = (crops.to(device) for crops in multi_crop(pictures, rng, config))
         progress = self.steps_done / config.steps
 
-        with torch.autocast(device.type, torch.bfloat16):
+        with autocast(device.type, self.precision):
             with torch.no_grad():
                 teacher = self.teacher(large.flatten(0, 1)).unflatten(0, large.shape[:2]).float()
             student = [self.student(crops.flatten(0, 1)).unflatten(0, crops.shape[:2]).float()
@@ -219,7 +221,9 @@ class Distillation:
         """Write all that `restore` needs; a file that is there is replaced only once the new one is whole."""
         parts = dict(student=self.student, teacher=self.teacher, optimiser=self.optimiser)
         state = {name: part.state_dict() for name, part in parts.items()}
-        state |= dict(centre=self.centre, steps_done=self.steps_done, config=asdict(self.config))
+        state |= dict(
+            centre=self.centre, steps_done=self.steps_done, config=asdict(self.config), precision=self.precision
+        )
         unfinished = Path(path).with_suffix(".part")
         torch.save(state, unfinished)
         unfinished.replace(path)
@@ -238,7 +242,7 @@ class Distillation:
                 getattr(self, name).load_state_dict(state[name])
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{path}: a run with a backbone of another shape, expected one like this") from error
-        self.centre, self.steps_done = state["centre"], state["steps_done"]
+        self.centre, self.steps_done, self.precision = state["centre"], state["steps_done"], state["precision"]
 
 
 def as_trainee(backbone: VisionTransformer, shape: TrainingConfig, renders: RenderSet, side: int = 96) -> Trainee:
@@ -251,7 +255,7 @@ def as_trainee(backbone: VisionTransformer, shape: TrainingConfig, renders: Rend
     trainee.backbone = backbone
     crops = sample_batch(renders, np.random.default_rng(7), min(6, len(renders)), VIEWS, side, (0.85, 1.0)).images
     with torch.no_grad():
-        trainee.centred(trainee(crops.to(device)).keys, update_mean=True)
+        trainee.centred(backbone.forward_training(crops.to(device), trainee.key_block).keys, update_mean=True)
     return trainee
 
 

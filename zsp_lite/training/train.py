@@ -24,6 +24,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, TINY, load_backbone
+from zsp_lite.backbones.precision import Precision, autocast, choose_precision
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
@@ -123,13 +124,17 @@ class Trainee(nn.Module):
     def __init__(self, config: TrainingConfig):
         super().__init__()
         self.key_block = config.key_block
+        self.precision: Precision | None = None
         self.backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
         self.geometry_of_tokens = nn.Linear(config.embed_dim, 5)
         self.geometry_of_keys = nn.Linear(config.embed_dim, 5)
         self.register_buffer("key_mean", torch.zeros(config.embed_dim))
 
     def forward(self, images: Tensor) -> TrainingTokens:
-        return self.backbone.forward_training(images, self.key_block)
+        """Run the backbone at `precision`, by default the one that is fast on the images' device."""
+        device = images.device.type
+        with autocast(device, self.precision or choose_precision(device)):
+            return self.backbone.forward_training(images, self.key_block)
 
     def centred(self, keys: Tensor, update_mean: bool = False) -> Tensor:
         """Keys about their running mean; `export_checkpoint` does the same by a mean at 224 px, in the key bias."""
@@ -181,9 +186,7 @@ def _sincos(dim: int, side: int, span: float = 12.0) -> Tensor:
 def losses(model: Trainee, batch: Batch, stage: Stage, weight: float, config: TrainingConfig,
            generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """The weighted sum of the objectives on one batch, and the figures worth logging."""
-    device = batch.images.device.type
-    with torch.autocast(device, torch.bfloat16):
-        out = model(batch.images)
+    out = model(batch.images)
     on_object = ~batch.surface[..., 0].isnan()
     geometry = 0.5 * sum(
         geometry_loss(head(features.float()), batch.geometry, on_object)
@@ -219,8 +222,7 @@ def held_out_accuracy(model: Trainee, renders: RenderSet, side: int = 128, objec
     for first in range(0, min(objects, len(renders)), 2):
         members = np.arange(first, min(first + 2, len(renders)))
         batch = _to(sample_batch(renders, rng, len(members), VIEWS, side, (0.85, 1.0), members=members), device)
-        with torch.autocast(device.type, torch.bfloat16):
-            out = model(batch.images)
+        out = model(batch.images)
         keys, on_object = model.centred(out.keys), ~batch.surface[..., 0].isnan()
         descriptors = F.normalize(keys, dim=-1)
         hits.append(correspondence_loss(descriptors, batch.surface, len(members), 0.15, 0.1, 256, generator)[1])
@@ -291,7 +293,9 @@ def train(
         if without_read_outs:
             fit_read_outs(model, training, config.seed)
     model.to(device)
+    model.precision = choose_precision(device.type) if resumed is None else resumed["precision"]
     average = Trainee(config).to(device)
+    average.precision = model.precision
     average.load_state_dict(model.state_dict())
     optimiser = _optimiser(model, config)
     step = 0
@@ -335,7 +339,7 @@ def train(
             log("  ".join(f"{name} {value}" for name, value in row.items()))
         if step % checkpoint_every == 0 or step == config.steps:
             state = dict(model=model.state_dict(), average=average.state_dict(), step=step, smooth=smooth)
-            state |= dict(optimiser=optimiser.state_dict(), origin=origin)
+            state |= dict(optimiser=optimiser.state_dict(), origin=origin, precision=model.precision)
             torch.save(state, checkpoint_file.with_suffix(".part"))
             checkpoint_file.with_suffix(".part").replace(checkpoint_file)
     return export_checkpoint(average.cpu(), held_out, config, folder / "zsp-tiny.safetensors")
@@ -407,7 +411,7 @@ def fit_read_outs(model: Trainee, renders: RenderSet, seed: int, objects: int = 
     batch = sample_batch(renders, np.random.default_rng([seed, 4]), objects, VIEWS, side, (0.6, 1.0))
     on_object = ~batch.surface[..., 0].isnan()
     foreground = 4.0 * on_object.flatten()[:, None] - 2
-    out = model(batch.images)
+    out = model.backbone.forward_training(batch.images, model.key_block)
 
     def fitted(x: Tensor, y: Tensor) -> Tensor:
         x, y = F.pad(x.double(), (0, 1), value=1.0), y.double()
@@ -425,7 +429,7 @@ def _load(config: TrainingConfig, path: Path) -> dict:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         parts = {name: state[name] for name in ("model", "average", "optimiser", "step")}
-        parts |= dict(smooth=state.get("smooth", {}), origin=state.get("origin"))
+        parts |= dict(smooth=state.get("smooth", {}), origin=state.get("origin"), precision=state["precision"])
     except Exception as error:  # torch raises whatever its unpickler stumbles over
         raise InputError(f"{path}: damaged, or no checkpoint of `train`") from error
     try:
