@@ -1,0 +1,128 @@
+"""README.md and docs/: links lead somewhere, names exist, commands parse, and the README's Python code runs."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
+
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+_INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+
+
+def python_blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+
+
+def command_blocks(page: Path) -> list[str]:
+    """The lines of indented code blocks, with continued lines joined."""
+    lines = [line[4:] for line in page.read_text().splitlines() if line.startswith("    ")]
+    return "\n".join(lines).replace("\\\n", " ").splitlines()
+
+
+def headings(page: Path) -> set[str]:
+    """The anchors that GitHub makes of a page's headings."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_the_readme_has_at_most_150_lines():
+    assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page):
+    for link in _LINK.findall(page.read_text()):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{page.name}: {link}"
+        assert not anchor or anchor in headings(target), f"{page.name}: {link}"
+
+
+def test_the_index_links_to_every_page():
+    index = (REPOSITORY / "docs" / "README.md").read_text()
+    for page in PAGES[1:]:
+        assert page.name == "README.md" or f"({page.name})" in index, page.name
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_module_and_file_of_the_package_that_is_named_exists(page):
+    text = page.read_text()
+    for name in re.findall(r"\bzsp_lite(?:\.\w+)+", text):
+        module, *attributes = name.split(".")
+        found = importlib.import_module(module)
+        for attribute in attributes:
+            module = f"{module}.{attribute}"
+            found = getattr(found, attribute, None) or importlib.import_module(module)
+    for path in re.findall(r"\b(?:zsp_lite|notebooks|tests|tools|data_samples)/[\w./-]*\w", text):
+        assert (REPOSITORY / path).exists() or path.startswith("notebooks/exercises/re"), path
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
+    folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
+    files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
+    named = set(re.findall(r"\bZSP_LITE_\w+", page.read_text()))
+    named |= {code for code in _INLINE_CODE.findall(page.read_text()) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)}
+    for name in named:
+        assert any(name.removeprefix("$") in path.read_text() for path in files), name
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_make_target_that_is_named_exists(page):
+    targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    commands = [*_INLINE_CODE.findall(page.read_text()), *command_blocks(page)]
+    for command in commands:
+        if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
+            assert set(words) <= targets, command
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_benchmark_row_that_is_named_exists(page):
+    from zsp_lite.benchmark.methods import GROUPS, METHODS
+
+    known = {*GROUPS, *METHODS}
+    for command in command_blocks(page):
+        words = shlex.split(command, comments=True)
+        if "--methods" in words:
+            assert set(words[words.index("--methods") + 1].split(",")) <= known, command
+    for code in _INLINE_CODE.findall(page.read_text()):
+        if re.fullmatch(r"(ours|verified|rootsift|oracle)-[\w-]+", code):
+            assert code in known, code
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_python_code_compiles_and_imports_what_exists(page):
+    for block in python_blocks(page):
+        compile(block, page.name, "exec")
+        exec("\n".join(re.findall(r"^(?:from|import) .+$", block, re.MULTILINE)), {})
+
+
+def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
+    from zsp_lite.data.frames import write_image, write_mask
+
+    first, second = python_blocks(REPOSITORY / "README.md")
+    monkeypatch.chdir(REPOSITORY)
+    names: dict = {}
+    exec(first, names)
+    assert names["estimate"].reliable and capsys.readouterr().out
+
+    # The second block reads pictures of its user: here the frames of the first.
+    import cv2
+
+    for name, frame in (("my_cup", names["reference"]), ("other_cup", names["targets"][names["estimate"].view])):
+        write_image(tmp_path / f"{name}.jpg", frame.rgb)
+        write_mask(tmp_path / f"{name}_mask.png", frame.mask)
+        cv2.imwrite(str(tmp_path / f"{name}_depth.png"), np.rint(1000 * frame.depth).astype(np.uint16))
+    monkeypatch.chdir(tmp_path)
+    exec(second, names)
+    assert names["estimate"].view == 0 and len(names["estimate"].matches) > 10
