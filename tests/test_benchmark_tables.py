@@ -209,10 +209,10 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
             with_tables(wrong, every_table(run[1]), 1234)
 
 
-def test_the_readmes_tables_are_those_of_the_stored_run():
+def test_the_tables_of_the_documentation_are_those_of_the_stored_run():
     repository = Path(__file__).parents[1]
     summary = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz").summary
-    text = (repository / "README.md").read_text()
+    text = (repository / "docs" / "results.md").read_text()
     assert with_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
     assert set(GROUPS["all"]) <= summary["methods"].keys() and len(summary["data"]["categories"]) == 20
     assert {row["n"] for row in summary["methods"].values()} == {2000}

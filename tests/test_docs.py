@@ -5,11 +5,18 @@ import re
 import shlex
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
+from zsp_lite.cli.main import cli
+
 REPOSITORY = Path(__file__).parents[1]
-PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+PAGES = [
+    REPOSITORY / "README.md",
+    *sorted((REPOSITORY / "docs").glob("*.md")),
+    *sorted((REPOSITORY / "notebooks" / "results").glob("*/README.md")),
+]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -50,7 +57,7 @@ def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page)
 
 def test_the_index_links_to_every_page():
     index = (REPOSITORY / "docs" / "README.md").read_text()
-    for page in PAGES[1:]:
+    for page in (REPOSITORY / "docs").glob("*.md"):
         assert page.name == "README.md" or f"({page.name})" in index, page.name
 
 
@@ -72,18 +79,64 @@ def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
     named = set(re.findall(r"\bZSP_LITE_\w+", page.read_text()))
-    named |= {code for code in _INLINE_CODE.findall(page.read_text()) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)}
+    named |= {
+        code for code in _INLINE_CODE.findall(page.read_text()) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)
+    }
     for name in named:
         assert any(name.removeprefix("$") in path.read_text() for path in files), name
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_make_target_that_is_named_exists(page):
-    targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)) | {"check"}
     commands = [*_INLINE_CODE.findall(page.read_text()), *command_blocks(page)]
     for command in commands:
         if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
             assert set(words) <= targets, command
+
+
+def parse(words: list[str]) -> None:
+    """Parse a command line without running it. Raises click.UsageError for what the command does not accept."""
+    command = cli
+    while isinstance(command, click.Group):
+        name, *words = words or [""]
+        if name not in command.commands:
+            raise click.UsageError(f"no command {name!r}")
+        command = command.commands[name]
+    command.make_context(command.name, words)
+
+
+def options_of(command: click.Command) -> set[str]:
+    return {option for parameter in command.params for option in parameter.opts} | {"--help"}
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_command_line_is_accepted_by_the_program(page):
+    for line in command_blocks(page):
+        words = shlex.split(line, comments=True)
+        for program in (["zsp-lite"], [".venv/bin/python", "-m", "zsp_lite"]):
+            if words[: len(program)] == program:
+                try:
+                    parse(words[len(program) :])
+                except click.UsageError as error:
+                    pytest.fail(f"{line}: {error.format_message()}")
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
+def test_every_command_and_option_in_running_text_exists(page):
+    """Running text may name a command without its arguments; options are looked up in the command before them."""
+    commands = [*cli.commands.values()]
+    commands += [one for command in commands for one in getattr(command, "commands", {}).values()]
+    options = {option for command in commands for option in options_of(command)}
+    for code in _INLINE_CODE.findall(page.read_text()):
+        words = code.split()
+        if words[0] == "zsp-lite" and len(words) > 1 and words[1] != "COMMAND":
+            command = cli.commands[words[1]]
+            if isinstance(command, click.Group) and len(words) > 2:
+                command = command.commands[words[2]]
+            assert {word for word in words if word.startswith("--")} <= options_of(command), code
+        elif words[0].startswith("--") and not words[0].startswith("--no-"):
+            assert words[0] in options, code
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -105,6 +158,12 @@ def test_python_code_compiles_and_imports_what_exists(page):
     for block in python_blocks(page):
         compile(block, page.name, "exec")
         exec("\n".join(re.findall(r"^(?:from|import) .+$", block, re.MULTILINE)), {})
+
+
+def test_a_command_line_with_a_wrong_name_option_or_value_is_not_accepted():
+    for line in ("data carry a b c", "data check --deeper .", "benchmark --pairs many", "synth --preset eval"):
+        with pytest.raises(click.UsageError):
+            parse(line.split())
 
 
 def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""A run's tables inside a Markdown document, such as a README: what stands between a table's marks is replaced.
+"""Tables of a run inside a Markdown document, such as docs/results.md: replaces the text between a table's marks.
 
 <!-- table table_1 -->
 (anything)

@@ -139,7 +139,7 @@ def _list_methods() -> None:
     epilog=examples(
         "tables outputs/benchmark",
         "tables results.json.gz --out outputs/tables",
-        "tables notebooks/results/paper_run/results.json.gz --into README.md",
+        "tables notebooks/results/paper_run/results.json.gz --into docs/results.md",
     )
 )
 @click.argument("source", type=PATH)
