@@ -78,8 +78,8 @@ def test_icp_starts_from_the_first_view_or_from_the_best(run):
 
 def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
     calls = []
-    compare = ZeroShotPose.compare
-    monkeypatch.setattr(ZeroShotPose, "compare", lambda *args: (calls.append(1), compare(*args))[1])
+    match_pair = ZeroShotPose.match_pair
+    monkeypatch.setattr(ZeroShotPose, "match_pair", lambda *args: (calls.append(1), match_pair(*args))[1])
     rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
     evaluate(small_folder(), BACKBONE, rows, 2, 3, out=tmp_path, categories=["pebble"])
     assert len(calls) == 2 * 3

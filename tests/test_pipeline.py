@@ -7,11 +7,12 @@ import pytest
 import torch
 from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
 
-from zsp_lite.alignment import umeyama
+from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose, extract_views, object_crop, patch_mask
+from zsp_lite.pipeline import PoseEstimate, ZeroShotPose, extract_views, match_points, object_crop, patch_mask
+from zsp_lite.verified import VerifiedSolver
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
 
 def test_views_prepared_before_give_the_same_estimate(method, estimate, reference, targets):
     views = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
-    shared = method.estimate_from_features(views[0], views[1:])
+    shared = method.estimate_from_views(views[0], views[1:])
     assert (shared.sim3.matrix == estimate.sim3.matrix).all()
     assert list(shared.timings) == ["matching", "view", "alignment"]
 
@@ -165,15 +166,8 @@ class TwoPatchBackbone(CoordinateBackbone):
         return FeatureMap(found.keys, saliency, found.global_feature)
 
 
-class NothingBackbone(CoordinateBackbone):
-    def features(self, image):
-        found = super().features(image)
-        return FeatureMap(found.keys, torch.zeros_like(found.saliency), found.global_feature)
-
-
-@pytest.mark.parametrize("backbone", [TwoPatchBackbone(), NothingBackbone()])
-def test_too_few_matches_fall_back_to_the_best_view_and_say_so(backbone, reference, targets):
-    estimate = ZeroShotPose(backbone).estimate(reference, targets)
+def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(reference, targets):
+    estimate = ZeroShotPose(TwoPatchBackbone()).estimate(reference, targets)
     assert not estimate.reliable and "best view" in estimate.note and "at least 4" in estimate.note
     assert (estimate.sim3.R == np.eye(3)).all() and not estimate.inliers.any()
     # The object's middle still lands on the target's middle: both crops hold the object alone.
@@ -189,8 +183,55 @@ def test_collinear_points_fall_back_and_say_so(method, reference):
     for view in views:
         view.foreground[:] = False
         view.foreground[:, 14] = True
-    estimate = method.estimate_from_features(views[0], views[1:])
+    estimate = method.estimate_from_views(views[0], views[1:])
     assert not estimate.reliable and "collinear" in estimate.note
+
+
+@pytest.mark.parametrize("solver", ["paper", "verified"])
+@pytest.mark.parametrize("foreground", ["saliency", "mask"])
+def test_a_target_with_an_empty_mask_is_left_out_with_a_flag(method, reference, targets, solver, foreground):
+    empty = replace(targets[1], mask=np.zeros_like(targets[1].mask))
+    method = replace(method, solver=solver, foreground=foreground)
+    estimate = method.estimate(reference, [empty, targets[0], targets[4]])
+    assert estimate.flags[0] == "target 1 left out: empty object mask"
+    assert estimate.view != 0 and np.isneginf(estimate.view_scores[0]) and len(estimate.target_views) == 3
+    without = method.estimate(reference, [targets[0], targets[4]])
+    assert (estimate.sim3.matrix == without.sim3.matrix).all() and estimate.view == without.view + 1
+    assert [one.view for one in estimate.hypotheses] == [one.view + 1 for one in without.hypotheses]
+
+
+def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(method, reference, targets):
+    reference, *views = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
+    no_depth = replace(views[0], frame=replace(views[0].frame, depth=None))
+    unknown = replace(views[1], frame=replace(views[1].frame, depth=np.zeros_like(views[1].frame.depth)))
+    blank = replace(views[2], foreground=torch.zeros_like(views[2].foreground))
+    estimate = method.estimate_from_views(reference, [no_depth, unknown, blank, views[4]])
+    assert estimate.view == 3 and estimate.flags == (
+        "target 0 left out: no depth map",
+        "target 1 left out: no known depth",
+        "target 2 left out: no foreground",
+    )
+    with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no depth map; target 1"):
+        method.estimate_from_views(reference, [no_depth, unknown])
+
+
+def test_a_function_can_be_the_solver(method, reference, targets):
+    def first_view(reference, targets, pairs, *, seed, threshold):
+        source, target = match_points(reference, targets[0], pairs[0].matches)
+        sim3, inliers = ransac(source, target, threshold, seed=seed)
+        scores = np.zeros(len(targets))
+        return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets), {"solver": 1.0})
+
+    estimate = replace(method, solver=first_view).estimate(reference, targets[:2])
+    alone = method.estimate(reference, targets[:1])
+    np.testing.assert_allclose(estimate.sim3.matrix, alone.sim3.matrix, atol=1e-9)
+    assert list(estimate.timings) == ["crop", "features", "matching", "solver"]
+
+
+def test_a_solver_by_name_is_the_same_as_the_object(method, reference, targets):
+    named = replace(method, solver="verified").estimate(reference, targets[:2])
+    given = replace(method, solver=VerifiedSolver()).estimate(reference, targets[:2])
+    assert (named.sim3.matrix == given.sim3.matrix).all() and len(named.hypotheses) == len(given.hypotheses)
 
 
 def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
@@ -209,9 +250,13 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"k": 0}, {"threshold": -1}],
+    [
+        {"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"solver": "best"}, {"threshold": -1},
+        {"k": 0}, {"k": 2.5}, {"k": True}, {"trials": 10.5}, {"trials": 0}, {"sample_size": 2}, {"sample_size": 4.0},
+        {"seed": -1}, {"seed": 0.5},
+    ],
     ids=str,
-)
+)  # fmt: skip
 def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(settings):
     with pytest.raises(InputError):
         ZeroShotPose(CoordinateBackbone(), **settings)

@@ -1,9 +1,33 @@
-"""The one error that bad input raises."""
+"""The exception that the library raises for bad input, and checks that several modules share."""
+
+import numbers
+
+import numpy as np
 
 
 class InputError(ValueError):
-    """Something the caller gave cannot be used: one line that names it, what came and what was expected.
+    """Bad input: one line that names the argument or file, what was given and what was expected.
 
-    The command line turns it into that line on stderr and exit code 2; every
-    other exception is a bug and shows its traceback.
+    The command line prints that line on stderr and exits with code 2. Every other exception is a bug and shows its
+    traceback.
     """
+
+
+def check_integer(name: str, value: object, minimum: int) -> None:
+    """Check that a value is an integer (a Python or NumPy one, not a bool) of at least `minimum`.
+
+    Raises:
+        InputError: The value is of another type or smaller.
+    """
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < minimum:
+        raise InputError(f"{name} is {value!r}, expected an integer of at least {minimum}")
+
+
+def check_seed(name: str, value: object) -> None:
+    """Check that a value is a non-negative integer or a `numpy.random.Generator`.
+
+    Raises:
+        InputError: The value is neither.
+    """
+    if not isinstance(value, np.random.Generator):
+        check_integer(name, value, 0)

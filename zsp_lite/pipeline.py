@@ -1,10 +1,12 @@
-"""The method from frames to a pose, composed of the stages' plain functions (paper fig. 2 and sec. 4)."""
+"""Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
+import importlib
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,60 +16,101 @@ from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, match, plain_similarities, similarities
-from zsp_lite.verified import Hypothesis, VerifiedSettings, solve
-from zsp_lite.views import IMAGE_SIZE, View, extract_views, frame_view, object_crop, patch_mask
+from zsp_lite.views import (
+    IMAGE_SIZE,
+    View,
+    extract_views,
+    frame_defect,
+    frame_view,
+    object_crop,
+    patch_mask,
+    usable_targets,
+)
 
 if TYPE_CHECKING:
     from zsp_lite.backbones.load import Backbone
 
-# Views are pipeline's vocabulary, wherever they live.
+# Views are part of this module's interface as well.
 __all__ = [
-    "IMAGE_SIZE", "PoseEstimate", "View", "ZeroShotPose", "frame_view", "extract_views", "match_points", "object_crop",
-    "patch_mask", "view_alignment",
+    "Hypothesis", "IMAGE_SIZE", "PoseEstimate", "Solver", "View", "ZeroShotPose", "align_best_view", "extract_views",
+    "frame_view", "match_points", "object_crop", "patch_mask", "view_alignment",
 ]  # fmt: skip
 
-# Instances of one category, each of unit spread, do not differ more: what the paper leaves open.
+# Range of the scale between two objects of a category; the paper gives none.
 SCALE_RANGE = (0.2, 5.0)
+# Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
+SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
 _FEW = 10
 
 
 @dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """The pose of the reference object in a target view, and how it came about.
+class Hypothesis:
+    """One of several candidate poses of a solver.
 
-    sim3: reference-camera points to camera points of the chosen target view.  view: its index.
-    matches: between the reference and that view.  inliers: (K,) which of them the fit used.
-    points: their 3D points in the reference's and the target's camera frame, (K, 3) each.
-    view_scores: (N,) of all target views, higher is better.  timings: seconds per stage.
-    target_camera: of the chosen view.  flags: one line per reason not to trust the estimate.
-    reference_view, target_views: crops, features and foregrounds that went in.
-    hypotheses: of the verified solver, best first, each with what speaks for it; the first is the estimate.
+    Attributes:
+        sim3: Reference-camera points to camera points of target view `view`.
+        view: Index of the target view that is closest to the reference viewpoint under this pose.
+        score: In nats, comparable between the hypotheses of one estimate.
+        terms: The terms that the score is a weighted sum of, by name.
+        confidence: Probability that the rotation error is below 30 degrees.
+    """
+
+    sim3: Sim3
+    view: int
+    score: float
+    terms: dict[str, float]
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Pose of the reference object in one of the target views, with the intermediate results behind it.
+
+    Attributes:
+        sim3: Reference-camera points to camera points of the chosen target view.
+        view: Index of the chosen target view.
+        matches: Matches between the reference and the chosen view.
+        inliers: (K,) the matches that agree with the pose.
+        view_scores: (N,) score of every target view, higher is better; -inf for views that were left out.
+        reference_view: Crop, features and foreground of the reference.
+        target_views: The same of all N target views.
+        timings: Seconds per stage.
+        flags: One line per reason not to trust the estimate.
+        hypotheses: Candidate poses of the solver, best first; empty for the paper's solver.
     """
 
     sim3: Sim3
     view: int
     matches: Matches
     inliers: Bool[np.ndarray, " k"]
-    points: tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]
     view_scores: Float[np.ndarray, " n"]
-    timings: dict[str, float]
-    target_camera: Camera
     reference_view: View
     target_views: tuple[View, ...]
+    timings: dict[str, float] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
 
     @property
+    def target_camera(self) -> Camera:
+        """Camera of the chosen target view's crop."""
+        return self.target_views[self.view].frame.camera
+
+    @cached_property
+    def points(self) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+        """3D points of the matches, in the reference's and in the chosen target's camera frame."""
+        return match_points(self.reference_view, self.target_views[self.view], self.matches)
+
+    @property
     def confidence(self) -> float | None:
-        """Chance that the rotation is within 30 degrees of the truth; None where the solver does not say."""
+        """Probability that the rotation error is below 30 degrees; None if the solver does not estimate it."""
         return self.hypotheses[0].confidence if self.hypotheses else None
 
     @property
     def reliable(self) -> bool:
-        """Whether nothing was flagged; it says nothing about how right a fitted pose is."""
+        """Whether there are no flags. This says nothing about the accuracy of a fitted pose."""
         return not self.flags
 
     @property
@@ -76,32 +119,89 @@ class PoseEstimate:
         return "; ".join(self.flags)
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
-        """Pose of the reference against other cameras of the target sequence (sec. 5.6): reference-camera
-        points to each camera's points, through the known world-to-camera transforms."""
+        """Express the pose in other cameras of the target sequence (sec. 5.6).
+
+        Args:
+            cameras: Cameras in the world of the target sequence.
+
+        Returns:
+            For each camera, the similarity from reference-camera points to its camera points.
+        """
         best = self.target_camera
         poses = []
         for camera in cameras:
-            turn = camera.R @ best.R.T
-            poses.append(Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3)
+            rotation = camera.R @ best.R.T
+            poses.append(Sim3(1.0, rotation, camera.t - rotation @ best.t) @ self.sim3)
         return poses
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this signature will do.
+
+    A solver that fits the pose in the first target view:
+
+        def first_view(reference, targets, pairs, *, seed, threshold):
+            points = match_points(reference, targets[0], pairs[0].matches)
+            sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
+            scores = np.zeros(len(targets))
+            return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets))
+
+        ZeroShotPose(backbone, solver=first_view)
+    """
+
+    def __call__(
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
+    ) -> PoseEstimate:
+        """Estimate the pose of the reference object.
+
+        `ZeroShotPose` checks the views before the call and leaves out unusable targets (see `views.usable_targets`).
+        It maps `view`, `view_scores`, `target_views` and the hypotheses' views of the result back to all targets,
+        and adds its own flags and timings.
+
+        Args:
+            reference: Reference view, with known depth in at least one pixel.
+            targets: N >= 1 target views, each with known depth in at least one pixel and a foreground patch.
+            pairs: For each target view, its similarities to the reference and their matches.
+            seed: Seed of everything that is drawn; the same seed gives the same pose.
+            threshold: Largest residual of an inlier, in units of the target object's standard deviation. (The
+                scenes of CO3D are scaled to unit standard deviation.)
+
+        Returns:
+            The estimate, in terms of the views given.
+
+        Raises:
+            InputError: The views do not determine a pose.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class ZeroShotPose:
-    """The method with its settings; the defaults are the paper's.
+    """Zero-shot category-level pose estimation; the defaults are the paper's.
 
-    k: matches kept.  kmeans: spread them over the object by clustering the 2k closest cycles (sec. 4.1).
-    view_selector: a name in `VIEW_SELECTORS`.  trials, threshold, sample_size: of RANSAC; the threshold is in
-    scene units, CO3D's being unit standard deviation of the point cloud.  saliency_threshold: foreground above it.
-    adaptive_threshold: take the threshold as a share of what the chosen view shows of the object (its points' standard
-    deviation), as the supplement suggests: for scenes in other units.
-    foreground: "saliency" as in the paper, or "mask" to take the frame's own mask.
-    cycle_from: "reference" as in the paper, or "target" as in its published code.
-    matcher: "cyclical" as in the paper, or another way to choose matches: see `matchers`.
-    binning: compare log-binned descriptors as in the paper, or the bare keys.
-    solver: "paper" trusts RANSAC in the best view; "verified" tests many poses against all views (see `verified`) and
-    adapts its thresholds to the object's size. verified: settings of the latter.
-    Raises InputError for a setting out of its range.
+    Attributes:
+        backbone: Maps a list of images to a list of `FeatureMap`.
+        k: Number of matches.
+        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best.
+        view_selector: Name in `best_view.VIEW_SELECTORS`.
+        trials: Number of RANSAC trials.
+        threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
+            deviation.)
+        adaptive_threshold: Multiply the threshold by the standard deviation of the object points in the chosen view,
+            for scenes in other units (supplement, "RANSAC parameters").
+        sample_size: Points per RANSAC trial.
+        saliency_threshold: A patch is foreground if its saliency is above this.
+        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
+        cycle_from: View in which cycles start: "reference", as in the paper, or "target".
+        matcher: "cyclical", as in the paper, a name in `matchers.MATCHERS`, or a function (see `matchers.Matcher`).
+        binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
+        solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
+            or a `Solver`.
+        seed: Seed of k-means and of the solver.
+
+    Raises:
+        InputError: A setting is out of range.
     """
 
     backbone: "Backbone"
@@ -117,61 +217,72 @@ class ZeroShotPose:
     cycle_from: Literal["reference", "target"] = "reference"
     matcher: str | Matcher = "cyclical"
     binning: bool = True
-    solver: Literal["paper", "verified"] = "paper"
-    verified: VerifiedSettings = VerifiedSettings()
+    solver: str | Solver = "paper"
     seed: int = 0
 
     def __post_init__(self):
-        matchers = ("cyclical", *MATCHERS)
-        for name, value, allowed in (
-            ("matcher", self.matcher if isinstance(self.matcher, str) else "cyclical", matchers),
-            ("view_selector", self.view_selector, tuple(VIEW_SELECTORS)),
-            ("foreground", self.foreground, ("saliency", "mask")),
-            ("cycle_from", self.cycle_from, ("reference", "target")),
-            ("solver", self.solver, ("paper", "verified")),
+        for name, allowed in (
+            ("matcher", ("cyclical", *MATCHERS)),
+            ("view_selector", tuple(VIEW_SELECTORS)),
+            ("foreground", ("saliency", "mask")),
+            ("cycle_from", ("reference", "target")),
+            ("solver", ("paper", *SOLVERS)),
         ):
+            value = getattr(self, name)
+            if name in ("matcher", "solver") and callable(value):
+                continue
             if value not in allowed:
                 raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
-        if self.k < 1 or self.trials < 1 or self.sample_size < 3 or not self.threshold > 0:
-            raise InputError(
-                f"k={self.k}, trials={self.trials}, sample_size={self.sample_size}, threshold="
-                f"{self.threshold}; expected k, trials >= 1, sample_size >= 3, threshold > 0"
-            )
+        for name, minimum in (("k", 1), ("trials", 1), ("sample_size", 3), ("seed", 0)):
+            check_integer(name, getattr(self, name), minimum)
+        if not self.threshold > 0:
+            raise InputError(f"threshold is {self.threshold}, expected a positive number")
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
-        """The pose of the reference's object in the best of N target views of another object of its category.
+        """Estimate the pose of the reference object in the best of N target views.
 
-        A frame without a mask is taken whole. Where the matches of the best view cannot carry a fit (fewer
-        than sample_size, collinear, or of no plausible scale) the estimate is the best view itself: identity
-        rotation, translation and scale from the foregrounds' centroids and spreads, and a flag that says so.
-        Raises InputError for no targets, an empty mask, and no known depth in the reference or the chosen target.
+        A frame without a mask is not cropped. Target views with an empty mask, without known depth or without
+        foreground are left out, with a flag each. If the matches of the best view do not determine a pose (fewer than
+        `sample_size`, collinear, or no plausible scale), the paper's solver returns `view_alignment` with a flag.
+
+        Args:
+            reference: Frame of the reference object.
+            targets: Frames of another object of its category, in one world.
+
+        Raises:
+            InputError: There are no targets, no target is usable, or the reference has an empty mask or no known
+                depth.
         """
         timings: dict[str, float] = {}
         with _timed(timings, "crop"):
             frames = [object_crop(frame) for frame in (reference, *targets)]
         with _timed(timings, "features"):
             views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
-        return self.estimate_from_features(views[0], views[1:], timings)
+        return self.estimate_from_views(views[0], views[1:], timings)
 
-    def estimate_from_features(
+    def estimate_from_views(
         self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
     ) -> PoseEstimate:
-        """`estimate`, from views that were prepared before and may be shared between pairs and settings."""
-        if not targets:
-            raise InputError("no target views, expected at least one")
+        """Run the stages after feature extraction: matching and the solver (see `estimate`).
+
+        Args:
+            reference: Reference view (see `views.extract_views`).
+            targets: Target views.
+            timings: Seconds of earlier stages, to include in the estimate's.
+        """
         timings = dict(timings or {})
         with _timed(timings, "matching"):
             sims = self.similarities(reference, targets)
-            comparisons = [self.compare(reference, target, sim) for target, sim in zip(targets, sims)]
-        return self.estimate_from_comparisons(reference, targets, comparisons, timings)
+            pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
+        return self.estimate_from_pairs(reference, targets, pairs, timings)
 
     def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
-        """Cosines between the descriptors of the reference's patches and of each target's."""
-        compared = similarities if self.binning else plain_similarities
-        return compared(reference.features, [target.features for target in targets])
+        """Compute the cosine similarities between the reference's and each target's patch descriptors."""
+        function = similarities if self.binning else plain_similarities
+        return function(reference.features, [target.features for target in targets])
 
-    def compare(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
-        """The matches between the reference and one target view, and what a view selector looks at."""
+    def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
+        """Match the reference with one target view (sec. 4.1), from their similarities."""
         matches = match(
             reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
             ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
@@ -181,70 +292,103 @@ class ZeroShotPose:
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
         )
 
-    def estimate_from_comparisons(
+    def estimate_from_pairs(
         self,
         reference: View,
         targets: Sequence[View],
-        comparisons: Sequence[ViewPair],
+        pairs: Sequence[ViewPair],
         timings: dict[str, float] | None = None,
     ) -> PoseEstimate:
-        """The last two stages: choose the view and align (sec. 4.2 and 4.3), or verify poses in all views."""
-        timings = dict(timings or {})
-        if self.solver == "verified":
-            return self._estimate_verified(reference, targets, comparisons, timings)
-        with _timed(timings, "view"):
-            scores = np.array([VIEW_SELECTORS[self.view_selector](comparison) for comparison in comparisons])
-            best = int(scores.argmax())
-            matches = comparisons[best].matches
-        with _timed(timings, "alignment"):
-            points = match_points(reference, targets[best], matches)
-            unit = _spread(_foreground_points(targets[best])) if self.adaptive_threshold else 1.0
-            flags: tuple[str, ...] = ()
-            try:
-                sim3, inliers = ransac(
-                    *points, threshold=unit * self.threshold, trials=self.trials, sample_size=self.sample_size,
-                    seed=self.seed, scale_range=SCALE_RANGE,
-                )  # fmt: skip
-                if (agreeing := int(inliers.sum())) < self.sample_size:
-                    flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
-            except InputError as error:
-                sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
-                flags = (f"pose is the best view's, not a fit: {error}",)
-        return PoseEstimate(
-            sim3, best, matches, inliers, points, scores, timings, targets[best].frame.camera,
-            reference, tuple(targets), flags,
+        """Run the solver on the usable target views (see `estimate`).
+
+        Args:
+            reference: Reference view.
+            targets: Target views.
+            pairs: For each target view, its similarities to the reference and their matches (see `match_pair`).
+            timings: Seconds of earlier stages, to include in the estimate's.
+        """
+        if not targets:
+            raise InputError("no target views, expected at least one")
+        if defect := frame_defect(reference.frame):
+            raise InputError(f"reference {reference.frame.name or 'view'}: {defect}")
+        usable, flags = usable_targets(targets)
+        found = self._solver()(
+            reference, [targets[i] for i in usable], [pairs[i] for i in usable],
+            seed=self.seed, threshold=self.threshold,
+        )  # fmt: skip
+        scores = np.full(len(targets), -np.inf)
+        scores[usable] = found.view_scores
+        return replace(
+            found, view=usable[found.view], view_scores=scores, target_views=tuple(targets),
+            timings=(timings or {}) | found.timings, flags=(*flags, *found.flags),
+            hypotheses=tuple(replace(one, view=usable[one.view]) for one in found.hypotheses),
         )  # fmt: skip
 
-    def _estimate_verified(
-        self, reference: View, targets: Sequence[View], comparisons: Sequence[ViewPair], timings: dict[str, float]
-    ) -> PoseEstimate:
-        """The best hypothesis of the verified solver, in the target view that it sees the object most alike."""
-        found = solve(
-            reference, targets, [one.similarity for one in comparisons], [one.matches for one in comparisons],
-            self.seed, self.verified,
-        )  # fmt: skip
-        best = found.hypotheses[0]
-        matches = comparisons[best.view].matches
-        points = match_points(reference, targets[best.view], matches)
-        residual = np.linalg.norm(best.sim3.apply(points[0]) - points[1], axis=1)
-        return PoseEstimate(
-            best.sim3, best.view, matches, residual < self.threshold * found.target_spread, points, -found.view_angles,
-            timings | found.timings, targets[best.view].frame.camera, reference, tuple(targets), found.flags,
-            found.hypotheses,
-        )  # fmt: skip
+    def _solver(self) -> Solver:
+        if self.solver == "paper":
+            return partial(
+                align_best_view, view_selector=self.view_selector, trials=self.trials, sample_size=self.sample_size,
+                adaptive_threshold=self.adaptive_threshold,
+            )  # fmt: skip
+        if isinstance(self.solver, str):
+            module, name = SOLVERS[self.solver].split(":")
+            return getattr(importlib.import_module(module), name)()
+        return self.solver
+
+
+def align_best_view(
+    reference: View,
+    targets: Sequence[View],
+    pairs: Sequence[ViewPair],
+    *,
+    seed: int = 0,
+    threshold: float = 0.2,
+    view_selector: str = "correspond",
+    trials: int = 1000,
+    sample_size: int = 4,
+    adaptive_threshold: bool = False,
+) -> PoseEstimate:
+    """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by RANSAC (sec. 4.3).
+
+    This is the `Solver` named "paper"; `ZeroShotPose` explains the settings.
+    """
+    timings: dict[str, float] = {}
+    with _timed(timings, "view"):
+        scores = np.array([VIEW_SELECTORS[view_selector](pair) for pair in pairs])
+        best = int(scores.argmax())
+        matches = pairs[best].matches
+    with _timed(timings, "alignment"):
+        points = match_points(reference, targets[best], matches)
+        unit = _spread(_foreground_points(targets[best])) if adaptive_threshold else 1.0
+        flags: tuple[str, ...] = ()
+        try:
+            sim3, inliers = ransac(
+                *points, threshold=unit * threshold, trials=trials, sample_size=sample_size, seed=seed,
+                scale_range=SCALE_RANGE,
+            )  # fmt: skip
+            if (agreeing := int(inliers.sum())) < sample_size:
+                flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
+        except InputError as error:
+            sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
+            flags = (f"pose is the best view's, not a fit: {error}",)
+    return PoseEstimate(sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags)
 
 
 def match_points(
     reference: View, target: View, matches: Matches
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """The matches' 3D points, each in its own camera frame (sec. 4.3)."""
+    """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
     (source, _), (destination, _) = reference.patch_points, target.patch_points
     return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
 
 
 def view_alignment(reference: View, target: View) -> Sim3:
-    """The reference as if seen from the target's viewpoint ("Ours-BV"): identity rotation, and the scale and
-    translation that bring the foreground points' spread and centroid onto the target's."""
+    """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
+
+    Returns:
+        Identity rotation, with the scale and translation that map the standard deviation and the centroid of the
+        reference's foreground points onto those of the target's.
+    """
     first, second = _foreground_points(reference), _foreground_points(target)
     spread = np.sqrt(np.square(first - first.mean(axis=0)).sum(axis=1).mean())
     target_spread = np.sqrt(np.square(second - second.mean(axis=0)).sum(axis=1).mean())
@@ -260,7 +404,7 @@ def _spread(points: Float[np.ndarray, "n 3"]) -> float:
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
     points, known = view.patch_points
     foreground = np.asarray(view.foreground.cpu())
-    # Measured points of the object; where they are too few to have a spread, of the whole crop.
+    # Fewer than ten foreground points do not give a spread: then those of the whole crop.
     for chosen in (foreground & known, known):
         if chosen.sum() >= _FEW:
             return points[chosen]

@@ -60,11 +60,11 @@ class View:
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
-    """The frame's object crop, resized to (size, size) not keeping its aspect (supplement, "Object crops").
+    """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
 
-    A frame without a mask is taken whole. Raises InputError for an empty mask.
+    A frame without a mask, or with an empty one, is not cropped.
     """
-    return resize_frame(frame if frame.mask is None else crop_to_object(frame), (size, size))
+    return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
 
 
 def extract_views(
@@ -73,7 +73,14 @@ def extract_views(
     foreground: str = "saliency",
     saliency_threshold: float = 0.05,
 ) -> list[View]:
-    """Views of cropped frames, their features computed in one batch.  foreground: see `frame_view`."""
+    """Extract the views of cropped frames, their features in one batch.
+
+    Args:
+        backbone: Maps a list of images to a list of `FeatureMap`.
+        frames: Object crops (see `object_crop`).
+        foreground: "saliency" or "mask" (see `frame_view`).
+        saliency_threshold: A patch is foreground if its saliency is above this.
+    """
     features = backbone([frame.rgb for frame in frames])
     return [frame_view(*pair, foreground, saliency_threshold) for pair in zip(frames, features)]
 
@@ -81,15 +88,62 @@ def extract_views(
 def frame_view(
     frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = 0.05
 ) -> View:
-    """A cropped frame with its features, and which patches are the object.
+    """Combine a cropped frame with its features and its foreground patches.
 
-    foreground: "saliency" (of the features, above the threshold) or "mask" (the frame's own, covering a
-    quarter of the patch). Raises InputError for "mask" where the frame has none.
+    A frame with an empty mask has no foreground.
+
+    Args:
+        frame: Object crop.
+        features: Features of its image.
+        foreground: "saliency" for patches whose saliency is above the threshold, or "mask" for patches of which the
+            frame's mask covers at least a quarter.
+        saliency_threshold: A patch is foreground if its saliency is above this.
+
+    Raises:
+        InputError: foreground is "mask" and the frame has no mask.
     """
-    if foreground == "mask":
+    if foreground == "mask" or (frame.mask is not None and not frame.mask.any()):
         return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device), frame.mask)
     soft = soft_saliency(features, frame.camera.size, saliency_threshold)
     return View(frame, features, features.foreground(saliency_threshold), soft)
+
+
+def frame_defect(frame: Frame) -> str:
+    """Say why a frame cannot be used for pose estimation.
+
+    Returns:
+        "empty object mask", "no depth map" or "no known depth"; "" for a usable frame.
+    """
+    if frame.mask is not None and not frame.mask.any():
+        return "empty object mask"
+    if frame.depth is None:
+        return "no depth map"
+    return "" if (frame.depth > 0).any() else "no known depth"
+
+
+def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
+    """Select the target views that a pose can be estimated in.
+
+    Args:
+        targets: Target views.
+
+    Returns:
+        The indices of the views with a non-empty mask, known depth and a foreground patch, and for each other view a
+        flag that names it and the reason.
+
+    Raises:
+        InputError: No view is usable.
+    """
+    usable, flags = [], []
+    for index, target in enumerate(targets):
+        defect = frame_defect(target.frame) or ("" if target.foreground.any() else "no foreground")
+        if defect:
+            flags.append(f"{target.frame.name or f'target view {index}'} left out: {defect}")
+        else:
+            usable.append(index)
+    if not usable:
+        raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
+    return usable, tuple(flags)
 
 
 def soft_saliency(

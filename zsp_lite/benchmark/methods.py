@@ -16,7 +16,7 @@ from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.robustness import DAMAGES, Damaged
 from zsp_lite.errors import InputError
-from zsp_lite.verified import VerifiedSettings
+from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.verification import Weights
 
 
@@ -58,18 +58,16 @@ def _verified_rows() -> dict[str, Method]:
     rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 10, 20)}
     rows |= {f"verified-mask-n{n}": Method(settings=_VERIFIED | _MASK, targets=n) for n in (1, 3, 5, 10)}
     less = {
-        "nosilhouette": VerifiedSettings(weights=Weights(f_off=0, r_off=0)),
-        "nofreespace": VerifiedSettings(weights=Weights(f_front=0, r_front=0)),
-        "noview": VerifiedSettings(weights=Weights(view=0)),
-        "simonly": VerifiedSettings(
-            weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0, view=0)
-        ),
-        "forward": VerifiedSettings(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0, view=0)),
-        "nofeatures": VerifiedSettings(weights=Weights(f_sim=0, r_sim=0, view=0), features=0),
-        "noicp": VerifiedSettings(icp=False),
-        "norefinement": VerifiedSettings(refinement=False),
+        "nosilhouette": VerifiedSolver(weights=Weights(f_off=0, r_off=0)),
+        "nofreespace": VerifiedSolver(weights=Weights(f_front=0, r_front=0)),
+        "noview": VerifiedSolver(weights=Weights(view=0)),
+        "simonly": VerifiedSolver(weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0, view=0)),
+        "forward": VerifiedSolver(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0, view=0)),
+        "nofeatures": VerifiedSolver(weights=Weights(f_sim=0, r_sim=0, view=0), features=0),
+        "noicp": VerifiedSolver(icp=False),
+        "norefinement": VerifiedSolver(refinement=False),
     }
-    return rows | {f"verified-{name}": Method(settings=_VERIFIED | {"verified": one}) for name, one in less.items()}
+    return rows | {f"verified-{name}": Method(settings={"solver": one}) for name, one in less.items()}
 
 
 def _damaged_rows() -> dict[str, Method]:

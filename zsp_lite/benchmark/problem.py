@@ -149,9 +149,9 @@ class Problem:
             if shared not in self._shared:
                 sim = self.store.similarity(features, self.keys[0], key, solver, reference, target)
                 start = time.perf_counter()
-                found = solver.compare(reference, target, sim)
+                found = solver.match_pair(reference, target, sim)
                 self._shared[shared] = found, time.perf_counter() - start
             comparison, spent = self._shared[shared]
             comparisons.append(comparison)
             seconds += spent
-        return solver.estimate_from_comparisons(reference, targets, comparisons, {"matching": seconds})
+        return solver.estimate_from_pairs(reference, targets, comparisons, {"matching": seconds})

@@ -89,8 +89,8 @@ def verified_row(repeats: int = 5) -> Row:
     method = ZeroShotPose(random_vits8(), foreground="mask", solver="verified")
     crops = [object_crop(frame) for frame in made_up_frames(1 + N_TARGETS)]
     reference, *targets = extract_views(method.backbone, crops, method.foreground)
-    compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
-    (seconds,) = _median_seconds([lambda: method.estimate_from_comparisons(reference, targets, compared)], repeats)
+    compared = [method.match_pair(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
+    (seconds,) = _median_seconds([lambda: method.estimate_from_pairs(reference, targets, compared)], repeats)
     note = f"beyond features, similarities and matches; {torch.get_num_threads()} threads"
     return Row(f"verified solver, N = {N_TARGETS}", 1000 * seconds, "ms", 300, note=note)
 

@@ -103,7 +103,7 @@ class Damaged:
             else:
                 frame = DAMAGES[self.damage][min(index, 1)](frame, rng)
             views.append(frame_view(frame, features, solver.foreground, solver.saliency_threshold))
-        return solver.estimate_from_features(views[0], views[1:])
+        return solver.estimate_from_views(views[0], views[1:])
 
 
 def object_spread(frame: Frame) -> float:

@@ -26,7 +26,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.synthetic.export import SPLITS
-from zsp_lite.verified import solve
+from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import MODES_APART, Calibration, fit_calibration, margins, reliability
 from zsp_lite.verified.verification import TERMS, Weights
 
@@ -98,8 +98,8 @@ def outcome(pair: Pair, store: FrameStore, labels: Mapping[str, PoseLabel]) -> O
     settings = solver.foreground, solver.saliency_threshold
     reference, *targets = [store.view("backbone", key, *settings) for key in keys]
     sims = solver.similarities(reference, targets)
-    matches = [solver.compare(reference, target, sim).matches for target, sim in zip(targets, sims)]
-    solution = solve(reference, targets, sims, matches, pair.seed)
+    pairs = [solver.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
+    solution = VerifiedSolver().solve(reference, targets, pairs, pair.seed)
     found = solution.hypotheses
     cameras = [target.frame.camera for target in targets]
     truth = [relative_pose(first, reference.frame.camera, second, camera)[:3, :3] for camera in cameras]

@@ -29,7 +29,7 @@ def guess_alignment(
     method = ZeroShotPose(backbone, solver="verified")
     first, second = _frames(dataset, category, reference, references), _frames(dataset, category, sequence, views)
     seen = extract_views(backbone, [object_crop(frame) for frame in (*first, *second)])
-    found = [method.estimate_from_features(view, seen[len(first) :]) for view in seen[: len(first)]]
+    found = [method.estimate_from_views(view, seen[len(first) :]) for view in seen[: len(first)]]
     best = int(np.argmax([estimate.confidence for estimate in found]))
     to_camera, from_camera = _rigid(first[best].camera), _rigid(found[best].target_camera).inverse()
     return from_camera @ found[best].sim3 @ to_camera, float(found[best].confidence)

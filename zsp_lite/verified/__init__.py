@@ -8,7 +8,7 @@ proposals     poses suggested by three matches of one view, and the views' own r
 soft_icp      each drawn to its neighbourhood's best alignment, weighted by features
 verification  a score of named terms: features, silhouettes, free space, forward and in reverse; likeness of views
 refinement    the score itself climbed by random search
-hypotheses    the ranking, and all of it in one call: `solve`
+hypotheses    the ranking, and the `VerifiedSolver` that runs all stages
 confidence    a calibrated chance that a hypothesis is right
 
 What was tried and left out, before the view term came (276 pairs of 19 training categories, Acc30 of the paper's
@@ -22,6 +22,6 @@ view term (87.6) was kept. Calling answers equally good by what both show to vie
 of the right answers.
 """
 
-from zsp_lite.verified.hypotheses import Hypothesis, Solution, VerifiedSettings, solve
+from zsp_lite.verified.hypotheses import Solution, VerifiedSolver
 
-__all__ = ["Hypothesis", "Solution", "VerifiedSettings", "solve"]
+__all__ = ["Solution", "VerifiedSolver"]

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.errors import InputError
-from zsp_lite.matching import Matches
+from zsp_lite.best_view import ViewPair
+from zsp_lite.pipeline import Hypothesis, PoseEstimate, match_points
 from zsp_lite.verified.confidence import MODES_APART, Calibration, calibration_for, margins
 from zsp_lite.verified.poses import Poses, angles, join, suppress
 from zsp_lite.verified.proposals import propose
@@ -42,45 +41,13 @@ _NOTHING_SEEN = 0.05
 _NOTHING_ALIKE = 0.02
 
 
-@dataclass(frozen=True)
-class VerifiedSettings:
-    """What the verified solver does; the defaults are what measured best, the rest is for ablations.
-
-    weights: of the score.  calibration: of the confidences, None for the one that fits the number of target views.
-    features: weight of similarity in the soft ICP.
-    icp, refinement: whether these stages run.
-    """
-
-    weights: Weights = Weights()
-    calibration: Calibration | None = None
-    features: float = 8.0
-    icp: bool = True
-    refinement: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One answer: a pose against target view `view`, what speaks for it, and how sure it is.
-
-    sim3: reference-camera points to the view's camera points.  view: the target view that looks at the object most
-    like the reference did, under this pose.  score: in nats, comparable within a pair.  terms: what it is the
-    weighted sum of, by name (see `verification`).  confidence: chance that the rotation is within 30 degrees.
-    """
-
-    sim3: Sim3
-    view: int
-    score: float
-    terms: dict[str, float]
-    confidence: float
-
-
 @dataclass(frozen=True, eq=False)
 class Solution:
     """What the solver found.
 
     hypotheses: best score first, at least 15 degrees apart, never none.  view_angles: degrees of rotation from the
-    reference's camera to each target view's (N,), under the best; infinite for views left out.  flags: one line per
-    reason not to trust it.  timings: seconds per stage.  scene: what the poses were tested on, its views in the
+    reference's camera to each target view's (N,), under the best.  flags: one line per reason not to trust it.
+    timings: seconds per stage.  scene: what the poses were tested on, its views in the
     order `order` of the targets.  poses: the hypotheses in its working units.
     """
 
@@ -98,48 +65,87 @@ class Solution:
         return 1 / self.scene.target_frame.scale
 
 
-def solve(
-    reference: View,
-    targets: Sequence[View],
-    similarities: Sequence[Float[Tensor, "n1 n2"]],
-    matches: Sequence[Matches],
-    seed: int | np.random.Generator = 0,
-    settings: VerifiedSettings = VerifiedSettings(),
-) -> Solution:
-    """Proposals, soft ICP, verification, refinement of what scores best, ranking.
+@dataclass(frozen=True)
+class VerifiedSolver:
+    """The `Solver` beyond the paper: test many poses in all target views. The defaults are what measured best.
 
-    similarities, matches: of the reference with each target.  The answer does not depend on the order of the targets,
-    and turns with their world. Target views without depth or foreground are left out, with a flag.
-    Raises InputError where the reference or all targets together have too little of both.
+    Attributes:
+        weights: Of the terms of the score.
+        calibration: Of the confidences; None for the one that fits the number of target views.
+        features: Weight of the similarity in the soft ICP.
+        icp: Whether to run the soft ICP.
+        refinement: Whether to run the refinement.
     """
-    timings: dict[str, float] = {}
-    with _timed(timings, "scene"), torch.no_grad():
-        order, flags = _usable(targets)
-        scene = make_scene(
-            reference, [targets[k] for k in order], [similarities[k] for k in order], [matches[k] for k in order]
-        )
-    poses, terms = search(scene, seed, settings, timings)
-    with _timed(timings, "ranking"), torch.no_grad():
-        score = settings.weights.score(terms).double().numpy()
-        apart = angles(poses.rotation, poses.rotation).double().numpy()
-        calibration = settings.calibration or calibration_for(len(order))
-        confidence = calibration.confidence(margins(score, apart), scene.spread)
-        sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
-        hypotheses = []
-        for i in range(len(poses)):
-            view = int(sight[i].argmin())
-            pose = scene.sim3(poses, i, view)
-            hypotheses.append(Hypothesis(pose, order[view], float(score[i]), terms.of(i), float(confidence[i])))
-    view_angles = np.full(len(targets), np.inf)
-    view_angles[list(order)] = sight[0]
-    flags += _doubts(hypotheses, poses)
-    return Solution(tuple(hypotheses), view_angles, flags, timings, scene, order, poses)
+
+    weights: Weights = Weights()
+    calibration: Calibration | None = None
+    features: float = 8.0
+    icp: bool = True
+    refinement: bool = True
+
+    def __call__(
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
+    ) -> PoseEstimate:
+        """Estimate the pose (see `pipeline.Solver`): the best hypothesis of `solve`, and all others with it."""
+        found = self.solve(reference, targets, pairs, seed)
+        best = found.hypotheses[0]
+        matches = pairs[best.view].matches
+        source, target = match_points(reference, targets[best.view], matches)
+        residual = np.linalg.norm(best.sim3.apply(source) - target, axis=1)
+        return PoseEstimate(
+            best.sim3, best.view, matches, residual < threshold * found.target_spread, -found.view_angles, reference,
+            tuple(targets), found.timings, found.flags, found.hypotheses,
+        )  # fmt: skip
+
+    def solve(
+        self,
+        reference: View,
+        targets: Sequence[View],
+        pairs: Sequence[ViewPair],
+        seed: int | np.random.Generator = 0,
+    ) -> Solution:
+        """Run all stages: proposals, soft ICP, verification, refinement of the best poses, ranking.
+
+        The result does not depend on the order of the targets, and rotates with their world.
+
+        Args:
+            reference: Reference view.
+            targets: N >= 1 usable target views (see `views.usable_targets`).
+            pairs: For each target view, its similarities to the reference and their matches.
+            seed: Of everything that is drawn.
+
+        Raises:
+            InputError: The reference, or all targets together, have too few foreground patches of known depth.
+        """
+        timings: dict[str, float] = {}
+        with _timed(timings, "scene"), torch.no_grad():
+            order = _content_order(targets)
+            scene = make_scene(
+                reference, [targets[k] for k in order], [pairs[k].similarity for k in order],
+                [pairs[k].matches for k in order],
+            )  # fmt: skip
+        poses, terms = search(scene, seed, self, timings)
+        with _timed(timings, "ranking"), torch.no_grad():
+            score = self.weights.score(terms).double().numpy()
+            apart = angles(poses.rotation, poses.rotation).double().numpy()
+            calibration = self.calibration or calibration_for(len(order))
+            confidence = calibration.confidence(margins(score, apart), scene.spread)
+            sight = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
+            hypotheses = []
+            for i in range(len(poses)):
+                view = int(sight[i].argmin())
+                pose = scene.sim3(poses, i, view)
+                hypotheses.append(Hypothesis(pose, order[view], float(score[i]), terms.of(i), float(confidence[i])))
+        view_angles = np.empty(len(targets))
+        view_angles[list(order)] = sight[0]
+        flags = _doubts(hypotheses, poses)
+        return Solution(tuple(hypotheses), view_angles, flags, timings, scene, order, poses)
 
 
 def search(
     scene: Scene,
     seed: int | np.random.Generator = 0,
-    settings: VerifiedSettings = VerifiedSettings(),
+    solver: VerifiedSolver = VerifiedSolver(),
     timings: dict[str, float] | None = None,
 ) -> tuple[Poses, Terms]:
     """The poses that explain a scene best, best first, at least 15 degrees apart, and their terms.
@@ -150,16 +156,16 @@ def search(
     with _timed(timings, "proposals"), torch.no_grad():
         poses = propose(scene, rng)
     with _timed(timings, "alignment"), torch.no_grad():
-        if settings.icp:
-            poses = soft_icp(scene, poses, features=settings.features)
+        if solver.icp:
+            poses = soft_icp(scene, poses, features=solver.features)
     with _timed(timings, "verification"), torch.no_grad():
-        score = settings.weights.score(verify(scene, poses))
+        score = solver.weights.score(verify(scene, poses))
         poses = poses[suppress(poses.rotation, score, _COARSE_APART, _COARSE_KEPT)]
     with _timed(timings, "refinement"), torch.no_grad():
-        if settings.refinement:
-            poses = _refined(scene, poses, settings.weights, rng)
+        if solver.refinement:
+            poses = _refined(scene, poses, solver.weights, rng)
         terms = verify(scene, poses)
-        best = suppress(poses.rotation, settings.weights.score(terms), _FINE_APART, _FINE_KEPT)
+        best = suppress(poses.rotation, solver.weights.score(terms), _FINE_APART, _FINE_KEPT)
         return poses[best], terms[best]
 
 
@@ -201,23 +207,11 @@ def _doubts(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[str, ...]:
     return tuple(flags)
 
 
-def _usable(targets: Sequence[View]) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """The targets that can be tested against, in an order that is theirs alone; a flag for each of the others."""
-    keys, flags = {}, []
-    for index, target in enumerate(targets):
-        depth = target.frame.depth
-        name = target.frame.name or f"target view {index}"
-        if depth is None or not (depth > 0).any():
-            flags.append(f"{name} left out: no known depth")
-        elif not target.foreground.any():
-            flags.append(f"{name} left out: no foreground")
-        else:
-            # What neither the order of the views nor the world's axes and unit change.
-            content = target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes()
-            keys[index] = hashlib.blake2b(content, digest_size=16).digest()
-    if not keys:
-        raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
-    return tuple(sorted(keys, key=keys.get)), tuple(flags)
+def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
+    """The targets sorted by a hash of their content, which neither their order nor the world's axes change."""
+    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+    keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
+    return tuple(sorted(range(len(targets)), key=keys.__getitem__))
 
 
 @contextmanager

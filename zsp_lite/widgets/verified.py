@@ -138,7 +138,7 @@ def _example_solution() -> tuple[Solution, tuple["View", ...]]:
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import demo_pairs
     from zsp_lite.pipeline import ZeroShotPose
-    from zsp_lite.verified import solve
+    from zsp_lite.verified import VerifiedSolver
     from zsp_lite.views import extract_views, object_crop
 
     dataset = Co3D(sample_data())
@@ -146,9 +146,9 @@ def _example_solution() -> tuple[Solution, tuple["View", ...]]:
     reference, targets = dataset.load_pair(pair)
     method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
     reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
-    similarities = method.similarities(reference, targets)
-    matches = [method.compare(reference, *pair).matches for pair in zip(targets, similarities)]
-    return solve(reference, targets, similarities, matches), tuple(targets)
+    sims = method.similarities(reference, targets)
+    pairs = [method.match_pair(reference, *pair) for pair in zip(targets, sims)]
+    return VerifiedSolver().solve(reference, targets, pairs), tuple(targets)
 
 
 def example_ranked_hypotheses() -> "VBox":

@@ -204,7 +204,7 @@ def example_best_view() -> "VBox":
     backbone = load_backbone("zsp-tiny", "cpu")
     reference, *targets = extract_views(backbone, frames)
     method = ZeroShotPose(backbone)
-    compared = [method.compare(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
+    compared = [method.match_pair(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     truths = [relative_pose(first, frames[0].camera, second, frame.camera) for frame in frames[1:]]
     seen_from = second.trans @ np.linalg.inv(first.trans) @ np.append(frames[0].camera.centre, 1)
     angles = rotation_error(np.eye(3), np.stack(truths)[:, :3, :3])
