@@ -1,4 +1,4 @@
-# The two commands: `make demo` and `make test`. Both make .venv once; README.md has the same steps in plain pip.
+# Start with `make demo` or `make test`; either creates .venv once. README.md has the same steps in plain pip.
 PYTHON ?= python3
 OUT ?= outputs/demo
 
@@ -7,11 +7,14 @@ RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test lab notebooks browser exercises doctor clean
+.PHONY: help demo test check lint format lab notebooks browser exercises doctor clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
-	@echo "make test       unit tests, then every notebook re-executed and checked (nbval)"
+	@echo "make test       ruff, unit tests, and every notebook re-executed and checked (nbval)"
+	@echo "make check      the unit tests that are not slow"
+	@echo "make lint       ruff: format and lint of all code, notebooks included"
+	@echo "make format     let ruff format all code, notebooks included"
 	@echo "make lab        JupyterLab on the notebooks"
 	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
@@ -37,10 +40,22 @@ demo: $(STAMP)
 	$(RUN) -m zsp_lite demo --out "$(OUT)"
 
 # One pytest run: the cells marked `# NBVAL_CHECK_OUTPUT` must reproduce their stored output, the others must run.
-# Two processes of one thread each; a file, and so a notebook, stays in one process.
-test: $(STAMP)
+# Two processes of one thread each; a file, and so a notebook, stays in one process. The notebooks take longest, so
+# they start first.
+test: lint
 	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --nbval-lax --nbval-current-env \
-	  --nbval-cell-timeout=600 --durations=10 tests $(wildcard notebooks)
+	  --nbval-cell-timeout=600 --durations=10 $(wildcard notebooks) tests
+
+check: $(STAMP)
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 -m "not slow and not browser" tests
+
+lint: $(STAMP)
+	$(RUN) -m ruff format --check .
+	$(RUN) -m ruff check .
+
+format: $(STAMP)
+	$(RUN) -m ruff format .
+	$(RUN) -m ruff check --fix .
 
 # Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs.
 lab: $(STAMP)
@@ -49,11 +64,11 @@ lab: $(STAMP)
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
 
-# Part of `make test` too; skipped where there is no Chromium.
+# Skipped where there is no Chromium.
 browser: $(STAMP)
-	$(RUN) -m pytest -v tests/browser
+	$(RUN) -m pytest -v -m browser tests/browser
 
-# nbgrader calls `alembic` by name.
+# nbgrader starts the program `alembic`, which is in the environment's bin folder.
 exercises: $(STAMP)
 	cd notebooks/exercises && PATH="$(CURDIR)/$(VENV)/bin:$$PATH" && \
 	  for folder in source/*; do nbgrader generate_assignment --force "$${folder#source/}" || exit 1; done

@@ -1,4 +1,4 @@
-"""Every notebook runs in a real JupyterLab, in a real browser, without an error, and its widgets answer."""
+"""Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their sliders."""
 
 import shutil
 from pathlib import Path
@@ -21,9 +21,11 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = REPOSITORY / "outputs" / "browser"
-LABELLING = {"08_label_poses.ipynb", "10_your_own_objects.ipynb"}  # have a 3D view to click on
+LABELLING = {"08_label_poses.ipynb", "10_your_own_objects.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
+
+pytestmark = pytest.mark.browser
 
 BROKEN = """\
 import io, ipywidgets, matplotlib.pyplot as plt
@@ -88,7 +90,7 @@ def page(browser, lab):
     lab.stop_kernels()
 
 
-def test_a_broken_notebook_is_found_out(page, lab):
+def test_errors_of_a_broken_notebook_are_found(page, lab):
     open_notebook(page, lab, "broken.ipynb")
     run_all(page, patience=300)
     assert errors(page, saved(page, lab, "broken.ipynb")) == [
@@ -100,7 +102,7 @@ def test_a_broken_notebook_is_found_out(page, lab):
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_a_notebook_runs_and_its_widgets_answer(page, lab, name):
+def test_a_notebook_runs_and_its_widgets_react(page, lab, name):
     open_notebook(page, lab, name)
     run_all(page, patience=60 * MINUTES)
     try:
