@@ -12,7 +12,6 @@ from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.io.ply import read_ply, write_ply
 
 V1, V2 = "ndc_norm_image_bounds", "ndc_isotropic"
 
@@ -328,40 +327,6 @@ def test_sequences_that_do_not_fit_together_are_refused(tmp_path):
     object.__setattr__(data, "timestamps", [0.0])
     with pytest.raises(InputError, match="4 frames and 1 timestamps"):
         write_co3d(tmp_path, "chair", [data])
-
-
-def test_point_clouds_are_read_in_every_encoding(tmp_path):
-    points = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
-    header = "ply\nformat {} 1.0\ncomment made up\nelement vertex 5\n"
-    header += "".join(f"property float {name}\n" for name in "xyz") + "element face 0\nend_header\n"
-    for encoding, body in {
-        "binary_little_endian": points.astype("<f4").tobytes(),
-        "binary_big_endian": points.astype(">f4").tobytes(),
-        "ascii": "\n".join(" ".join(map(repr, row.tolist())) for row in points).encode(),
-    }.items():
-        (tmp_path / "cloud.ply").write_bytes(header.format(encoding).encode() + body)
-        read, colours = read_ply(tmp_path / "cloud.ply")
-        np.testing.assert_array_equal(read, points)
-        assert colours is None
-
-
-def test_broken_point_clouds_are_refused_by_name(tmp_path):
-    path = tmp_path / "cloud.ply"
-    write_ply(path, np.zeros((5, 3)), np.zeros((5, 3), np.uint8))
-    whole = path.read_bytes()
-    for data in (
-        b"",
-        b"text",
-        whole[:-1],
-        whole.replace(b"float x", b"float w"),
-        whole.replace(b"vertex 5", b"vertex x"),
-    ):
-        path.write_bytes(data)
-        with pytest.raises(InputError, match=r"point cloud .*cloud\.ply"):
-            read_ply(path)
-    write_ply(path, np.full((5, 3), np.nan), np.zeros((5, 3), np.uint8))
-    with pytest.raises(InputError, match="not finite"):
-        read_ply(path)
 
 
 def test_opening_a_category_costs_little_more_than_its_json():

@@ -104,6 +104,17 @@ def test_shrinking_averages_colours_over_the_area():
     assert (resize_frame(frame(rgb=rgb), (12, 16)).rgb == 100).all()
 
 
+@pytest.mark.parametrize("transpose", [False, True])
+def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(transpose):
+    stripes = np.zeros((24, 24, 3), np.uint8)
+    stripes[::3] = 240  # every third row, each row of the result covers two periods
+    size = (4, 48)
+    if transpose:
+        stripes, size = stripes.swapaxes(0, 1), size[::-1]
+    resized = resize_frame(frame(rgb=stripes, camera=random_camera(0, (24, 24))), size)
+    assert (resized.rgb == 80).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -293,6 +293,8 @@ def edited(change):
         ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
         ("nerfstudio", edited(lambda c: c["frames"][2].update(file_path="gone.jpg")), "frame 2: file gone.jpg is not"),
         ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)), "frame 1: pose is"),
+        ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: k4 is 0.01, expected 0"),
+        ("nerfstudio", edited(lambda c: c["frames"][3].update(k4=-0.01)), "frame 3: k4 is -0.01, expected 0"),
         ("open3d", lambda folder: (folder / "depth/0003.png").unlink(), "8 pictures, 7 depth maps and 8 poses"),
         ("open3d", break_file("trajectory.log", "0 0 1\n1 0 0 0\n"), "expected five for each pose"),
         ("open3d", lambda folder: (folder / "camera_intrinsic.json").unlink(), "none of camera_intrinsic.json"),

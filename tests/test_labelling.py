@@ -170,6 +170,23 @@ def test_undo_skip_clear_and_move(root):
     assert labelling.progress()[-1].state == "open"
 
 
+@pytest.mark.parametrize("point", [(0, np.nan, 0), (np.inf, 0, 0), (1, 2)])
+def test_a_pick_is_moved_to_finite_points_only_and_the_session_stays_readable(root, point):
+    labelling = Labelling(root, "chair")
+    pick_all(labelling, "best", corners())
+    with pytest.raises(InputError, match="pick on best is .*expected a finite point"):
+        labelling.move("best", 0, point)
+    np.testing.assert_array_equal(Labelling(root, "chair").picks("best"), corners())
+
+
+def test_undo_without_picks_leaves_a_skipped_sequence_skipped(root):
+    labelling = Labelling(root, "chair")
+    labelling.skip("b")
+    labelling.undo("b")
+    assert labelling.progress() == Labelling(root, "chair").progress()
+    assert labelling.progress()[-1].state == "skipped"
+
+
 def test_a_guess_puts_the_picks_on_the_cloud(root):
     labelling = Labelling(root, "chair")
     with pytest.raises(InputError, match="needs 4 keypoints on the reference first"):

@@ -85,7 +85,7 @@ class Co3D:
     ) -> list[SequenceAnnotation]:
         """The sequences worth labelling: both scores above their bounds, best point clouds first, at most `top`.
 
-        The paper's supplementary, "Labelled categories"; a score that is not given passes no bound.
+        The supplement's "Choice of evaluation categories & sequences"; a score that is not given passes no bound.
         """
         scored = []
         for sequence in self.sequences(category):

@@ -99,15 +99,20 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
-    """The frame resized to (height, width), not keeping its aspect.
+    """Resize a frame without keeping its aspect ratio.
 
-    Colours are averaged over the area when shrinking, interpolated otherwise; depth takes the pixel under the
-    new pixel's centre, so that no depth is made up across an edge or a hole; the mask is interpolated.
+    Colours are averaged (OpenCV's INTER_AREA) along a side that shrinks and interpolated along a side that grows.
+    Depth is taken from the nearest pixel, so that no values are made up at edges and holes. The mask is interpolated.
+
+    Args:
+        frame: The frame.
+        size: New (height, width), pixels.
     """
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
-    shrinks = height <= old_height and width <= old_width
-    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
+    rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)
+    rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)

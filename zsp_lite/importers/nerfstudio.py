@@ -30,6 +30,7 @@ class _Intrinsics(msgspec.Struct, kw_only=True):
     p1: float | None = None
     p2: float | None = None
     k3: float | None = None
+    k4: float | None = None
 
 
 class _Frame(_Intrinsics, kw_only=True):
@@ -65,6 +66,8 @@ def read_nerfstudio(folder: str | Path) -> Capture:
         missing = [name for name in ("fl_x", "cx", "cy", "w", "h") if given[name] is None]
         if missing:
             raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
+        if given["k4"]:
+            raise InputError(f"{where}: k4 is {given['k4']}, expected 0, for OpenCV's distortion model has no r^8 term")
         to_world = np.array(frame.transform_matrix) @ _TO_OPENCV
         size = int(given["h"]), int(given["w"])
         camera = camera_from_pose(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)

@@ -127,22 +127,19 @@ class Labelling:
         name: of a new keypoint of the reference (default: a number). Raises InputError where all keypoints are picked
         already, or the reference's would change under those of other sequences.
         """
-        point = np.asarray(point, dtype=np.float64)
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise InputError(f"pick on {sequence} is {point.tolist()}, expected a finite point (3,)")
+        point = _finite_point(point, sequence)
         picks = self._editable(sequence)
         if sequence == self.reference:
             self._stored.names.append(name or f"keypoint {len(picks) + 1}")
         elif len(picks) >= len(self.names):
             raise InputError(f"sequence {sequence}: all {len(self.names)} keypoints are picked; undo one to pick again")
-        picks.append(tuple(point.tolist()))
+        picks.append(point)
         self._save()
 
     def undo(self, sequence: str) -> None:
         """Take the last pick of a sequence back; nothing happens where there is none."""
-        picks = self._editable(sequence)
-        if picks:
-            picks.pop()
+        if len(self.picks(sequence)):
+            self._editable(sequence).pop()
             if sequence == self.reference:
                 self._stored.names.pop()
             self._save()
@@ -194,7 +191,7 @@ class Labelling:
         picks = self._editable(sequence)
         if not 0 <= index < len(picks):
             raise InputError(f"sequence {sequence} has no pick {index}, expected 0 to {len(picks) - 1}")
-        picks[index] = tuple(np.asarray(point, dtype=np.float64).tolist())
+        picks[index] = _finite_point(point, sequence)
         self._save()
 
     def alignment(self, sequence: str) -> Alignment | None:
@@ -275,6 +272,13 @@ class Labelling:
 
     def _save(self) -> None:
         write_atomic(self.path, msgspec.json.format(msgspec.json.encode(self._stored), indent=1))
+
+
+def _finite_point(point: Point, sequence: str) -> Triple:
+    point = np.asarray(point, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise InputError(f"pick on {sequence} is {point.tolist()}, expected a finite point (3,)")
+    return tuple(point.tolist())
 
 
 def _cloud_quality(sequence: SequenceAnnotation | None) -> float:
