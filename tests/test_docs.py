@@ -1,4 +1,4 @@
-"""README.md and docs/: links lead somewhere, names exist, commands parse, and the README's Python code runs."""
+"""README.md, docs/ and other pages: links lead somewhere, names exist, commands parse, and the README's Python code runs."""
 
 import importlib
 import re
@@ -15,7 +15,8 @@ REPOSITORY = Path(__file__).parents[1]
 PAGES = [
     REPOSITORY / "README.md",
     *sorted((REPOSITORY / "docs").glob("*.md")),
-    *sorted((REPOSITORY / "notebooks" / "results").glob("*/README.md")),
+    *sorted((REPOSITORY / "notebooks").rglob("README.md")),
+    REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
@@ -127,7 +128,7 @@ def test_every_command_and_option_in_running_text_exists(page):
     """Running text may name a command without its arguments; options are looked up in the command before them."""
     commands = [*cli.commands.values()]
     commands += [one for command in commands for one in getattr(command, "commands", {}).values()]
-    options = {option for command in commands for option in options_of(command)}
+    options = {option for command in commands for option in options_of(command)} | {"--force"}  # nbgrader's
     for code in _INLINE_CODE.findall(page.read_text()):
         words = code.split()
         if words[0] == "zsp-lite" and len(words) > 1 and words[1] != "COMMAND":
