@@ -1,4 +1,4 @@
-"""README.md, docs/ and other pages: links lead somewhere, names exist, commands parse, and the README's Python code runs."""
+"""README.md, docs/ and other pages: links lead somewhere, names exist, commands parse, the README's code runs."""
 
 import importlib
 import re
