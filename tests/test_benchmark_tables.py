@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from zsp_lite.benchmark import published
-from zsp_lite.benchmark.compare import compare, comparison_table
+from zsp_lite.benchmark.compare import compare, comparison_table, split_rows
 from zsp_lite.benchmark.document import with_tables
 from zsp_lite.benchmark.figures import (
     accuracy_against_views,
@@ -25,12 +25,13 @@ from zsp_lite.benchmark.figures import (
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
-from zsp_lite.benchmark.results import Results, read_results, write_results
+from zsp_lite.benchmark.results import Results, pool, read_results, read_runs, write_results
 from zsp_lite.benchmark.storage import RunFolder
-from zsp_lite.benchmark.summary import summarise_run
+from zsp_lite.benchmark.summary import category_of, objects_of, summarise_run, weights_of_pairs
 from zsp_lite.benchmark.tables import (
     OTHER_DATA,
     THIS_RUN,
+    Cell,
     all_rows,
     by_category,
     category_tables,
@@ -39,24 +40,27 @@ from zsp_lite.benchmark.tables import (
 )
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import paired_test
+from zsp_lite.metrics import accuracy, bootstrap_ci, object_weights, paired_test
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
 PAIRS = 8
 ROWS = [*GROUPS["table1"], *GROUPS["ablations"], *GROUPS["views"], "ours-bv", "rootsift", "verified"]
 
 
-def made_up_run(out, rows=ROWS, seed=0):
-    """A run's folder with random errors."""
+def made_up_run(out, rows=ROWS, seed=0, objects=PAIRS):
+    """A run's folder with random errors of pairs that share a few objects, other ones for each seed."""
     rng = np.random.default_rng(seed)
     rows = list(dict.fromkeys(rows))
+    names = [f"{seed}_{i}" for i in range(objects)]
     pairs = {}
     for name in rows:
         n = METHODS[name].targets if name in METHODS else None
         pairs[name] = [
-            Pair(category, f"s{i}", i, f"t{i}", tuple(range(n or 5))) for category in CATEGORIES for i in range(PAIRS)
-        ]
-    with RunFolder(out, {"seed": seed, "methods": dict.fromkeys(rows, "x")}) as folder:
+            Pair(category, names[i % objects], i, names[(i * i + 1) % objects], tuple(range(n or 5)))
+            for category in CATEGORIES for i in range(PAIRS)
+        ]  # fmt: skip
+    settings = {"seed": seed, "targets": 5, "methods": dict.fromkeys(rows, "x"), "backbone": "none"}
+    with RunFolder(out, settings) as folder:
         for name in rows:
             for pair in pairs[name]:
                 found = {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "", "inliers": 9}
@@ -114,8 +118,12 @@ def test_a_run_of_three_rows_has_no_table_of_what_it_lacks(tmp_path):
     summary = made_up_run(tmp_path, ["ours", "ours-bv", "rootsift"])
     assert [table.name for table in paper_tables(summary)] == ["table_2", "table_a_targets", "table_a_depth", "beyond"]
     assert len(all_rows(summary).rows) == 3
-    errors = [list(read_results(tmp_path).errors(name).values()) for name in ("rootsift", "ours")]
-    assert summary["against_ours"]["rootsift"] == paired_test(*errors)
+    found = read_results(tmp_path)
+    keys = sorted(found.rows["ours"], key=lambda key: (CATEGORIES.index(category_of(key)), key))
+    errors = [[found.errors(name)[key] for key in keys] for name in ("rootsift", "ours")]
+    test = paired_test(*errors, weights=weights_of_pairs(keys))
+    against = summary["against_ours"]["rootsift"]
+    assert against == {name: test[name] for name in against} and "accuracy_gain_ci" in against
 
 
 def test_the_verified_solver_stands_beside_the_papers_by_number_of_views(tmp_path):
@@ -250,14 +258,22 @@ def test_what_is_no_run_is_refused(tmp_path):
 
 
 def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
-    made_up_run(tmp_path, ["ours", "icp"], seed=1)
-    first, second = read_results(run[0]), read_results(tmp_path)
+    first = read_results(run[0])
+    rows = {
+        name: {key: {"error": one["error"] / 2} for key, one in first.rows[name].items()} for name in ("ours", "icp")
+    }
+    second = Results({}, {}, [], rows)
     second.rows["ours"].pop(next(iter(second.rows["ours"])))
     found = {one.first: one for one in compare(first, second)}
     assert set(found) == {"ours", "icp"} and found["ours"].n == 47 and found["icp"].n == 48
     a, b = first.errors("icp"), second.errors("icp")
-    test = paired_test(list(a.values()), [b[key] for key in a])
-    assert found["icp"].accuracy_p == test["accuracy_p"] and found["icp"].error_drop == test["error_drop"]
+    keys = sorted(a)
+    test = paired_test([a[key] for key in keys], [b[key] for key in keys], weights=weights_of_pairs(keys))
+    assert (
+        found["icp"].test == test
+        and found["icp"].test["accuracy_gain_ci"]
+        != paired_test([a[key] for key in keys], [b[key] for key in keys])["accuracy_gain_ci"]
+    )
     assert found["icp"].acc30[1] - found["icp"].acc30[0] == pytest.approx(test["accuracy_gain"])
     (mixed,) = compare(first, first, [("ours", "icp")])
     table = comparison_table([mixed], "a", "b")
@@ -268,6 +284,89 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
         compare(first, second, [("ours-n1", "ours")])
     with pytest.raises(InputError, match="row in common"):
         compare(Results({}, {}, [], {"x": {}}), second)
+
+
+def test_rows_to_compare_may_have_colons_in_their_names():
+    first, second = (Results({}, {}, [], dict.fromkeys(names, {})) for names in (("ours", "my:row"), ("ours", "a:b:c")))
+    assert split_rows("ours", first, second) == ("ours", "ours")
+    assert split_rows("my:row:ours", first, second) == ("my:row", "ours")
+    assert split_rows("my:row:a:b:c", first, second) == ("my:row", "a:b:c")
+    for text in ("my:row", "ours:", "", ":ours", "ours:my:row"):
+        with pytest.raises(InputError, match="not in the runs, expected A:B or A with A one of ours, my:row and B"):
+            split_rows(text, first, second)
+    first, second = (Results({}, {}, [], dict.fromkeys(names, {})) for names in (("a", "a:b"), ("b:c", "c")))
+    with pytest.raises(InputError, match="'a:b:c': ambiguous"):
+        split_rows("a:b:c", first, second)
+
+
+def test_the_names_of_objects_are_read_from_a_pairs_key():
+    pair = Pair("toytruck", "100_2601_9340", 4, "101_7848_2398", (1, 2, 3))
+    assert category_of(pair.key) == "toytruck"
+    assert objects_of(pair.key) == ("toytruck/100_2601_9340", "toytruck/101_7848_2398")
+
+
+def test_intervals_of_a_run_come_from_resampled_objects(run):
+    errors = read_results(run[0]).errors("ours")
+    objects, categories = [objects_of(key) for key in errors], [category_of(key) for key in errors]
+    expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), object_weights(objects, categories))
+    assert run[1]["methods"]["ours"]["acc30_ci"] == pytest.approx(list(expected))
+
+
+def test_a_run_of_an_earlier_version_gets_its_intervals_again(run, tmp_path):
+    results = read_results(run[0])
+    old = json.loads(json.dumps(results.summary))
+    del old["intervals"]
+    old["methods"]["ours"] |= {"acc30_ci": [0, 100], "flagged": 7}
+    path = write_results(replace(results, summary=old), tmp_path / "results.json.gz")
+    again = read_results(path).summary
+    assert again["methods"]["ours"]["acc30_ci"] == pytest.approx(run[1]["methods"]["ours"]["acc30_ci"])
+    assert again["methods"]["ours"]["flagged"] == 7 and again["intervals"]["resampled"] == "objects"
+
+
+def test_runs_on_different_objects_are_pooled(tmp_path):
+    rows = ["ours", "ours-bv", "icp"]
+    for seed in (0, 1, 2):
+        made_up_run(tmp_path / str(seed), rows[: 3 - (seed == 2)], seed)
+    runs = [read_results(tmp_path / str(seed)) for seed in (0, 1, 2)]
+    pooled = pool(runs)
+    assert list(pooled.rows) == ["ours", "ours-bv"]
+    row = pooled.summary["methods"]["ours"]
+    errors = {key: error for run in runs for key, error in run.errors("ours").items()}
+    assert row["n"] == len(errors) == 3 * 48
+    assert row["acc30"] == pytest.approx(np.mean([run.summary["methods"]["ours"]["acc30"] for run in runs]))
+    objects, categories = [objects_of(key) for key in errors], [category_of(key) for key in errors]
+    weights = object_weights(objects, categories)
+    expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), weights)
+    assert row["acc30_ci"] == pytest.approx(list(expected))
+    single = runs[0].summary["methods"]["ours"]["acc30_ci"]
+    assert row["acc30_ci"][1] - row["acc30_ci"][0] < 0.8 * (single[1] - single[0])
+    assert read_runs([tmp_path / "0"]).summary == runs[0].summary
+    write_reports([tmp_path / "0", tmp_path / "1"], tmp_path / "pooled")
+    assert read_results(tmp_path / "pooled" / "results.json.gz").summary["methods"]["icp"]["n"] == 96
+
+
+def test_runs_that_are_not_of_one_benchmark_are_not_pooled(tmp_path):
+    made_up_run(tmp_path / "0", ["ours"])
+    one = read_results(tmp_path / "0")
+    with pytest.raises(InputError, match="share 48 pairs of row ours"):
+        pool([one, one])
+    for settings, told in (
+        ({"backbone": "other"}, "differ in backbone: none, other"),
+        ({"targets": 3}, "differ in targets"),
+        ({"methods": {"ours": "y"}}, "differ in row ours"),
+    ):
+        with pytest.raises(InputError, match=told):
+            pool([one, replace(one, settings=one.settings | settings)])
+    with pytest.raises(InputError, match="no row in common"):
+        pool([one, Results({}, {}, [], {"x": {}})])
+
+
+def test_small_p_values_are_not_printed_as_zero(run):
+    table = all_rows(run[1])
+    index = [column.title for column in table.columns].index("p")
+    for p, text in ((0.0004, "< 0.001"), (1e-30, "< 0.001"), (0.0123, "0.012"), (1.0, "1.000")):
+        cells = [Cell(p, p_value=True) if i == index else None for i in range(len(table.columns))]
+        assert f"| {text} |" in as_markdown(replace(table, rows=(("ours", tuple(cells)),)))
 
 
 def test_rows_by_category_for_a_terminal(run):
@@ -284,7 +383,8 @@ def test_rows_by_category_for_a_terminal(run):
 def test_a_run_against_itself_shows_no_difference(run):
     results = read_results(run[0])
     for one in compare(results, results):
-        assert one.accuracy_gain == one.error_drop == 0 and one.accuracy_p == one.error_p == 1
+        assert one.test["accuracy_gain"] == one.test["error_drop"] == 0
+        assert {value for name, value in one.test.items() if name.endswith("_p")} == {1}
 
 
 def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_path):

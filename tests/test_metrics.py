@@ -1,5 +1,7 @@
 """Pose errors against analytic angles, and the statistics against values worked out by hand."""
 
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,10 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import (
     accuracy,
     bootstrap_ci,
+    mean_category_median,
     median,
+    object_weights,
+    pair_weights,
     paired_test,
     rotation_error,
     summarise,
@@ -82,12 +87,27 @@ def test_accuracy_counts_errors_strictly_below_the_threshold():
     assert median([1, 2, 100]) == 2
 
 
+def acc30(errors, weights=None):
+    return accuracy(errors, 30, weights)
+
+
+def test_weights_count_errors_several_times():
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 7, 8):
+        errors, weights = rng.uniform(0, 60, n), rng.integers(0, 4, n) + np.eye(n, dtype=int)[0]
+        repeated = np.repeat(errors, weights)
+        assert median(errors, weights) == np.median(repeated)
+        assert accuracy(errors, 30, weights) == pytest.approx(100 * np.mean(repeated < 30))
+    np.testing.assert_array_equal(median([3.0, 1.0], [[1, 1], [0, 5]]), [2, 1])
+
+
 def test_the_interval_of_an_accuracy_matches_the_binomial():
     # 40 of 100 solved: the normal approximation gives 40 +- 1.96 * sqrt(.4 * .6 / 100) = 40 +- 9.6.
     errors = np.r_[np.zeros(40), np.full(60, 90.0)]
-    low, high = bootstrap_ci(errors, lambda e: accuracy(e, 30), seed=1)
+    low, high = bootstrap_ci(errors, acc30)
     assert low == pytest.approx(30.4, abs=1.5) and high == pytest.approx(49.6, abs=1.5)
-    assert bootstrap_ci(errors, median, seed=1) == bootstrap_ci(errors, median, seed=1)
+    drawn = np.random.default_rng(0).integers(100, size=(2000, 100))
+    assert (low, high) == pytest.approx(tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5])))
 
 
 def test_equal_errors_have_no_spread():
@@ -96,6 +116,70 @@ def test_equal_errors_have_no_spread():
         "n": 5, "median": 20, "acc30": 100, "acc15": 0,
         "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0,
     }  # fmt: skip
+
+
+PAIRS = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
+
+
+def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
+    weights = object_weights(PAIRS, resamples=500)
+    np.testing.assert_allclose(weights.sum(axis=1), len(PAIRS))
+    for row in weights:
+        # Some multiplicities of a, b, c and d, which sum to 4, explain all six weights up to their common factor.
+        fits = [
+            np.allclose(row * products.sum(), products * row.sum())
+            for a in range(5) for b in range(5 - a) for c in range(5 - a - b)
+            for count in [dict(zip("abcd", (a, b, c, 4 - a - b - c)))]
+            for products in [np.array([count[one] * count[other] for one, other in PAIRS])] if products.any()
+        ]  # fmt: skip
+        assert any(fits)
+
+
+def test_the_order_of_pairs_and_other_categories_do_not_change_a_draw():
+    weights = object_weights(PAIRS, ["x"] * 6)
+    np.testing.assert_array_equal(object_weights(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
+    both = object_weights(PAIRS * 2, ["w"] * 6 + ["x"] * 6)
+    np.testing.assert_array_equal(both[:, 6:], weights)
+    assert (both[:, :6] != weights).any()
+    np.testing.assert_allclose(both[:, :6].sum(axis=1), 6)
+
+
+def test_pairs_of_two_objects_are_resampled_one_by_one():
+    np.testing.assert_array_equal(np.unique(object_weights([("a", "b"), ("b", "a")])), [0, 1, 2])
+
+
+def test_objects_and_categories_of_other_lengths_are_refused():
+    for objects, categories in ((PAIRS, ["x"]), ([], None), (["a", "b"], None)):
+        with pytest.raises(InputError, match="object_weights"):
+            object_weights(objects, categories)
+
+
+def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
+    """A simulated world: a pair is solved if its two objects and chance together are easy enough."""
+    rng, n, m, worlds = np.random.default_rng(0), 50, 10, 200
+    truth, hits = 100 * NormalDist(0, np.sqrt(1 + 2 * 0.8**2)).cdf(0.3), np.zeros(2)
+    categories = np.repeat(["x", "y"], n)
+    for _ in range(worlds):
+        easiness = rng.normal(0, 0.8, size=(2, m))
+        first = np.tile(np.arange(n) % m, (2, 1))
+        second = (first + rng.integers(1, m, size=(2, n))) % m
+        total = np.take_along_axis(easiness, first, 1) + np.take_along_axis(easiness, second, 1)
+        errors = np.where(0.3 + total + rng.normal(size=(2, n)) > 0, 10.0, 90.0).ravel()
+        objects = np.stack([first.ravel(), second.ravel()], axis=-1)
+        for i, weights in enumerate((object_weights(objects, categories, 400), pair_weights(2 * n, 400))):
+            low, high = bootstrap_ci(errors, acc30, weights)
+            hits[i] += low <= truth <= high
+    by_objects, by_pairs = hits / worlds
+    assert 0.9 <= by_objects <= 0.99 and by_pairs < 0.75
+
+
+def test_the_mean_of_category_medians_is_over_categories():
+    errors, categories = np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)], ["x"] * 6 + ["y"] * 6
+    weights = object_weights(PAIRS * 2, categories)
+    found, interval = mean_category_median(errors, categories, weights)
+    assert found == 20
+    medians = [(10 + median(errors[6:], row)) / 2 for row in weights[:, 6:]]
+    assert interval == pytest.approx(tuple(np.percentile(medians, [2.5, 97.5])))
 
 
 @pytest.mark.parametrize("errors", [[], 3.0, [1.0, np.nan]])
@@ -113,15 +197,29 @@ def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
     first, second = np.r_[[90.0] * 6, 10.0, [5.0] * 3], np.r_[[10.0] * 6, 90.0, [5.0] * 3]
     result = paired_test(first, second)
     assert result["accuracy_gain"] == pytest.approx(50)
-    assert result["accuracy_p"] == pytest.approx(0.125)
+    assert result["sign_test_p"] == pytest.approx(0.125)
     assert result["error_drop"] == pytest.approx(40)
     # Sums of +-80 over 7 signs at least as far as 5 * 80: |plus - minus| >= 5, that is 2 * (1 + 7) of 128.
-    assert result["error_p"] == pytest.approx(16 / 128, abs=0.015)
+    assert result["permutation_test_p"] == pytest.approx(16 / 128)
+
+
+def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates():
+    rng = np.random.default_rng(0)
+    first, second = rng.uniform(0, 60, 6), rng.uniform(0, 40, 6)
+    weights = object_weights(PAIRS)
+    result = paired_test(first, second, weights=weights)
+    gains = [100 * np.average((second < 30) * 1.0 - (first < 30), weights=row) for row in weights]
+    assert result["accuracy_gain_ci"] == pytest.approx(list(np.percentile(gains, [2.5, 97.5])))
+    below = np.sum(np.array(gains) < 1e-9)
+    assert result["accuracy_gain"] > 0 and result["accuracy_gain_p"] == pytest.approx(2 * (below + 1) / 2001)
+    drops = [np.average(first - second, weights=row) for row in weights]
+    assert result["error_drop_ci"] == pytest.approx(list(np.percentile(drops, [2.5, 97.5])))
 
 
 def test_a_method_does_not_differ_from_itself():
     errors = np.linspace(0, 180, 30)
     result = paired_test(errors, errors)
-    assert result["accuracy_p"] == 1 and result["error_p"] == 1 and result["error_drop"] == 0
+    assert {result[f"{name}_p"] for name in ("accuracy_gain", "error_drop", "sign_test", "permutation_test")} == {1}
+    assert result["error_drop"] == 0
     with pytest.raises(InputError):
         paired_test(errors, errors[:-1])

@@ -1,4 +1,4 @@
-"""Two runs, or two rows, on the same pairs: is the difference more than chance?"""
+"""Two runs, or two rows, on the same pairs: by how much do they differ, and is it more than chance?"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zsp_lite.benchmark.results import Results
+from zsp_lite.benchmark.summary import weights_of_pairs
 from zsp_lite.benchmark.tables import Cell, Column, Table
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, paired_test
@@ -13,10 +14,11 @@ from zsp_lite.metrics import accuracy, median, paired_test
 
 @dataclass(frozen=True)
 class Difference:
-    """Row `first` of run A against row `second` of run B on the `n` pairs that both have; errors in degrees.
+    """Row `first` of run A against row `second` of run B on the `n` pairs that both have.
 
-    acc30, median: of A and B.  accuracy_gain: B - A in percentage points, accuracy_p its sign test over the pairs that
-    only one of them has within 30 degrees.  error_drop: mean of A - B, error_p its permutation test (signs flipped).
+    Attributes:
+        acc30, median: Of A and of B, in percent and degrees.
+        test: What `metrics.paired_test` returns, with bootstrap intervals and p values over objects.
     """
 
     first: str
@@ -24,16 +26,19 @@ class Difference:
     n: int
     acc30: tuple[float, float]
     median: tuple[float, float]
-    accuracy_gain: float
-    accuracy_p: float
-    error_drop: float
-    error_p: float
+    test: dict
 
 
 def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | None = None) -> list[Difference]:
-    """Every row that both runs have against its namesake, or the given (row of A, row of B).
+    """Compare rows of two runs on the pairs that both have evaluated.
 
-    Only pairs that both have evaluated count. Raises InputError where there is no common row or pair.
+    Args:
+        first: Run A.
+        second: Run B.
+        rows: (row of A, row of B); by default every row that both runs have, with itself.
+
+    Raises:
+        InputError: If there is no common row or pair.
     """
     if rows is None:
         rows = [(name, name) for name in first.rows if name in second.rows]
@@ -42,39 +47,54 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
     found = []
     for one, other in rows:
         a, b = first.errors(one), second.errors(other)
-        keys = [key for key in a if key in b]
+        keys = sorted(key for key in a if key in b)
         if not keys:
             raise InputError(f"rows {one} and {other} have no pair in common: other data, seed or number of views")
         before, after = np.array([a[key] for key in keys]), np.array([b[key] for key in keys])
-        test = paired_test(before, after)
-        found.append(
-            Difference(
-                one,
-                other,
-                len(keys),
-                (float(accuracy(before, 30)), float(accuracy(after, 30))),
-                (float(median(before)), float(median(after))),
-                **test,
-            )  # fmt: skip
-        )
+        test = paired_test(before, after, weights=weights_of_pairs(keys))
+        acc30 = float(accuracy(before, 30)), float(accuracy(after, 30))
+        found.append(Difference(one, other, len(keys), acc30, (float(median(before)), float(median(after))), test))
     return found
 
 
+def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
+    """Split "A:B" into a row of each run; "A" stands for the row A of both. Names of rows may hold colons themselves.
+
+    Raises:
+        InputError: If the text names no rows of the runs, or can be read in several ways.
+    """
+    if text in first.rows and text in second.rows:
+        return text, text
+    ends = [i for i, sign in enumerate(text) if sign == ":"]
+    found = [(text[:i], text[i + 1 :]) for i in ends if text[:i] in first.rows and text[i + 1 :] in second.rows]
+    if len(found) != 1:
+        raise InputError(
+            f"rows {text!r}: {'ambiguous' if found else 'not in the runs'}, expected A:B or A with A one of "
+            f"{', '.join(first.rows)} and B one of {', '.join(second.rows)}"
+        )
+    return found[0]
+
+
 def comparison_table(differences: list[Difference], first: str, second: str) -> Table:
-    """For people to read; `first` and `second` name the runs."""
-    columns = [Column("pairs"), Column("A", "Acc30 (%)"), Column("B", "Acc30 (%)"), Column("B - A", "Acc30 (%)"),
-               Column("p", "Acc30 (%)"), Column("A", "error (°)"), Column("B", "error (°)"),
-               Column("B less by, mean", "error (°)"), Column("p", "error (°)")]  # fmt: skip
+    """Tabulate differences; `first` and `second` name the runs."""
+    columns = [Column("pairs")]
+    for group, gain, test in (("Acc30 (%)", "B - A", "sign test"), ("error (°)", "mean of A - B", "permutation test")):
+        columns += [Column(title, group) for title in ("A", "B", gain, "p", f"p, {test}")]
     rows = []
     for one in differences:
-        cells = [Cell(one.n, decimals=0), *map(Cell, one.acc30), Cell(one.accuracy_gain),
-                 Cell(one.accuracy_p, decimals=4), *map(Cell, one.median), Cell(one.error_drop),
-                 Cell(one.error_p, decimals=4)]  # fmt: skip
+        cells = [Cell(one.n, decimals=0)]
+        for values, name, test in (
+            (one.acc30, "accuracy_gain", "sign_test_p"),
+            (one.median, "error_drop", "permutation_test_p"),
+        ):
+            cells += [*map(Cell, values), Cell(one.test[name], *one.test[f"{name}_ci"])]
+            cells += [Cell(one.test[p], p_value=True) for p in (f"{name}_p", test)]
         label = one.first if one.first == one.second else f"{one.first}:{one.second}"
         rows.append((label, tuple(cells)))
     note = (
-        "On the pairs that both have. Acc30: sign test over the pairs that only one of them solves; error: medians "
-        "over all pairs, and a permutation test of the mean difference. Of twenty rows that do not differ, one has "
-        "p < 0.05 by chance."
+        "On the pairs that both have; errors of A and B are medians. Intervals (95 %) and p: bootstrap over objects. "
+        "The sign test (pairs that only one of the two solves) and the permutation test (mean difference) take pairs "
+        "for independent; pairs share objects, so their p values are too small. Of twenty rows that do not differ, one "
+        "has p < 0.05 by chance."
     )
     return Table("compare", f"A = {first}, B = {second}", tuple(columns), tuple(rows), note)

@@ -159,6 +159,8 @@ def _text(cell: Cell | str | None) -> str:
         return _NOTHING
     if isinstance(cell, str):
         return cell
+    if cell.p_value:
+        return "< 0.001" if cell.value < 0.001 else f"{cell.value:.3f}"
     text = f"{cell.value:.{cell.decimals}f}"
     if cell.low is None or cell.high is None:
         return text

@@ -1,23 +1,36 @@
 """All that is made of a finished run: tables, figures, and the one file to keep."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from zsp_lite.benchmark.formats import write_tables
-from zsp_lite.benchmark.results import RESULTS, Results, read_results, write_results
+from zsp_lite.benchmark.results import RESULTS, Results, read_runs, write_results
 from zsp_lite.benchmark.tables import every_table
+from zsp_lite.errors import InputError
 
 
-def write_reports(run: str | Path, out: str | Path | None = None) -> Results:
-    """Tables, figures and `results.json.gz` of a run (its folder, or such a file), into `out` or its own folder.
+def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None = None) -> Results:
+    """Write tables and figures of a run, and its `results.json.gz`.
 
-    Raises InputError where it is no finished run.
+    Args:
+        run: A run's folder or its `results.json.gz`, or several to be pooled.
+        out: Folder to write to; by default where the run is. Pooled runs need one.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: If `run` is no finished run.
     """
     # matplotlib takes a second to import, which a benchmark with nothing to draw need not wait for.
     from zsp_lite.benchmark.figures import write_figures
 
-    results = read_results(run)
-    out = Path(out) if out is not None else Path(run) if Path(run).is_dir() else Path(run).parent
-    if Path(run).is_dir():
+    paths = [Path(run)] if isinstance(run, str | Path) else list(map(Path, run))
+    if out is None and len(paths) > 1:
+        raise InputError("pooled runs: no folder given to write their tables to")
+    results = read_runs(paths)
+    out = Path(out) if out is not None else paths[0] if paths[0].is_dir() else paths[0].parent
+    if len(paths) > 1 or paths[0].is_dir():
         write_results(results, out / RESULTS)
     write_tables(every_table(results.summary), out / "tables")
     write_figures(results, out / "figures")

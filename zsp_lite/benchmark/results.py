@@ -1,21 +1,25 @@
-"""A finished run to read again, from its folder or from one small file that can be kept, sent and committed."""
+"""Read finished runs again, from a folder or from one small file to commit, and pool several of them."""
 
 import gzip
 import json
+import logging
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from zsp_lite.benchmark.storage import PAIRS, SETTINGS, read_invocations, read_records
+from zsp_lite.benchmark.summary import INTERVALS, summarise_rows
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
+
+logger = logging.getLogger(__name__)
 
 RESULTS = "results.json.gz"
 # Beyond these decimals an error in degrees, or a length, says nothing.
 _DECIMALS = 4
-_KEPT = ("error", "translation_error", "scale", "view", "inliers", "confidence")
+_KEPT = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,8 @@ def read_results(path: str | Path) -> Results:
         for key, record in read_records(path / PAIRS, mend=False).items():
             for name, found in record["methods"].items():
                 if name in asked and record["category"] in categories:
-                    rows.setdefault(name, {})[key] = {part: found[part] for part in _KEPT if part in found}
-        return Results(summary, settings, read_invocations(path), rows)
+                    rows.setdefault(name, {})[key] = {part: found[part] for part in _KEPT if found.get(part, "") != ""}
+        return Results(_with_object_intervals(summary, rows), settings, read_invocations(path), rows)
     content = _decode(_inflate(read_bytes(path, "results"), path), path)
     try:
         keys = content["pairs"]
@@ -69,9 +73,77 @@ def read_results(path: str | Path) -> Results:
             }
             for name, row in content["rows"].items()
         }
-        return Results(content["summary"], content["settings"], content["invocations"], rows)
+        return Results(
+            _with_object_intervals(content["summary"], rows), content["settings"], content["invocations"], rows
+        )
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(f"results {path}: not a run's results ({error})") from error
+
+
+def read_runs(paths: Sequence[str | Path]) -> Results:
+    """Read one run, or several to be pooled (see `pool`)."""
+    runs = [read_results(path) for path in paths]
+    return runs[0] if len(runs) == 1 else pool(runs)
+
+
+def pool(runs: Sequence[Results]) -> Results:
+    """Pool runs of one benchmark on different objects, such as exports with different seeds, into one.
+
+    Rows that not all of the runs have are left out. Sequences of one category and name are one object.
+
+    Returns:
+        All pairs of the runs, summarised together. The summary has no timings.
+
+    Raises:
+        InputError: If the runs have no row in common, share a pair, or differ in the backbone, the number of target
+            views or a row's settings.
+    """
+    names = [name for name in runs[0].rows if all(name in run.rows for run in runs)]
+    if not names:
+        raise InputError(f"runs to pool have no row in common: {'; '.join(', '.join(run.rows) for run in runs)}")
+    if missing := sorted({name for run in runs for name in run.rows} - set(names)):
+        logger.warning("not in all runs, left out: %s", ", ".join(missing))
+    for what in ("backbone", "targets", *(("methods", name) for name in names)):
+        found = {str(_setting(run, what)) for run in runs}
+        if len(found) > 1:
+            label = what if isinstance(what, str) else f"row {what[1]}"
+            raise InputError(f"runs to pool differ in {label}: {', '.join(sorted(found))}")
+    rows: dict[str, dict[str, dict]] = {}
+    for name in names:
+        rows[name] = {key: found for run in runs for key, found in run.rows[name].items()}
+        if (total := sum(len(run.rows[name]) for run in runs)) > len(rows[name]):
+            raise InputError(
+                f"runs to pool share {total - len(rows[name])} pairs of row {name}, expected other objects"
+            )
+    categories = list(dict.fromkeys(category for run in runs for category in run.summary["data"]["categories"]))
+    data = {
+        "root": ", ".join(str(run.summary["data"]["root"]) for run in runs),
+        "categories": categories,
+        "pairs": sum(run.summary["data"]["pairs"] for run in runs),
+        "targets": runs[0].summary["data"]["targets"],
+        "runs": len(runs),
+    }
+    summary = {"data": data, "backbone": runs[0].summary["backbone"], **summarise_rows(rows)}
+    for name, row in summary["methods"].items():
+        row |= {part: sum(run.summary["methods"][name][part] for run in runs) for part in ("failed", "flagged")}
+    return Results(summary, runs[0].settings, [one for run in runs for one in run.invocations], rows)
+
+
+def _setting(run: Results, what: str | tuple[str, str]) -> Any:
+    if isinstance(what, str):
+        return run.settings.get(what)
+    group, name = what
+    return run.settings.get(group, {}).get(name)
+
+
+def _with_object_intervals(summary: Mapping[str, Any], rows: Mapping[str, Mapping[str, dict]]) -> dict[str, Any]:
+    """The summary; one of an earlier version, which took pairs for independent, with its intervals computed again."""
+    if summary.get("intervals") == INTERVALS or not summary.get("methods"):
+        return dict(summary)
+    fresh = summarise_rows({name: rows[name] for name in summary["methods"]})
+    for name, row in fresh["methods"].items():  # earlier versions did not keep these by pair
+        row |= {part: summary["methods"][name][part] for part in ("failed", "flagged")}
+    return {**summary, **fresh}
 
 
 def write_results(results: Results, path: str | Path) -> Path:

@@ -1,70 +1,121 @@
-"""What a run's records say: the figures of every row, over all pairs and by category (paper sec. 5.1)."""
+"""Figures of a run: every row over all pairs and by category (paper sec. 5.1), with intervals over objects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from zsp_lite.data.pairs import Pair
-from zsp_lite.metrics import median, paired_test, summarise
+from zsp_lite.metrics import (
+    mean_category_median,
+    median,
+    object_weights,
+    paired_difference,
+    sign_test,
+    summarise,
+)
 
-_RESAMPLES = 2000
+# What the intervals of a summary are of; summaries of earlier versions have no such member, or another one.
+INTERVALS = {"level": 0.95, "resampled": "objects"}
 
 
 def summarise_run(
     records: Mapping[str, dict], pairs: Mapping[str, Sequence[Pair]], data: Mapping[str, Any], backbone: str
 ) -> dict:
-    """The summary of finished pairs: figures per row and category, saliency, and median seconds per stage.
+    """Summarise finished pairs: figures per row and category, saliency, and median seconds per stage.
 
-    records: by the pairs' keys.  pairs: those of each row, in one order for all rows of as many target views.
-    "median", "acc30" and "acc15" are over all pairs; "mean_category_median" is the paper's way of averaging
-    medians. "against_ours": paired tests of "ours" against each other row. "saliency_iou": mean over the frames used.
-    "cost": seconds of the whole run, and what "ours" by itself would have taken.
+    Args:
+        records: By the pairs' keys.
+        pairs: The pairs of each row, in one order for all rows of as many target views.
+        data: What the run was of.
+        backbone: Its name.
+
+    Returns:
+        {"methods": see `summarise_rows`, "against_ours": see `against_ours`, "saliency_iou": mean over the frames used,
+        "timings": median seconds, "cost": seconds of the whole run, and of "ours" by itself}.
     """
-    results = {name: [records[pair.key]["methods"][name] for pair in found] for name, found in pairs.items()}
-    errors = {name: np.array([one["error"] for one in found]) for name, found in results.items()}
-    rows = {}
-    for name, found in results.items():
-        category_of = np.array([pair.category for pair in pairs[name]])
-        categories = list(dict.fromkeys(category_of.tolist()))
-        grouped = [errors[name][category_of == category] for category in categories]
-        per_category = {category: summarise(group) for category, group in zip(categories, grouped)}
-        rows[name] = summarise(errors[name]) | {
-            "mean_category_median": float(np.mean([row["median"] for row in per_category.values()])),
-            "mean_category_median_ci": _mean_of_medians_ci(grouped),
-            "failed": sum("failed" in one for one in found),
-            "flagged": sum(one.get("note", "") != "" for one in found),
-            "per_category": per_category,
-        }
+    results = {name: {pair.key: records[pair.key]["methods"][name] for pair in found} for name, found in pairs.items()}
     used = [records[pair.key] for pair in dict.fromkeys(pair for found in pairs.values() for pair in found)]
-    summary = {"data": dict(data), "backbone": backbone, "methods": rows, "saliency_iou": _saliency(used)}
-    summary["timings"] = _timings(used, next(iter(results.values())))
-    if "ours" in errors:
-        ours = pairs["ours"]
-        summary["against_ours"] = {
-            name: paired_test(found, errors["ours"])
-            for name, found in errors.items()
-            if name != "ours" and same_problems(pairs[name], ours)
-        }
+    summary = {"data": dict(data), "backbone": backbone, **summarise_rows(results), "saliency_iou": _saliency(used)}
+    summary["timings"] = _timings(used, list(next(iter(results.values())).values()))
     if cost := _cost(records, used, pairs):
         summary["cost"] = cost
     return summary
 
 
-def same_problems(first: Sequence[Pair], second: Sequence[Pair]) -> bool:
-    """Whether two lists of pairs ask for the same poses in the same order, if from different numbers of views."""
-    return [_question(pair) for pair in first] == [_question(pair) for pair in second]
+def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    """Summarise the errors of rows.
+
+    Args:
+        rows: By row and pair key, {"error": degrees, "failed": present where the row failed, "note": not "" where the
+            method flagged its estimate}.
+
+    Returns:
+        {"methods": by row, over all pairs and "per_category", the figures of `metrics.summarise`, and
+        "mean_category_median": the paper's way of averaging medians; "against_ours": every other row that has the same
+        problems in the same order against "ours", see `metrics.paired_difference`; "intervals": what they are of}.
+        Intervals and p values come from resampled objects, except for "sign_test_p".
+    """
+    rows = {name: _ordered(row) for name, row in rows.items()}
+    weights: dict[tuple, np.ndarray] = {}
+    methods, errors = {}, {}
+    for name, row in rows.items():
+        errors[name] = np.array([one["error"] for one in row.values()])
+        objects = tuple(map(objects_of, row))
+        if objects not in weights:
+            weights[objects] = weights_of_pairs(row)
+        drawn, categories = weights[objects], np.array([category_of(key) for key in row])
+        average, interval = mean_category_median(errors[name], categories, drawn)
+        methods[name] = summarise(errors[name], drawn) | {
+            "mean_category_median": average,
+            "mean_category_median_ci": list(interval),
+            "failed": sum("failed" in one for one in row.values()),
+            "flagged": sum(one.get("note", "") != "" for one in row.values()),
+            "per_category": {
+                category: summarise(errors[name][members], drawn[:, members])
+                for category in dict.fromkeys(categories.tolist())
+                for members in [categories == category]
+            },
+        }
+    summary: dict[str, Any] = {"methods": methods, "intervals": dict(INTERVALS)}
+    if "ours" in rows:
+        problems, drawn = list(map(_problem, rows["ours"])), weights_of_pairs(rows["ours"])
+        summary["against_ours"] = {
+            name: paired_difference(found, errors["ours"], weights=drawn)
+            | {"sign_test_p": sign_test(found < 30, errors["ours"] < 30)}
+            for name, found in errors.items()
+            if name != "ours" and list(map(_problem, rows[name])) == problems
+        }
+    return summary
 
 
-def _question(pair: Pair) -> tuple:
-    return pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
+def category_of(key: str) -> str:
+    """The category that a pair's key names."""
+    return key.split("/")[0]
 
 
-def _mean_of_medians_ci(groups: Sequence[np.ndarray]) -> list[float]:
-    """95 % bootstrap interval of the categories' mean median; pairs are drawn anew within each category."""
-    rng = np.random.default_rng(0)
-    drawn = [median(group[rng.integers(len(group), size=(_RESAMPLES, len(group)))]) for group in groups]
-    return [float(bound) for bound in np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])]
+def objects_of(key: str) -> tuple[str, str]:
+    """The two objects, CATEGORY/SEQUENCE of the reference and of the target, that a pair's key names."""
+    category, reference, target = key.split("/")
+    return f"{category}/{reference.rpartition(':')[0]}", f"{category}/{target.rpartition(':')[0]}"
+
+
+def weights_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
+    """Bootstrap weights of the pairs with these keys, from resampled objects."""
+    keys = list(keys)
+    return object_weights([objects_of(key) for key in keys], [category_of(key) for key in keys])
+
+
+def _ordered(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row's pairs by category and problem, the same order for all numbers of target views."""
+    categories = list(dict.fromkeys(map(category_of, row)))
+    return dict(sorted(row.items(), key=lambda item: (categories.index(category_of(item[0])), _problem(item[0]))))
+
+
+def _problem(key: str) -> str:
+    """A pair's key without its target frames."""
+    return key.rpartition(":")[0]
 
 
 def _saliency(records: Sequence[dict]) -> dict[str, float]:

@@ -15,7 +15,7 @@ from zsp_lite.errors import InputError
 THIS_RUN = "this run"
 OTHER_DATA = "published on CO3D (other data)"
 NOTE = (
-    "Med. err.: mean of the categories' medians. Intervals: 95 %, bootstrap over pairs. Published figures are the "
+    "Med. err.: mean of the categories' medians. Intervals: 95 %, bootstrap over objects. Published figures are the "
     "paper's, on CO3D with DINO ViT-S/8: other data, and another backbone unless the run says otherwise."
 )
 _TITLES = {"med": "Med. err. (°)", "acc30": "Acc30 (%)", "acc15": "Acc15 (%)"}
@@ -33,6 +33,7 @@ class Cell:
     low: float | None = None
     high: float | None = None
     decimals: int = 1
+    p_value: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,17 +129,23 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def all_rows(summary: Mapping[str, Any]) -> Table:
     """Every row of the run: its figures, and how many of its answers say themselves that they are not to be trusted."""
-    columns = ("pairs", "Med. err. (°)", "Acc30 (%)", "Acc15 (%)", "above 150° (%)", "flagged", "failed", "p (Acc30)")
+    columns = (
+        "pairs", "Med. err. (°)", "Acc30 (%)", "Acc15 (%)", "above 150° (%)", "flagged", "failed", "ours - row (%)",
+        "p", "p, sign test",
+    )  # fmt: skip
     rows = []
     for name, row in summary["methods"].items():
         test = summary.get("against_ours", {}).get(name)
         cells = [Cell(row["n"], decimals=0), *(_figure(row, figure) for figure in _FIGURES), Cell(row["above150"]),
                  Cell(row["flagged"], decimals=0), Cell(row["failed"], decimals=0),
-                 None if test is None else Cell(test["accuracy_p"], decimals=3)]  # fmt: skip
+                 None if test is None else Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]),
+                 None if test is None else Cell(test["accuracy_gain_p"], p_value=True),
+                 None if test is None else Cell(test["sign_test_p"], p_value=True)]  # fmt: skip
         rows.append((name, tuple(cells)))
     note = (
-        "Med. err.: mean of the categories' medians. flagged: the method itself warned; its answer counts as it is. "
-        'p: sign test of Acc30 against "ours" on the same pairs. Intervals: 95 %, bootstrap over pairs.'
+        "Med. err.: mean of the categories' medians. flagged: estimates that the method itself warns about; they count "
+        'as they are. ours - row: difference in Acc30 to "ours" on the same pairs. Intervals (95 %) and p: bootstrap '
+        "over objects. The sign test takes pairs for independent; pairs share objects, so its p values are too small."
     )
     return Table("all_rows", "All rows", tuple(map(Column, columns)), tuple(rows), note)
 

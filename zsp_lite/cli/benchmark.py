@@ -138,42 +138,50 @@ def _list_methods() -> None:
 @click.command(
     epilog=examples(
         "tables outputs/benchmark",
+        "tables outputs/seed0 outputs/seed1 outputs/seed2",
         "tables results.json.gz --out outputs/tables",
         "tables notebooks/results/paper_run/results.json.gz --into docs/results.md",
     )
 )
-@click.argument("source", type=PATH)
-@click.option("--out", type=PATH, metavar="DIR", show_default="the run's folder", help="Folder to write.")
+@click.argument("sources", type=PATH, nargs=-1, required=True, metavar="RUN...")
+@click.option(
+    "--out", type=PATH, metavar="DIR", show_default="the run's folder; none for several runs", help="Folder to write."
+)
 @click.option(
     "--by-category", type=names, metavar="ROW,...", show_default=f"the first {_ROWS_SHOWN}",
     help="Rows of the table by category in the terminal; the files have all.",
 )  # fmt: skip
 @click.option("--into", type=PATH, metavar="FILE", help="Only update the marked tables of this Markdown file.")
-def tables(source: Path, out: Path | None, by_category: list[str] | None, into: Path | None) -> None:
-    """Write tables and figures of a finished benchmark run: SOURCE is its folder or its results.json.gz."""
+def tables(sources: tuple[Path, ...], out: Path | None, by_category: list[str] | None, into: Path | None) -> None:
+    """Write tables and figures of a benchmark run, or of several runs on different objects, pooled.
+
+    RUN is a run's folder or its results.json.gz.
+    """
     if into:
         if out:
             raise InputError("tables: --into writes no folder; expected it without --out")
-        return _update_document(source, into)
+        return _update_document(sources, into)
     import matplotlib
 
     matplotlib.use("Agg")
     from zsp_lite.benchmark import tables as build
     from zsp_lite.benchmark.formats import print_tables
     from zsp_lite.benchmark.reports import write_reports
+    from zsp_lite.benchmark.results import read_runs
 
-    summary = write_reports(source, out).summary
+    write = len(sources) == 1 or out
+    summary = (write_reports(sources, out) if write else read_runs(sources)).summary
     rows = by_category or list(summary["methods"])[:_ROWS_SHOWN]
     print_tables([build.all_rows(summary), *build.paper_tables(summary), build.by_category(summary, rows)])
     return None
 
 
-def _update_document(source: Path, document: Path) -> None:
+def _update_document(sources: tuple[Path, ...], document: Path) -> None:
     from zsp_lite.benchmark.document import update_document
-    from zsp_lite.benchmark.results import read_results
+    from zsp_lite.benchmark.results import read_runs
     from zsp_lite.benchmark.tables import every_table
 
-    summary = read_results(source).summary
+    summary = read_runs(sources).summary
     update_document(document, every_table(summary), max(row["n"] for row in summary["methods"].values()))
     print(f"Written: {document}")
 
@@ -192,22 +200,17 @@ def _update_document(source: Path, document: Path) -> None:
 )  # fmt: skip
 @click.option("--out", type=PATH, metavar="DIR", help="Folder to write the table to.")
 def compare(first: Path, second: Path, rows: list[str] | None, out: Path | None) -> None:
-    """Compare two benchmark runs on their common pairs, with tests of significance.
+    """Compare two benchmark runs on their common pairs, with intervals over objects and tests of significance.
 
     RUN_A and RUN_B are folders of runs or files results.json.gz.
     """
     from zsp_lite.benchmark.compare import compare as compare_runs
-    from zsp_lite.benchmark.compare import comparison_table
+    from zsp_lite.benchmark.compare import comparison_table, split_rows
     from zsp_lite.benchmark.formats import print_tables, write_tables
     from zsp_lite.benchmark.results import read_results
 
-    chosen = None
-    if rows:
-        split = [name.split(":") for name in rows]
-        if any(len(parts) > 2 or not all(parts) for parts in split):
-            raise InputError(f"--rows is {','.join(rows)}, expected A:B or A, separated by commas")
-        chosen = [(parts[0], parts[-1]) for parts in split]
-    found = compare_runs(read_results(first), read_results(second), chosen)
+    runs = read_results(first), read_results(second)
+    found = compare_runs(*runs, [split_rows(text, *runs) for text in rows] if rows else None)
     table = comparison_table(found, str(first), str(second))
     print_tables([table])
     if out:
