@@ -1,4 +1,4 @@
-"""The procedural world: exports read like CO3D; labels, cameras and depth agree with the geometry."""
+"""Synthetic data: exports read like CO3D; labels, cameras and depth agree with the geometry."""
 
 import inspect
 import itertools
@@ -54,7 +54,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def chairs():
-    """Two chairs as CO3D would hold them, each with its exact twin."""
+    """Two chairs with simulated sensor errors, each with its exact rendering."""
     return [make_sequence("chair", index, FRAMES, SEED, SIZE) for index in range(2)]
 
 
@@ -66,13 +66,13 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def code_of(module: types.ModuleType) -> dict[str, types.CodeType]:
-    """Code of every function of the module's side: its own, and those of its siblings that it imports."""
-    side = module.__name__.split(".")[-1].split("_")[0]  # the split's name
+    """Code of every function of a split: those of its main module and of the modules that it imports."""
+    split = module.__name__.split(".")[-1].split("_")[0]
     found, queue = {}, [module]
     while queue:
         here = queue.pop()
         for function in vars(here).values():
-            if inspect.isfunction(function) and function.__module__.split(".")[-1].startswith(side):
+            if inspect.isfunction(function) and function.__module__.split(".")[-1].startswith(split):
                 function = inspect.unwrap(function)
                 if f"{function.__module__}.{function.__name__}" not in found:
                     found[f"{function.__module__}.{function.__name__}"] = function.__code__
@@ -80,7 +80,7 @@ def code_of(module: types.ModuleType) -> dict[str, types.CodeType]:
     return found
 
 
-def test_evaluation_names_are_the_papers():
+def test_evaluation_categories_have_the_names_of_the_paper():
     assert set(EVALUATION) == PAPER_CATEGORIES
     assert len(TRAINING) >= 12
 
@@ -104,7 +104,7 @@ def test_no_two_splits_share_code(one, other):
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_no_split_borrows_from_another(split):
+def test_no_split_imports_from_another(split):
     assert MODULES.keys() == SPLITS.keys()
     modules = {name.rpartition(".")[0] for name in code_of(MODULES[split])}
     homes = {getattr(thing, "__module__", "") for name in modules for thing in vars(sys.modules[name]).values()}
@@ -112,7 +112,7 @@ def test_no_split_borrows_from_another(split):
     assert not [home for home in homes if home and home.startswith(others)]
 
 
-def test_a_split_can_be_made_by_its_name(tmp_path):
+def test_the_name_of_a_split_stands_for_its_categories(tmp_path):
     main(["synth", "--category", "validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
     made = Co3D(tmp_path)
     assert sorted(made.categories()) == sorted(VALIDATION)
@@ -132,7 +132,7 @@ def test_objects_of_a_category_are_unit_sized_and_vary(category):
 
 @pytest.mark.parametrize("category", sorted(GENERATORS))
 def test_front_and_back_of_an_object_differ(category):
-    """Turned by half a turn about z, no object coincides with itself, or its pose would have two answers."""
+    """No object coincides with itself after half a turn about z, otherwise its pose would be ambiguous."""
     shape = make_shape(GENERATORS[category], 3)
     turned = shape.vertices * [-1, -1, 1]
     nearest = np.linalg.norm(shape.vertices[:, None] - turned[None, ::3], axis=-1).min(0)
@@ -142,7 +142,7 @@ def test_front_and_back_of_an_object_differ(category):
 # Sequences
 
 
-def test_the_object_is_never_cut_and_fills_the_picture():
+def test_the_object_is_inside_the_image_and_fills_it():
     size = (120, 160)
     extents = []
     for seed in range(8):
@@ -155,7 +155,7 @@ def test_the_object_is_never_cut_and_fills_the_picture():
     assert 0.5 < np.median(extents) < 0.8
 
 
-def test_the_sweep_goes_once_around_between_10_and_35_degrees():
+def test_the_camera_moves_once_around_at_10_to_35_degrees_of_elevation():
     vertices = make_shape(EVALUATION["car"], 0).vertices
     cameras = handheld_sweep(vertices, 1, 40, (100, 100))
     x, y, z = np.transpose([camera.centre - (vertices.max(0) + vertices.min(0)) / 2 for camera in cameras])
@@ -175,12 +175,12 @@ def test_canonical_coordinates_project_onto_their_own_pixels_and_depth(chairs):
             np.testing.assert_allclose(depth, view.depth[row, col], rtol=1e-4)
 
 
-def test_the_world_is_the_first_cameras_frame(chairs):
+def test_the_world_is_the_frame_of_the_first_camera(chairs):
     for data, _ in chairs:
         np.testing.assert_allclose(data.frames[0].camera.matrix, np.eye(4), atol=1e-12)
 
 
-def test_a_change_of_unit_scales_lengths_and_moves_no_pixel(chairs):
+def test_a_change_of_unit_scales_lengths_and_keeps_pixels(chairs):
     exact = chairs[0][1]
     larger = rescaled(exact, 3.0)
     point = np.array([0.3, -0.2, 0.1])
@@ -193,21 +193,21 @@ def test_a_change_of_unit_scales_lengths_and_moves_no_pixel(chairs):
 # Sensor
 
 
-def test_a_third_to_a_half_of_the_depth_is_unknown_in_patches():
-    unknown, on_object, lonely = [], [], []
+def test_a_third_to_a_half_of_the_depth_is_missing_in_connected_regions():
+    unknown, on_object, isolated = [], [], []
     for index, category in enumerate(sorted(EVALUATION)):
         data, exact = make_sequence(category, index, 2, SEED, SIZE)
         for frame, view in zip(data.frames, exact.views, strict=True):
             hole = frame.depth == 0
             unknown.append(hole.mean())
             on_object.append(hole[view.mask].mean())
-            lonely.append((hole[:, 1:-1] & ~hole[:, :-2] & ~hole[:, 2:]).sum() / hole.sum())
+            isolated.append((hole[:, 1:-1] & ~hole[:, :-2] & ~hole[:, 2:]).sum() / hole.sum())
     assert 0.3 < np.mean(on_object) < 0.5
     assert 0.35 < np.mean(unknown) < 0.6
-    assert np.mean(lonely) < 0.1
+    assert np.mean(isolated) < 0.1
 
 
-def test_known_depth_is_right_to_about_half_a_percent(chairs):
+def test_measured_depth_is_accurate_to_about_half_a_percent(chairs):
     for data, exact in chairs:
         error = []
         for frame, view in zip(data.frames, exact.views, strict=True):
@@ -216,7 +216,7 @@ def test_known_depth_is_right_to_about_half_a_percent(chairs):
         assert 0.003 < np.concatenate(error).std() < 0.008
 
 
-def test_masks_are_soft_and_right_to_two_pixels(chairs):
+def test_masks_are_soft_and_accurate_to_two_pixels(chairs):
     truth = np.zeros((80, 80), bool)
     truth[20:60, 20:60] = True
     mask = soft_mask(truth, 0)
@@ -243,7 +243,7 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
 # Export
 
 
-def test_the_reader_reads_what_is_exported(folder, chairs):
+def test_an_export_reads_back(folder, chairs):
     dataset = Co3D(folder)
     assert dataset.categories() == ["chair", "toytruck"]
     for category in dataset.categories():
@@ -264,7 +264,7 @@ def test_the_reader_reads_what_is_exported(folder, chairs):
 
 
 def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
-    """Ground truth from labels and cameras against a fit to the objects' own coordinates."""
+    """Ground truth from labels and cameras equals a fit to the canonical coordinates."""
     labels = read_labels(folder, "chair")
     (data_a, exact_a), (data_b, exact_b) = chairs
     view_a, view_b = exact_a.views[2], exact_b.views[4]
@@ -277,12 +277,12 @@ def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
 
     a, b = canonical_to_camera(view_a, view_a.depth), canonical_to_camera(view_b, view_b.depth)
     np.testing.assert_allclose(truth[:3, :3], np.asarray(b.R) @ np.asarray(a.R).T, atol=1e-3)
-    # The object's origin, the same point of both, goes where it belongs.
+    # The origin of the canonical frame is the same point of both objects.
     np.testing.assert_allclose(truth[:3, :3] @ np.asarray(a.t) + truth[:3, 3], np.asarray(b.t), atol=1e-2)
     assert np.array_equal(labels[data_a.name].trans, np.eye(4))
 
 
-def test_evaluation_pairs_in_the_upstream_form_read_back(folder):
+def test_evaluation_pairs_in_the_published_format_read_back(folder):
     preset = Preset(("chair", "toytruck"), 2, FRAMES, SIZE, pairs=4, targets=(1, 3))
     write_pairs(preset, folder, SEED)
     for category in preset.categories:
@@ -291,8 +291,8 @@ def test_evaluation_pairs_in_the_upstream_form_read_back(folder):
             assert len(pairs) == 4 and {len(pair.target_frames) for pair in pairs} == {n_targets}
 
 
-def test_a_sequence_depends_on_its_own_name_alone(folder, tmp_path):
-    """One category by itself, begun with one sequence, then completed, gives the very bytes of the whole."""
+def test_a_sequence_does_not_depend_on_the_rest_of_the_export(folder, tmp_path):
+    """An export of one category in two steps has the same bytes as in a full export."""
     export_categories(["toytruck"], tmp_path, 1, FRAMES, SEED, SIZE)
     export_categories(["toytruck"], tmp_path, 2, FRAMES, SEED, SIZE)
     whole = {name: data for name, data in files(folder).items() if "toytruck" in name and "determ_eval" not in name}
@@ -307,14 +307,14 @@ def test_complete_sequences_are_not_rendered_again(folder, monkeypatch):
     assert files(folder) == before
 
 
-def test_an_interrupted_export_is_taken_up(tmp_path, monkeypatch):
-    def breaks_at_the_second(category, index, *rest):
+def test_an_interrupted_export_is_completed(tmp_path, monkeypatch):
+    def interrupt_second(category, index, *rest):
         if index == 1:
             raise KeyboardInterrupt
         return make_sequence(category, index, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(export, "make_sequence", breaks_at_the_second)
+        patch.setattr(export, "make_sequence", interrupt_second)
         with pytest.raises(KeyboardInterrupt):
             export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
     export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
@@ -322,7 +322,7 @@ def test_an_interrupted_export_is_taken_up(tmp_path, monkeypatch):
     assert files(tmp_path / "a") == files(tmp_path / "b")
 
 
-def test_the_v2_layout_holds_the_same_cameras(tmp_path, chairs):
+def test_the_v2_layout_has_the_same_cameras(tmp_path, chairs):
     export_categories(["chair"], tmp_path, 1, FRAMES, SEED, SIZE, layout="v2")
     dataset = Co3D(tmp_path)
     annotations = dataset.frames("chair", chairs[0][0].name)
@@ -331,7 +331,7 @@ def test_the_v2_layout_holds_the_same_cameras(tmp_path, chairs):
         np.testing.assert_allclose(dataset.load(annotation).camera.K, frame.camera.K)
 
 
-def test_training_categories_can_be_exported_too(tmp_path):
+def test_training_categories_can_be_exported(tmp_path):
     export_categories(["teapot"], tmp_path, 1, 2, 0, 48)
     assert Co3D(tmp_path).categories() == ["teapot"]
 
@@ -343,7 +343,7 @@ def test_sequence_names_are_digits_in_the_order_of_the_indices():
     assert names[0] != sequence_name(1, "car", 0)
 
 
-def test_presets_are_of_evaluation_categories():
+def test_presets_consist_of_evaluation_categories():
     for preset in PRESETS.values():
         assert set(preset.categories) <= set(EVALUATION)
         assert all(getattr(preset, field.name) for field in fields(preset))
@@ -360,32 +360,32 @@ def test_presets_are_of_evaluation_categories():
         ((["chair"], 1, 1, 0, 64, "v3"), "v3"),
     ],
 )
-def test_bad_requests_are_refused(tmp_path, arguments, named):
+def test_bad_arguments_are_input_errors(tmp_path, arguments, named):
     categories, *rest = arguments
     with pytest.raises(InputError, match=named):
         export_categories(categories, tmp_path, *rest)
 
 
-def test_a_folder_made_with_other_settings_is_refused(folder):
-    with pytest.raises(InputError, match="was made with"):
+def test_a_folder_with_other_settings_is_an_input_error(folder):
+    with pytest.raises(InputError, match="was written with"):
         export_categories(["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
 
 
 @pytest.mark.parametrize("name", ["synthetic.json", "chair/object_poses.json"])
-def test_a_damaged_export_is_refused_by_the_name_of_its_file(tmp_path, name):
+def test_a_damaged_export_is_an_input_error_with_the_name_of_the_file(tmp_path, name):
     (tmp_path / "chair").mkdir()
     (tmp_path / name).write_text('{"seed": ')
     with pytest.raises(InputError, match=name):
         export_categories(["chair"], tmp_path, 1, 2, SEED, 48)
 
 
-def test_an_unknown_preset_is_refused(tmp_path):
+def test_an_unknown_preset_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="imagenet"):
         export.export_preset("imagenet", tmp_path, 0)
 
 
-def test_the_shipped_samples_are_what_the_preset_makes():
-    """Two sequences of data_samples, made again, picture by picture; the frames hold wall, floor and shadows."""
+def test_the_preset_reproduces_the_shipped_samples():
+    """Rendered again, two sequences of data_samples have the same pictures, with wall, floor and shadows."""
     preset, dataset = export.PRESETS["samples"], Co3D(sample_data())
     for category, index in (("teddybear", 2), ("toytruck", 2)):
         data, _ = export.make_sequence(category, index, preset.frames, 0, preset.image_size)
@@ -393,6 +393,6 @@ def test_the_shipped_samples_are_what_the_preset_makes():
         for made, found in zip(data.frames, shipped, strict=True):
             jpeg = cv2.imencode(".jpg", made.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, export.JPEG_QUALITY])[1]
             pixels = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1]
-            # One grey level: what another processor's instructions may round otherwise.
+            # Another processor may round differently by one grey level.
             assert np.abs(pixels.astype(int) - found.rgb).max() <= 1
             assert np.mean((made.depth > 0) == (found.depth > 0)) > 0.999

@@ -18,7 +18,7 @@ from zsp_lite.backbones.load import TINY as SHIPPED
 from zsp_lite.cli import main as cli
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
-from zsp_lite.synthetic.assembly import make_shape, make_sibling
+from zsp_lite.synthetic.assembly import make_shape, make_variant
 from zsp_lite.synthetic.render import orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 from zsp_lite.training.batches import MEAN, STD, _crop_grids, sample_batch
@@ -222,11 +222,11 @@ def test_siblings_keep_the_build_and_change_the_proportions():
     builds = [(generator, 5) for generator in TRAINING.values()] + [(random_assembly, seed) for seed in range(30)]
     for generator, seed in builds:
         first = make_shape(generator, seed)
-        other = make_sibling(generator, seed, np.random.default_rng(1))
+        other = make_variant(generator, seed, np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
         np.testing.assert_array_equal(first.part, other.part)
         assert np.abs(first.vertices - other.vertices).max() > 0.02
-    same = make_sibling(generator, seed, np.random.default_rng(1), amount=0.0)
+    same = make_variant(generator, seed, np.random.default_rng(1), amount=0.0)
     np.testing.assert_allclose(same.vertices, first.vertices)
 
 

@@ -15,7 +15,7 @@ import torch
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarity
-from zsp_lite.synthetic.truth import hits
+from zsp_lite.synthetic.ground_truth import correct_matches
 
 pytest.importorskip("ipywidgets", reason="widgets need ipywidgets: pip install 'zsp-lite[notebooks]'")
 matplotlib.use("agg")
@@ -126,7 +126,7 @@ def test_facets_report_the_share_of_right_neighbours(truth):
     keys = load_backbone("zsp-tiny", "cpu", facet="token")([truth.reference.rgb, truth.target.rgb])
     nearest = similarity(*(one.keys for one in keys)).argmax(1).numpy()
     cells = np.stack(np.divmod(nearest, 28), -1).reshape(28, 28, 2)
-    share = hits(cells, truth.partners)[truth.found].mean()
+    share = correct_matches(cells, truth.cells)[truth.valid].mean()
     assert f"{share:.0%} have" in widget.sentence.value
 
 
@@ -134,7 +134,7 @@ def test_context_follows_both_sliders(truth):
     widget = build("context")
     assert picture_changes(widget, "row", 5) and picture_changes(widget, "col", 3)
     row_col = (5, 3)
-    assert ("not in sight" in widget.sentence.value) == (not truth.found[row_col])
+    assert ("not in sight" in widget.sentence.value) == (not truth.valid[row_col])
 
 
 def test_saliency_counts_the_patches_above_the_threshold():

@@ -8,7 +8,7 @@ import pytest
 
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import cyclical_distances, match, similarity
-from zsp_lite.synthetic.truth import hits
+from zsp_lite.synthetic.ground_truth import correct_matches
 
 pytest.importorskip("ipywidgets", reason="widgets need ipywidgets: pip install 'zsp-lite[notebooks]'")
 matplotlib.use("agg")
@@ -55,15 +55,15 @@ def test_the_cycle_starts_at_a_patch_of_the_object_that_returns_a_picture(views,
 @pytest.mark.parametrize("way", ["cyclical", *MATCHERS])
 def test_matches_are_counted_against_the_truth(views, sim, way):
     truth = common.example_truth()
-    widget = matching.matches(*views, sim, truth.partners, truth.found)
+    widget = matching.matches(*views, sim, truth.cells, truth.valid)
     widget.controls["way"].value, widget.controls["k"].value, widget.controls["kmeans"].value = way, 20, False
     expected = match(views[0].features, views[1].features, 20, False, sim=sim, matcher=way)
     at = tuple(expected.reference.T)
-    right = (hits(expected.target, truth.partners[at]) & truth.found[at]).sum()
+    right = (correct_matches(expected.target, truth.cells[at]) & truth.valid[at]).sum()
     said = widget.sentence.value
     assert (
         said.startswith(f"{way}: {len(expected)} matches, {right} right")
-        and f"{(~truth.found[at]).sum()} without" in said
+        and f"{(~truth.valid[at]).sum()} without" in said
     )
 
 

@@ -1,4 +1,4 @@
-"""A procedural world: objects composed of primitives, rendered on the CPU, written like CO3D.
+"""Synthetic data: procedural objects from primitives, rendered on the CPU, exported in CO3D's layout.
 
-Frame of every category: z up, the front looks along +x, the left side lies at +y.
+Object coordinates of every category: front +x, left +y, up +z.
 """

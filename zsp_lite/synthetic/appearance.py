@@ -1,16 +1,21 @@
-"""What one instance looks like: colours and textures of its materials, its light, the room behind it."""
+"""Random appearance of a rendering: materials with textures, light, background and sensor noise."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from zsp_lite.synthetic.assembly import N_MATERIALS
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Colours in [0, 1]; textures are sine patterns over canonical coordinates; `light` points to the lamp."""
+    """Appearance of one rendering, with `m` materials.
+
+    Colours are RGB in [0, 1]. A texture mixes the two colours of a material by a sine pattern over the canonical
+    coordinates. `light` is the unit vector towards the light source. The background consists of a ground plane and
+    a wall, each with two colours. `noise` is the standard deviation of the pixel noise, `gain` a factor per channel.
+    """
 
     colour: Float[np.ndarray, "m 3"]
     second_colour: Float[np.ndarray, "m 3"]
@@ -33,14 +38,14 @@ class Appearance:
 
 
 def _colour(rng: np.random.Generator) -> np.ndarray:
-    """A random colour, by hue, saturation and value."""
+    """Draw an RGB colour (3,) in [0, 1] by hue, saturation and value."""
     hue, saturation, value = rng.random(), rng.beta(1.2, 2.0), rng.uniform(0.25, 1)
     k = (np.array([5, 3, 1]) + hue * 6) % 6
     return value - value * saturation * np.clip(np.minimum(k, 4 - k), 0, 1)
 
 
 def random_appearance(seed: int | np.random.Generator) -> Appearance:
-    """Draw an appearance; materials, light and room are independent of the object's category and shape."""
+    """Draw an appearance, independent of the category and the shape of the object."""
     rng = np.random.default_rng(seed)
     n = N_MATERIALS
     ground, wall = _colour(rng), _colour(rng)
@@ -67,17 +72,21 @@ def random_appearance(seed: int | np.random.Generator) -> Appearance:
     )
 
 
-def surface_albedo(look: Appearance, canonical: Float[np.ndarray, "n 3"], material: np.ndarray):
-    """Albedo (n, 3) of surface points at canonical coordinates (n, 3), made of `material` (n,)."""
-    phase = (canonical * look.texture_wave[material]).sum(1)
-    phase += look.texture_warp_amount[material] * np.sin((canonical * look.texture_warp[material]).sum(1))
-    pattern = 0.5 + 0.5 * np.clip(np.sin(phase) * look.texture_sharpness[material], -1, 1)
-    share = (pattern * look.texture_amount[material])[:, None]
-    return look.colour[material] * (1 - share) + look.second_colour[material] * share
+def surface_albedo(
+    appearance: Appearance, canonical: Float[np.ndarray, "n 3"], material: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the albedo of surface points from their canonical coordinates and the indices of their materials."""
+    phase = (canonical * appearance.texture_wave[material]).sum(1)
+    phase += appearance.texture_warp_amount[material] * np.sin((canonical * appearance.texture_warp[material]).sum(1))
+    pattern = 0.5 + 0.5 * np.clip(np.sin(phase) * appearance.texture_sharpness[material], -1, 1)
+    share = (pattern * appearance.texture_amount[material])[:, None]
+    return appearance.colour[material] * (1 - share) + appearance.second_colour[material] * share
 
 
-def backdrop(points: Float[np.ndarray, "n 3"], waves: Float[np.ndarray, "3 3"], colours: Float[np.ndarray, "2 3"]):
-    """Colour (n, 3) of a smooth, irregular two-coloured backdrop at points (n, 3)."""
+def background_colour(
+    points: Float[np.ndarray, "n 3"], waves: Float[np.ndarray, "3 3"], colours: Float[np.ndarray, "2 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the colours of background points: a smooth, irregular pattern of two colours."""
     first = points @ waves[0]
     pattern = np.sin(first + 1.3) + 0.6 * np.sin(points @ waves[1] + 1.5 * np.sin(first))
     pattern += 0.4 * np.sin(points @ waves[2] + 2 * np.sin(points @ waves[1]))

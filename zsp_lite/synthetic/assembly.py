@@ -1,4 +1,4 @@
-"""Objects as assemblies of primitives: parts with materials, one canonical frame, unit size."""
+"""Objects composed of primitives: parts with materials, in one coordinate frame and of unit size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ N_MATERIALS = 8
 
 @dataclass(frozen=True)
 class Shape:
-    """One object: a mesh whose vertices know their part and whose faces know their material.
+    """The mesh of one object, with the part of each vertex and the material of each face.
 
-    Vertices are centred on the bounding box and scaled so that the surface has unit standard deviation, averaged
-    over the three axes (CO3D's convention for point clouds).
+    The origin is the centre of the bounding box. The surface has unit standard deviation, averaged over the three
+    axes (CO3D's convention for point clouds).
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -26,10 +26,13 @@ class Shape:
 
 
 class Assembly:
-    """Collects the parts of one object; generators draw every proportion from its random generator.
+    """Collects the parts of one object, and draws the random numbers that its generator asks for.
 
-    With `variation` every proportion moves from its draw by a normal deviate of `amount` of its range, while the
-    choices between parts stay: another object of the same build.
+    Args:
+        rng: Source of all draws.
+        variation: If given, every proportion (`u`) is perturbed by normal noise from this source, while the choices
+            between parts (`chance`, `choice`) stay: the same object with other proportions.
+        amount: Standard deviation of that noise, as a fraction of the range of the proportion.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None, amount: float = 0.3):
@@ -39,7 +42,7 @@ class Assembly:
         self._materials: list[int] = []
 
     def u(self, low: float, high: float) -> float:
-        """A uniform draw from [low, high)."""
+        """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
             low, high = min(low, high), max(low, high)
@@ -47,22 +50,22 @@ class Assembly:
         return value
 
     def chance(self, probability: float) -> bool:
-        """True with the given probability."""
+        """Draw True with the given probability."""
         return bool(self.rng.random() < probability)
 
-    def pick(self, n: int) -> int:
-        """A uniform draw from 0 .. n - 1."""
+    def choice(self, n: int) -> int:
+        """Draw uniformly from 0 .. n - 1."""
         return int(self.rng.integers(n))
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part made of one of the object's materials (0 .. 7), and its mirror image in y = 0 if asked."""
+        """Add a part of one of the materials 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
         self._meshes.append(mesh)
         self._materials.append(material)
         if mirror:
             self.add(mesh.mirrored(), material)
 
     def shape(self) -> Shape:
-        """The finished object, stretched a little along each axis as instances of a category are."""
+        """Return the finished object, with a small random scale along each axis."""
         counts = [len(m.vertices) for m in self._meshes]
         starts = np.cumsum([0, *counts[:-1]])
         vertices = np.concatenate([m.vertices for m in self._meshes])
@@ -75,7 +78,7 @@ class Assembly:
 
 
 def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Standard deviation of the surface, averaged over the three axes, in the unit of the vertices."""
+    """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
     middle = (a + b + c) / 3
@@ -84,19 +87,25 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def make_shape(generator: Callable[[Assembly], None], seed: int | list[int]) -> Shape:
-    """The object that `generator` builds from `seed`; the same seed gives the same object."""
+    """Return the object that `generator` builds; the same seed gives the same object."""
     assembly = Assembly(np.random.default_rng(seed))
     generator(assembly)
     return assembly.shape()
 
 
-def make_sibling(
+def make_variant(
     generator: Callable[[Assembly], None], seed: int | list[int], variation: np.random.Generator, amount: float = 0.3
 ) -> Shape:
-    """The object that `generator` builds from `seed` with other proportions: the same parts in the same order.
+    """Return the object of `make_shape(generator, seed)` with other proportions: the same parts in the same order.
 
-    As long as the generator takes only choices, not proportions, to decide which parts there are, vertex i is the
-    same place on all siblings: correspondence between objects that differ as instances of a category do.
+    Vertex i is the same point of the same part on all variants, so the correspondence between them is known. This
+    requires that the parts depend on the generator's choices only, not on its proportions.
+
+    Args:
+        generator: Builds an object from the draws of an `Assembly`.
+        seed: Seed of the object.
+        variation: Source of the changes.
+        amount: Standard deviation of the changes, as a fraction of the range of each proportion.
     """
     assembly = Assembly(np.random.default_rng(seed), variation, amount)
     generator(assembly)
@@ -104,10 +113,18 @@ def make_sibling(
 
 
 def deform(shape: Shape, seed: int | np.random.Generator, amount: float = 1.0) -> Float[np.ndarray, "v 3"]:
-    """Vertices of a gently altered copy: parts scaled, the whole warped and stretched.
+    """Deform an object: scale its parts, warp and scale the whole.
 
-    A vertex keeps its index, so surface correspondence between the copies of one object stays known. This is the
-    shape augmentation of the training; it needs no second instance.
+    A vertex keeps its index, so the correspondence with the original is known. This is the shape augmentation of the
+    training.
+
+    Args:
+        shape: Object to deform.
+        seed: Seed or source of the draws.
+        amount: Strength of the deformation; 0 changes nothing.
+
+    Returns:
+        Vertices of the deformed object.
     """
     rng = np.random.default_rng(seed)
     n_parts = shape.part.max() + 1

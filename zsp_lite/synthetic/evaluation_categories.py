@@ -1,13 +1,13 @@
-"""The categories that methods are evaluated on: names of the paper's twenty, generators of their own.
+"""The categories that methods are evaluated on: the names of the paper's twenty, with generators of their own.
 
-No backbone is trained on any of them; `training_categories` and `validation_categories` share neither a name nor a
-generator with them.
+No backbone is trained on them. `training_categories` and `validation_categories` share no name and no generator with
+them.
 """
 
-from zsp_lite.synthetic.evaluation_appliances import hairdryer, laptop, mouse, toaster
-from zsp_lite.synthetic.evaluation_desk import book, handbag, keyboard, remote
-from zsp_lite.synthetic.evaluation_furniture import backpack, chair, hydrant, toilet
-from zsp_lite.synthetic.evaluation_road import bicycle, car, motorcycle
+from zsp_lite.synthetic.evaluation_belongings import backpack, book, handbag
+from zsp_lite.synthetic.evaluation_electronics import keyboard, laptop, mouse, remote
+from zsp_lite.synthetic.evaluation_household import chair, hairdryer, toaster, toilet
+from zsp_lite.synthetic.evaluation_street import bicycle, car, hydrant, motorcycle
 from zsp_lite.synthetic.evaluation_toys import teddybear, toybus, toyplane, toytrain, toytruck
 
 EVALUATION = {

@@ -1,4 +1,4 @@
-"""Parts that several evaluation categories are built of, beyond the bare primitives."""
+"""Compound parts that several evaluation categories share."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ Y = (0.0, 1.0, 0.0)
 
 
 def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0, cells: int = 10) -> Mesh:
-    """A superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10.
+    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10.
 
-    Each side of a cube becomes a grid of `cells` x `cells`, denser at the edges, where the surface bends.
+    Each side of a cube becomes a grid of `cells` x `cells`, denser at the edges, where the curvature is largest.
     """
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, cells + 1))
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
@@ -27,11 +27,11 @@ def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0, cells: int = 10
             vertices.append(np.roll(points, axis, axis=1))
     vertices = np.concatenate(vertices)
     reach = (np.abs(vertices) ** squareness).sum(1, keepdims=True) ** (1 / squareness)
-    return Mesh(vertices / reach, np.concatenate(faces)).scaled(np.asarray(size, float) / 2).moved(centre)
+    return Mesh(vertices / reach, np.concatenate(faces)).scaled(np.asarray(size, float) / 2).translated(centre)
 
 
 def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
-    """The mesh with its width (y) shrinking from 1 at height `low` to `factor` at height `high`."""
+    """Scale the width (y) of a mesh by 1 at height `low`, linearly to `factor` at height `high`."""
     share = np.clip((mesh.vertices[:, 2] - low) / (high - low), 0, 1)
     vertices = mesh.vertices.copy()
     vertices[:, 1] *= 1 + (factor - 1) * share
@@ -39,7 +39,7 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
 
 
 def pane(start, end, width: float, thickness: float = 0.04) -> Mesh:
-    """A slab between two points (x, z), `width` across (y): a windscreen, a back rest, a lid."""
+    """Return a slab between two points (x, z) of width `width` along y, for example a windscreen."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     along = (end - start) / np.linalg.norm(end - start)
     across = thickness / 2 * np.array([-along[1], along[0]])
@@ -47,18 +47,18 @@ def pane(start, end, width: float, thickness: float = 0.04) -> Mesh:
 
 
 def wheel_pair(a: Assembly, x: float, y: float, radius: float, width: float, tyre: int, hub: int) -> None:
-    """A wheel with its hub on the floor at (x, y), and its mirror image."""
+    """Add a wheel with its hub on the floor at (x, y), and its mirror image."""
     upright = ("x", np.pi / 2)
-    a.add(cylinder(radius, radius, width, 22).turned(*upright).moved((x, y, radius)), tyre, mirror=True)
+    a.add(cylinder(radius, radius, width, 22).rotated(*upright).translated((x, y, radius)), tyre, mirror=True)
     a.add(
-        cylinder(radius * 0.6, radius * 0.6, width * 1.2, 14).turned(*upright).moved((x, y, radius)),
+        cylinder(radius * 0.6, radius * 0.6, width * 1.2, 14).rotated(*upright).translated((x, y, radius)),
         hub,
         mirror=True,
     )
 
 
 def bolt_circle(a: Assembly, centre, radius: float, count: int, size: float, material: int) -> None:
-    """Small knobs on a circle in the plane across x: the bolts of a flange."""
+    """Add the bolts of a flange: small rods on a circle perpendicular to x."""
     for angle in np.arange(count) * 2 * np.pi / count:
         at = np.asarray(centre, float) + [0, radius * np.cos(angle), radius * np.sin(angle)]
         a.add(rod(at, at + [size, 0, 0], size, sides=6), material)

@@ -1,4 +1,4 @@
-"""Evaluation categories of the nursery. Each generator builds one object: front +x, up +z, left +y."""
+"""Evaluation categories of toys (front +x, left +y, up +z)."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid
 
 
 def teddybear(a: Assembly) -> None:
-    """Sitting or standing; round or long muzzle; arms raised or hanging; tummy, bow, shirt or hat."""
+    """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging, optional shirt and hat."""
     belly, tall, skull = a.u(0.36, 0.55), a.u(0.48, 0.68), a.u(0.32, 0.46)
     standing = a.chance(0.3)
     floor = a.u(0.35, 0.5) if standing else 0.0
@@ -26,7 +26,7 @@ def teddybear(a: Assembly) -> None:
 
     shoulder = np.array([0, belly * 0.8, floor + tall * 1.45])
     for side in (1, -1):
-        # The two arms differ: plush arms never lie alike.
+        # Each arm has its own pose.
         hand = shoulder + [a.u(-0.05, 0.45), a.u(0.2, 0.42), a.u(-0.5, 0.45)]
         a.add(capsule(shoulder * [1, side, 1], hand * [1, side, 1], a.u(0.12, 0.16), a.u(0.12, 0.18)), 0)
     leg = a.u(0.14, 0.21)
@@ -51,16 +51,16 @@ def teddybear(a: Assembly) -> None:
             ],
             24,
         )
-        a.add(shirt.scaled((0.87, 1, 1)).moved((0, 0, floor)), 4)
+        a.add(shirt.scaled((0.87, 1, 1)).translated((0, 0, floor)), 4)
     if a.chance(0.4):
         a.add(ellipsoid((0.06, 0.12, 0.09), (belly * 0.62, 0.1, floor + tall * 1.78)), 5, mirror=True)
     if a.chance(0.2):
-        a.add(cylinder(skull * 0.55, skull * 0.45, 0.22).moved(head + [0, 0, skull * 1.05]), 6)
-        a.add(cylinder(skull * 0.8, skull * 0.8, 0.04).moved(head + [0, 0, skull * 0.94]), 6)
+        a.add(cylinder(skull * 0.55, skull * 0.45, 0.22).translated(head + [0, 0, skull * 1.05]), 6)
+        a.add(cylinder(skull * 0.8, skull * 0.8, 0.04).translated(head + [0, 0, skull * 0.94]), 6)
 
 
 def toyplane(a: Assembly) -> None:
-    """Propeller or jet; low, middle, high or double wing; straight or swept; T-tail; wheels."""
+    """Build a propeller plane or jet: low, middle, high or double wing, straight or swept; optional wheels."""
     length, radius = a.u(1.6, 2.6), a.u(0.16, 0.32)
     nose, tail = length / 2, -length / 2
     a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.u(0.35, 0.7), radius), 0)
@@ -79,9 +79,7 @@ def toyplane(a: Assembly) -> None:
         for x in (lead - 0.1, trail + 0.1):
             strut_y = span * 0.65
             a.add(
-                rod((x - sweep * 0.6, strut_y, levels[0]), (x - sweep * 0.6, strut_y, levels[1]), 0.02),
-                3,
-                mirror=True,
+                rod((x - sweep * 0.6, strut_y, levels[0]), (x - sweep * 0.6, strut_y, levels[1]), 0.02), 3, mirror=True
             )
         a.add(rod((wing_x, 0.08, 0), (wing_x, 0.12, levels[1]), 0.02), 3, mirror=True)
 
@@ -89,12 +87,7 @@ def toyplane(a: Assembly) -> None:
     a.add(extrusion([[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]], 0.06), 2)
     stabiliser, level = a.u(0.3, 0.55), (a.u(0, 0.1) if a.chance(0.75) else fin * 0.92)
     a.add(
-        extrusion(
-            [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]],
-            0.05,
-            "xy",
-            level,
-        ),
+        extrusion([[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]], 0.05, "xy", level),
         1,
         mirror=True,
     )
@@ -102,19 +95,15 @@ def toyplane(a: Assembly) -> None:
         engine = (
             (wing_x - sweep * 0.4, span * 0.4, levels[0] - 0.13) if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08)
         )
-        a.add(
-            rod(np.add(engine, [-0.2, 0, 0]), np.add(engine, [0.2, 0, 0]), 0.08, a.u(0.1, 0.13)),
-            3,
-            mirror=True,
-        )
+        a.add(rod(np.add(engine, [-0.2, 0, 0]), np.add(engine, [0.2, 0, 0]), 0.08, a.u(0.1, 0.13)), 3, mirror=True)
         a.add(rod(np.add(engine, [0.15, 0, 0]), np.add(engine, [0.22, 0, 0]), 0.07), 5, mirror=True)
     else:
         a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), 3)
         blade, turn = a.u(0.3, 0.45), a.u(0, np.pi)
-        n_blades = 2 + a.pick(3)
+        n_blades = 2 + a.choice(3)
         for k in range(n_blades):
-            upright = box((0.035, 0.1, blade)).moved((0, 0, blade / 2))
-            a.add(upright.turned("x", turn + k * TAU / n_blades).moved((nose + 0.08, 0, 0)), 5)
+            upright = box((0.035, 0.1, blade)).translated((0, 0, blade / 2))
+            a.add(upright.rotated("x", turn + k * TAU / n_blades).translated((nose + 0.08, 0, 0)), 5)
     if a.chance(0.85):
         canopy = length * a.u(0.16, 0.28)
         a.add(ellipsoid((a.u(0.2, 0.35), radius * 0.7, radius * 0.7), (canopy, 0, radius * 0.75)), 4)
@@ -124,11 +113,11 @@ def toyplane(a: Assembly) -> None:
     if a.chance(0.6):
         gear = np.array([wing_x + 0.1, 0.25, -radius - 0.22])
         a.add(rod(gear * [1, 0.6, 0], gear, 0.025), 3, mirror=True)
-        a.add(cylinder(0.1, 0.1, 0.07).turned("x", np.pi / 2).moved(gear), 6, mirror=True)
+        a.add(cylinder(0.1, 0.1, 0.07).rotated("x", np.pi / 2).translated(gear), 6, mirror=True)
 
 
 def toytruck(a: Assembly) -> None:
-    """Cab over engine or with a bonnet; box, flat bed with load, tank, tipper or crane behind."""
+    """Build a truck: cab over engine or with a bonnet; box, flat bed, tank, tipper or crane behind."""
     length, width, wheel = a.u(1.7, 2.6), a.u(0.7, 1.0), a.u(0.16, 0.28)
     deck, cab_height, cab_length = wheel * 1.3, a.u(0.5, 0.85), a.u(0.4, 0.65)
     nose, tail = length / 2, -length / 2
@@ -138,9 +127,7 @@ def toytruck(a: Assembly) -> None:
         bonnet = a.u(0.25, 0.45)
         a.add(
             rounded_box(
-                (bonnet * 1.3, width * 0.85, cab_height * 0.55),
-                (nose - bonnet * 0.5, 0, deck + cab_height * 0.26),
-                6,
+                (bonnet * 1.3, width * 0.85, cab_height * 0.55), (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6
             ),
             0,
         )
@@ -176,7 +163,7 @@ def toytruck(a: Assembly) -> None:
 
     load_front = cab_rear - 0.05
     load_length, load_x = load_front - tail, (load_front + tail) / 2
-    style = a.pick(5)
+    style = a.choice(5)
     if style == 0:
         height = a.u(0.6, 1.0)
         a.add(box((load_length, width * a.u(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)), 1)
@@ -192,7 +179,7 @@ def toytruck(a: Assembly) -> None:
     elif style == 2:
         radius = width * a.u(0.38, 0.5)
         a.add(rod((tail, 0, deck + radius), (load_front, 0, deck + radius), radius, sides=22), 1)
-        a.add(cylinder(0.1, 0.1, 0.08).moved((load_x, 0, deck + 2 * radius + 0.02)), 7)
+        a.add(cylinder(0.1, 0.1, 0.08).translated((load_x, 0, deck + 2 * radius + 0.02)), 7)
     elif style == 3:
         tilt, wall = a.u(0.15, 0.6), a.u(0.3, 0.45)
         tray = [[0, 0], [load_length, 0], [load_length + 0.08, wall], [0.0, wall]]
@@ -202,10 +189,10 @@ def toytruck(a: Assembly) -> None:
             box((load_length, width, 0.06), (load_length / 2, 0, 0)),
             box((0.06, width, wall), (load_length, 0, wall / 2)),
         ):
-            a.add(mesh.turned("y", -tilt).moved((tail, 0, deck + 0.12)), 1)
+            a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.12)), 1)
         a.add(rod((load_x, 0, deck), (load_x + 0.1, 0, deck + 0.12 + load_length * 0.5 * np.sin(tilt)), 0.05), 2)
     else:
-        a.add(cylinder(width * 0.35, width * 0.35, 0.2).moved((load_x, 0, deck + 0.16)), 1)
+        a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), 1)
         mast = np.array([load_x, 0, deck + 0.3])
         jib = mast + [-load_length * a.u(0.4, 0.7), 0, a.u(0.5, 0.9)]
         a.add(box((0.3, 0.3, 0.3), mast + [0, 0, 0.08]), 1)
@@ -218,8 +205,8 @@ def toytruck(a: Assembly) -> None:
 
 
 def toybus(a: Assembly) -> None:
-    """City bus, double-decker or school bus with a bonnet; doors on the right."""
-    style = a.pick(3)
+    """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
+    style = a.choice(3)
     length, width, wheel = a.u(1.9, 2.9), a.u(0.65, 0.9), a.u(0.15, 0.22)
     height = a.u(0.65, 0.85) * (1.6 if style == 1 else 1)
     floor = wheel * 0.8
@@ -238,7 +225,7 @@ def toybus(a: Assembly) -> None:
     a.add(box((body_length * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)), 1)
     rows = (0.36, 0.78) if style == 1 else (0.66,)
     window_height = height * (0.2 if style == 1 else 0.3)
-    n_windows = 4 + a.pick(4)
+    n_windows = 4 + a.choice(4)
     pitch = body_length * 0.9 / n_windows
     for row in rows:
         for k in range(n_windows):
@@ -264,10 +251,7 @@ def toybus(a: Assembly) -> None:
         a.add(box((0.1, 0.06, 0.14), (nose - 0.02, width * 0.54, floor + height * 0.6)), 3, mirror=True)
     if a.chance(0.5):
         a.add(
-            box(
-                (body_length * a.u(0.15, 0.3), width * 0.6, 0.1),
-                (tail + body_length * 0.3, 0, floor + height + 0.03),
-            ),
+            box((body_length * a.u(0.15, 0.3), width * 0.6, 0.1), (tail + body_length * 0.3, 0, floor + height + 0.03)),
             1,
         )
     for x in (nose - length * a.u(0.18, 0.24), tail + length * a.u(0.17, 0.24)):
@@ -275,7 +259,7 @@ def toybus(a: Assembly) -> None:
 
 
 def toytrain(a: Assembly) -> None:
-    """A locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
+    """Build a locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
     length, width, wheel = a.u(1.6, 2.3), a.u(0.6, 0.8), a.u(0.14, 0.24)
     deck = wheel * 1.5
     nose, tail = length / 2, -length / 2
@@ -300,38 +284,29 @@ def toytrain(a: Assembly) -> None:
         chimney, flare = a.u(0.2, 0.45), a.u(0.9, 2.0)
         base = boiler + radius * 0.9
         a.add(
-            lathe([[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [0.09 * flare, chimney], [0.001, chimney]]).moved(
+            lathe([[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [0.09 * flare, chimney], [0.001, chimney]]).translated(
                 (front - 0.2, 0, base)
             ),
             3,
         )
         a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (hood_rear + (front - hood_rear) * 0.42, 0, base)), 7)
-        a.add(
-            rod((front + 0.03, 0, boiler + radius * 0.6), (front + 0.15, 0, boiler + radius * 0.6), 0.08, 0.1),
-            5,
-        )
+        a.add(rod((front + 0.03, 0, boiler + radius * 0.6), (front + 0.15, 0, boiler + radius * 0.6), 0.08, 0.1), 5)
     else:
         hood_height = cab_height * a.u(0.55, 0.8)
         hood = (nose - 0.05 - hood_rear, width * a.u(0.7, 0.95), hood_height)
         a.add(rounded_box(hood, ((nose - 0.05 + hood_rear) / 2, 0, deck + 0.06 + hood_height / 2), 9), 0)
         a.add(box((0.04, hood[1] * 0.6, hood_height * 0.4), (nose - 0.05, 0, deck + hood_height * 0.4)), 6)
-        a.add(
-            ellipsoid((0.05, 0.07, 0.07), (nose - 0.05, width * 0.22, deck + hood_height * 0.8)),
-            5,
-            mirror=True,
-        )
+        a.add(ellipsoid((0.05, 0.07, 0.07), (nose - 0.05, width * 0.22, deck + hood_height * 0.8)), 5, mirror=True)
         a.add(box((0.25, width * 0.3, 0.14), ((nose + hood_rear) / 2, 0, deck + 0.1 + hood_height)), 3)
-    # The cow-catcher slopes down and forwards.
+    # The cowcatcher slopes down and forwards.
     plough = [[nose - 0.02, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose - 0.02, 0.05]]
     a.add(extrusion(plough, width * 0.75), 7)
     a.add(rod((tail - 0.12, 0, deck), (tail, 0, deck), 0.05), 3)
-    n_axles = 2 + a.pick(3)
+    n_axles = 2 + a.choice(3)
     big_rear = a.chance(0.4)
     axles = np.linspace(tail + wheel * 1.3, nose - wheel * 1.6, n_axles)
     for k, x in enumerate(axles):
         wheel_pair(a, x, width / 2 - 0.03, wheel * (1.35 if big_rear and k == 0 else 1), 0.08, 3, 2)
     a.add(
-        box((axles[-1] - axles[0], 0.03, 0.05), ((axles[0] + axles[-1]) / 2, width / 2 + 0.06, wheel)),
-        7,
-        mirror=True,
+        box((axles[-1] - axles[0], 0.03, 0.05), ((axles[0] + axles[-1]) / 2, width / 2 + 0.06, wheel)), 7, mirror=True
     )

@@ -1,4 +1,4 @@
-"""Procedural categories written as a folder in CO3D's layout, with pose labels and evaluation pairs."""
+"""Export of procedural categories as a folder in CO3D's layout, with pose labels and evaluation pairs."""
 
 import hashlib
 import json
@@ -17,22 +17,31 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.synthetic.assembly import Shape, make_shape
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
-from zsp_lite.synthetic.sensor import observe
+from zsp_lite.synthetic.sensor import simulate_capture
 from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
 
 SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATION}
 GENERATORS = TRAINING | VALIDATION | EVALUATION
-SETTINGS_FILE = "synthetic.json"  # in the data folder: what it was made with
-POSES_FILE = "object_poses.json"  # in each category: where each sequence's object stands in its world
+SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
+POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 JPEG_QUALITY = 88
 LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A data set as plain data: `image_size` is the shorter image side in pixels, `pairs` is per category."""
+    """Definition of a data set.
+
+    Attributes:
+        categories: Names of categories.
+        sequences: Sequences per category.
+        frames: Frames per sequence.
+        image_size: Shorter image side in pixels.
+        pairs: Evaluation pairs per category.
+        targets: Numbers of target views; each has its own file of pairs.
+    """
 
     categories: tuple[str, ...]
     sequences: int
@@ -42,7 +51,7 @@ class Preset:
     targets: tuple[int, ...]
 
 
-# Half of the paper's twenty names, fixed before any result: the five of its Table 1 and five others.
+# Half of the paper's twenty categories, chosen before any result: the five of its Table 1 and five others.
 _EVAL = (
     "bicycle", "car", "chair", "hairdryer", "hydrant", "motorcycle", "teddybear", "toaster", "toyplane", "toytruck"
 )  # fmt: skip
@@ -50,7 +59,7 @@ _EVAL = (
 PRESETS = {
     "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
     "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
-    # As large as the paper's evaluation: its twenty categories, ten sequences of about a hundred frames each.
+    # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
     "paper": Preset(tuple(EVALUATION), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
 }
 
@@ -58,9 +67,16 @@ PRESETS = {
 def export_preset(
     preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] | None = None
 ) -> None:
-    """Write a preset with its evaluation pairs to the folder `out`; `progress` wraps the loop, as tqdm does.
+    """Write a preset with its evaluation pairs to a folder.
 
-    Raises InputError on an unknown preset and as `export_categories`.
+    Args:
+        preset: Name in `PRESETS`.
+        out: Folder to write; an incomplete export is completed.
+        seed: Seed of the objects and of the pairs.
+        progress: Wraps the loop over sequences, as tqdm does.
+
+    Raises:
+        InputError: If the preset is unknown, and as for `export_categories`.
     """
     if preset not in PRESETS:
         raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
@@ -72,7 +88,7 @@ def export_preset(
 
 
 def write_pairs(preset: Preset, out: str | Path, seed: int) -> None:
-    """Sample the preset's evaluation pairs and write them in the upstream form."""
+    """Sample the evaluation pairs of a preset and write them in the file format of the published evaluation."""
     dataset = Co3D(out)
     for category in preset.categories:
         for n_targets in preset.targets:
@@ -90,12 +106,23 @@ def export_categories(
     layout: str = "v1",
     progress: Callable[[Iterable], Iterable] | None = None,
 ) -> None:
-    """Write `sequences` sequences of `frames` frames of each category to the folder `out`, with pose labels.
+    """Write sequences of procedural categories to a folder, with pose labels.
 
-    The name of a split stands for all its categories. The shorter image side has `image_size` pixels. A sequence
-    depends on the seed, its category and its index alone, so any part of an export can be made again; sequences that
-    are complete already are left alone. The first sequence of a category is its labels' reference. Raises InputError
-    on unknown categories or layouts, and on a folder that was made with other settings.
+    A sequence depends only on the seed, its category and its index. Complete sequences are not rendered again. The
+    first sequence of a category is the reference of its labels.
+
+    Args:
+        categories: Names of categories, or of splits ("training", "validation", "evaluation").
+        out: Folder to write; an incomplete export is completed.
+        sequences: Sequences per category.
+        frames: Frames per sequence.
+        seed: Seed of the export.
+        image_size: Shorter image side in pixels.
+        layout: "v1" or "v2", the version of CO3D's annotations.
+        progress: Wraps the loop over sequences, as tqdm does.
+
+    Raises:
+        InputError: If a category or the layout is unknown, or the folder was written with other settings.
     """
     categories = list(dict.fromkeys(name for given in categories for name in SPLITS.get(given, [given])))
     for category in categories:
@@ -109,41 +136,51 @@ def export_categories(
         )
     out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout}
-    _claim(out, settings)
+    _write_settings(out, settings)
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs) if progress else jobs:
         name = sequence_name(seed, category, index)
         poses = _read_poses(out, category)
-        if name not in poses or name not in _complete(out, category):
+        if name not in poses or name not in _complete_sequences(out, category):
             data, exact = make_sequence(category, index, frames, seed, image_size)
-            # The pose goes first: a sequence counts as complete by the annotations, which come last.
+            # Annotations are written last; a sequence with annotations is complete.
             poses[name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale}
             write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
             write_co3d(out, category, [data], quality=JPEG_QUALITY, intrinsics_format=LAYOUTS[layout])
         reference = sequence_name(seed, category, 0)
         trans = np.array(poses[name]["trans"]) @ np.linalg.inv(poses[reference]["trans"])
-        trans = np.eye(4) if name == reference else np.round(trans, 12) + 0.0  # the same on any processor
+        trans = np.eye(4) if name == reference else np.round(trans, 12) + 0.0  # equal on all processors, without -0.0
         write_label(out, category, PoseLabel(trans, name, reference))
 
 
 def make_sequence(
     category: str, index: int, frames: int, seed: int, image_size: int
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Sequence number `index` of a category, as CO3D would hold it, and its exact twin."""
+    """Make sequence number `index` of a category.
+
+    Returns:
+        The sequence with simulated sensor errors, and its exact rendering in the same unit.
+    """
     key = _stable_hash(seed, category, index)
     shape = _make_object(category, key)
     rendered = render_sequence(shape, np.random.default_rng([key, 1]), frames, image_size)
-    return observe(rendered, sequence_name(seed, category, index), np.random.default_rng([key, 2]))
+    return simulate_capture(rendered, sequence_name(seed, category, index), np.random.default_rng([key, 2]))
 
 
 def make_object(category: str, sequence: str, seed: int) -> Shape:
-    """The object of an exported sequence, given its name and the export's seed, in canonical coordinates.
+    """Return the object of an exported sequence in canonical coordinates.
 
-    Raises InputError where no such sequence is exported with that seed.
+    Args:
+        category: Category of the sequence.
+        sequence: Name of the sequence.
+        seed: Seed of the export.
+
+    Raises:
+        InputError: If an export with this seed has no such sequence.
     """
     index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
     if category not in GENERATORS or index < 0 or sequence != sequence_name(seed, category, index):
-        raise InputError(f"sequence {category}/{sequence} is none of an export with seed {seed}")
+        raise InputError(f"sequence {category}/{sequence} does not exist in an export with seed {seed}")
     return _make_object(category, _stable_hash(seed, category, index))
 
 
@@ -152,23 +189,23 @@ def _make_object(category: str, key: int) -> Shape:
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
-    """A name like CO3D's, digits in three groups; sorted names are in the order of the indices, up to 900."""
+    """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
     digits = _stable_hash(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
 def _stable_hash(seed: int, category: str, index: int) -> int:
-    """64 bits that are the same on every machine and in every process."""
+    """Return a 64-bit hash that is the same on every machine and in every process."""
     return int.from_bytes(hashlib.sha256(f"{seed}/{category}/{index}".encode()).digest()[:8], "big")
 
 
-def _claim(out: Path, settings: dict) -> None:
-    """Note the settings in the folder, or refuse one that was made with others."""
+def _write_settings(out: Path, settings: dict) -> None:
+    """Write the settings of the export, or raise InputError if the folder has others."""
     path = out / SETTINGS_FILE
     if path.is_file():
         found = decode(read_bytes(path, "settings"), dict, path)
         if found != settings:
-            raise InputError(f"folder {out} was made with {found}, expected {settings} or another folder")
+            raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())
 
 
@@ -177,8 +214,8 @@ def _read_poses(out: Path, category: str) -> dict:
     return decode(read_bytes(path, "object poses"), dict, path) if path.is_file() else {}
 
 
-def _complete(out: Path, category: str) -> set[str]:
-    """Names of the sequences that stand in both of the category's annotation files."""
+def _complete_sequences(out: Path, category: str) -> set[str]:
+    """Return the names of the sequences that are in both annotation files of the category."""
     dataset = Co3D(out)
     if category not in dataset.categories():
         return set()

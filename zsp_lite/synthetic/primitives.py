@@ -1,4 +1,4 @@
-"""Triangle meshes of simple solids, the letters that every procedural object is written in."""
+"""Triangle meshes of simple solids, the parts of every procedural object."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ _PLANES = {"xz": (0, 2, 1), "xy": (0, 1, 2), "yz": (1, 2, 0)}
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh: vertices (V, 3) in object units and faces (F, 3), indices into them."""
+    """A triangle mesh: vertices in object units, and faces as indices of vertices."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
 
-    def moved(self, offset) -> "Mesh":
-        """The mesh shifted by `offset` (3,)."""
+    def translated(self, offset) -> "Mesh":
+        """Return the mesh shifted by `offset` (3,)."""
         return Mesh(self.vertices + np.asarray(offset, float), self.faces)
 
     def scaled(self, factors) -> "Mesh":
-        """The mesh stretched about the origin by `factors`, one number or (3,)."""
+        """Return the mesh scaled about the origin by `factors`, one number or (3,)."""
         return Mesh(self.vertices * np.asarray(factors, float), self.faces)
 
-    def turned(self, axis: str, angle: float) -> "Mesh":
-        """The mesh rotated about the axis "x", "y" or "z" through the origin, `angle` in radians, right-handed."""
+    def rotated(self, axis: str, angle: float) -> "Mesh":
+        """Return the mesh rotated about the axis "x", "y" or "z" through the origin, right-handed, in radians."""
         i = "xyz".index(axis)
         j, k = (i + 1) % 3, (i + 2) % 3
         R = np.eye(3)
@@ -34,12 +34,12 @@ class Mesh:
         return Mesh(self.vertices @ R.T, self.faces)
 
     def mirrored(self) -> "Mesh":
-        """The mirror image in the plane y = 0, with faces turned so that normals keep pointing outwards."""
+        """Return the mirror image in the plane y = 0; faces are reversed so that normals still point outwards."""
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
-def _along(vertices: np.ndarray, direction) -> np.ndarray:
-    """Vertices rotated so that their z axis points along `direction`."""
+def _align_z(vertices: np.ndarray, direction) -> np.ndarray:
+    """Rotate vertices so that their z axis points along `direction`."""
     z = np.asarray(direction, float)
     z = z / np.linalg.norm(z)
     x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
@@ -48,7 +48,7 @@ def _along(vertices: np.ndarray, direction) -> np.ndarray:
 
 
 def box(size, centre=(0, 0, 0)) -> Mesh:
-    """An axis-aligned box of the given size (3,)."""
+    """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
              [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
@@ -56,7 +56,7 @@ def box(size, centre=(0, 0, 0)) -> Mesh:
 
 
 def lathe(profile, sides: int = 20) -> Mesh:
-    """The surface swept by a profile of (radius, height) points turning about z."""
+    """Return the surface of revolution about z of a profile of (radius, height) points (n, 2)."""
     profile = np.asarray(profile, float)
     angle = np.linspace(0, TAU, sides, endpoint=False)
     x, y = np.outer(profile[:, 0], np.cos(angle)), np.outer(profile[:, 0], np.sin(angle))
@@ -68,27 +68,27 @@ def lathe(profile, sides: int = 20) -> Mesh:
 
 
 def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
-    """A closed cone frustum about z, centred at the origin, with radii `bottom` and `top`."""
+    """Return a closed cone frustum about z, centred at the origin, with radii `bottom` and `top`."""
     return lathe([[1e-4, -height / 2], [bottom, -height / 2], [top, height / 2], [1e-4, height / 2]], sides)
 
 
 def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18, rings: int = 12) -> Mesh:
-    """An ellipsoid with the given radii (3,)."""
+    """Return an axis-aligned ellipsoid with the given radii (3,)."""
     t = np.linspace(-np.pi / 2, np.pi / 2, rings)
     unit = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
-    return unit.scaled(radii).moved(centre)
+    return unit.scaled(radii).translated(centre)
 
 
 def rod(start, end, radius: float, end_radius: float | None = None, sides: int = 12) -> Mesh:
-    """A closed cone frustum from point `start` to point `end`."""
+    """Return a closed cone frustum from point `start` (3,) to point `end` (3,)."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     end_radius = radius if end_radius is None else end_radius
     mesh = cylinder(radius, end_radius, np.linalg.norm(end - start) + 1e-9, sides)
-    return Mesh(_along(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+    return Mesh(_align_z(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
 
 
 def capsule(start, end, radius: float, end_radius: float | None = None, sides: int = 14) -> Mesh:
-    """A rod with hemispherical ends."""
+    """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     end_radius = radius if end_radius is None else end_radius
     half = np.linalg.norm(end - start) / 2 + 1e-9
@@ -96,12 +96,12 @@ def capsule(start, end, radius: float, end_radius: float | None = None, sides: i
     tail = [[radius * np.cos(a) + 1e-5, -half + radius * np.sin(a)] for a in t]
     head = [[end_radius * np.cos(a) + 1e-5, half + end_radius * np.sin(a)] for a in -t[::-1]]
     mesh = lathe(tail + head, sides)
-    return Mesh(_along(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+    return Mesh(_align_z(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
 
 
 def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start: float = 0.0, stop: float = TAU,
           sides: int = 24, tube_sides: int = 10) -> Mesh:  # fmt: skip
-    """A torus about `axis`, or the arc of it from angle `start` to `stop` in radians."""
+    """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
     closed = abs(stop - start - TAU) < 1e-6
     p, q = np.meshgrid(np.linspace(start, stop, sides, endpoint=not closed),
                        np.linspace(0, TAU, tube_sides, endpoint=False), indexing="ij")  # fmt: skip
@@ -111,13 +111,13 @@ def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start: f
     i, j, i1, j1 = i.ravel(), j.ravel(), (i.ravel() + 1) % sides, (j.ravel() + 1) % tube_sides
     a, b, c, d = (r * tube_sides + s for r, s in ((i, j), (i, j1), (i1, j1), (i1, j)))
     faces = np.stack([np.stack([a, c, b], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
-    return Mesh(_along(vertices, axis) + np.asarray(centre, float), faces)
+    return Mesh(_align_z(vertices, axis) + np.asarray(centre, float), faces)
 
 
 def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:
-    """An outline (n, 2), star-shaped about its mean, in the plane "xz", "xy" or "yz", made `thickness` thick.
+    """Extrude an outline (n, 2) in the plane "xz", "xy" or "yz" to a slab of the given thickness.
 
-    The slab is centred at `offset` along the plane's normal.
+    The outline must be star-shaped about its mean. The slab is centred at `offset` along the normal of the plane.
     """
     outline = np.asarray(outline, float)
     n = len(outline)

@@ -1,4 +1,4 @@
-"""A CPU renderer: Open3D casts the rays, NumPy shades them."""
+"""Ray-casting renderer on the CPU: Open3D intersects rays with the mesh, NumPy shades the hits."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,21 @@ from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.synthetic.appearance import Appearance, backdrop, surface_albedo
+from zsp_lite.synthetic.appearance import Appearance, background_colour, surface_albedo
 from zsp_lite.synthetic.assembly import Shape
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """One view with everything a renderer knows about it.
+    """One rendered view with its exact geometry.
 
-    `depth` is the z coordinate in the camera frame, 0 where no surface is hit; `canonical` holds the object
-    coordinates of each object pixel and `normals` its normal in the camera frame, NaN and 0 elsewhere.
+    Attributes:
+        rgb: Picture.
+        depth: z coordinate in the camera frame, 0 where the ray hits neither the object nor the floor.
+        mask: Pixels of the object.
+        canonical: Object coordinates of each object pixel, NaN elsewhere.
+        normals: Unit normals of the object pixels in the camera frame, 0 elsewhere.
+        camera: Camera of the view.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -28,9 +33,17 @@ class Rendering:
 
 
 def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
-    """World-to-camera rotation (3, 3) and translation (3,) of a camera on a sphere about `target`, looking at it.
+    """Return the pose of a camera on a sphere around `target` that looks at its centre.
 
-    Angles in radians; azimuth 0 stands in front of the object, at +x; roll turns the camera about its axis.
+    Args:
+        azimuth: Angle about z in radians; 0 is in front of the object, at +x.
+        elevation: Angle above the horizontal plane in radians.
+        roll: Rotation about the optical axis in radians.
+        distance: Radius of the sphere.
+        target: Centre of the sphere (3,).
+
+    Returns:
+        World-to-camera rotation (3, 3) and translation (3,).
     """
     away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     forward = -away
@@ -43,9 +56,10 @@ def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, t
 
 def framed_camera(vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarray, size: int, margin: float = 1.1,
                   shift: Float[np.ndarray, "2"] | None = None) -> Camera:  # fmt: skip
-    """A square camera at pose R, t whose image of `size` pixels just holds all vertices.
+    """Return a camera at pose R, t with a square image of `size` pixels that contains all vertices.
 
-    The object's bounding square is enlarged by the factor `margin` and moved by `shift`, a fraction of its width.
+    The bounding square of the object is enlarged by the factor `margin` and shifted by `shift`, a fraction of its
+    width.
     """
     in_camera = vertices @ R.T + t
     plane = in_camera[:, :2] / in_camera[:, 2:]
@@ -57,7 +71,7 @@ def framed_camera(vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarr
 
 
 class Scene:
-    """One object, ready for rays; `vertices` replaces the shape's own, for a deformed copy."""
+    """One object, prepared for ray casting; `vertices` replaces those of the shape, for a deformed copy."""
 
     def __init__(self, shape: Shape, vertices: Float[np.ndarray, "v 3"] | None = None):
         o3d = load_open3d()
@@ -72,9 +86,9 @@ class Scene:
         self.centre = (self.vertices.max(0) + self.vertices.min(0)) / 2
 
     def render(
-        self, camera: Camera, look: Appearance, seed: int | np.random.Generator, shadows: bool = True
+        self, camera: Camera, appearance: Appearance, seed: int | np.random.Generator, shadows: bool = True
     ) -> Rendering:
-        """Render the object on its floor before its wall; `seed` draws the sensor noise."""
+        """Render the object on a floor in front of a wall; `seed` draws the sensor noise."""
         rng = np.random.default_rng(seed)
         height, width = camera.size
         R, eye = camera.R.astype(np.float32), camera.centre.astype(np.float32)
@@ -85,7 +99,7 @@ class Scene:
         distance = hits["t_hit"].numpy()
         mask = np.isfinite(distance)
 
-        # The object's pixels. Rays have unit z in the camera frame, so the ray parameter is the depth.
+        # Object pixels. Rays have unit z in the camera frame, so the ray parameter is the depth.
         on = np.flatnonzero(mask)
         face, uv = hits["primitive_ids"].numpy()[on], hits["primitive_uvs"].numpy()[on]
         weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)
@@ -95,29 +109,31 @@ class Scene:
         normal *= -np.sign((normal * view).sum(1, keepdims=True))
         point = eye + distance[on, None] * rays[on]
 
-        # The room's pixels: floor where a downward ray meets it, wall elsewhere.
+        # Background pixels: floor where a downward ray meets it, wall elsewhere.
         off = np.flatnonzero(~mask)
         down = rays[off, 2] < -1e-3
         reach = np.where(down, (self.floor - eye[2]) / np.where(down, rays[off, 2], -1), np.inf)
-        grounded = (reach < 25) & look.has_ground
+        grounded = (reach < 25) & appearance.has_ground
         floor_point = eye + reach[grounded, None] * rays[off[grounded]]
         wall_point = 2.5 * rays[off] / np.linalg.norm(rays[off], axis=1, keepdims=True)
-        room = backdrop(wall_point, look.wall_waves, look.wall_colours)
-        room[grounded] = backdrop(floor_point, look.ground_waves, look.ground_colours)
+        background = background_colour(wall_point, appearance.wall_waves, appearance.wall_colours)
+        background[grounded] = background_colour(floor_point, appearance.ground_waves, appearance.ground_colours)
         depth = np.where(mask, distance, 0).astype(np.float32)
         depth[off[grounded]] = reach[grounded]
 
         lit = np.ones(len(on))
         if shadows:
             origin = np.concatenate([point + 0.01 * normal, floor_point + [0, 0, 0.002]])
-            ray = np.concatenate([origin, np.broadcast_to(look.light, origin.shape)], 1).astype(np.float32)
+            ray = np.concatenate([origin, np.broadcast_to(appearance.light, origin.shape)], 1).astype(np.float32)
             shadow = self._rays.test_occlusions(self._tensor(ray)).numpy()
             lit = 1 - 0.85 * shadow[: len(on)]
-            room[grounded] *= 1 - 0.5 * shadow[len(on) :, None]
+            background[grounded] *= 1 - 0.5 * shadow[len(on) :, None]
         rgb = np.zeros((height * width, 3))
-        rgb[on] = _shade(look, surface_albedo(look, canonical, self.shape.material[face]), normal, view, lit)
-        rgb[off] = room
-        rgb = rgb * look.gain + rng.normal(0, look.noise + 1e-4, rgb.shape)
+        rgb[on] = _shade(
+            appearance, surface_albedo(appearance, canonical, self.shape.material[face]), normal, view, lit
+        )
+        rgb[off] = background
+        rgb = rgb * appearance.gain + rng.normal(0, appearance.noise + 1e-4, rgb.shape)
 
         def image(values, fill, channels):
             out = np.full((height * width, channels), fill, np.float32)
@@ -134,12 +150,12 @@ class Scene:
         )
 
 
-def _shade(look: Appearance, albedo, normal, view, lit):
-    """Colours (n, 3) by Blinn-Phong shading with a sky-dependent ambient term and a little light from the camera."""
-    lambert = np.clip(normal @ look.light, 0, 1) * lit
-    half = look.light - view
+def _shade(appearance: Appearance, albedo, normal, view, lit):
+    """Return colours (n, 3) by Blinn-Phong shading, with ambient light from above and a weak light at the camera."""
+    lambert = np.clip(normal @ appearance.light, 0, 1) * lit
+    half = appearance.light - view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    highlight = np.clip((normal * half).sum(1), 0, 1) ** 24 * look.specular * lit
-    ambient = look.ambient * (0.75 + 0.25 * normal[:, 2])
+    highlight = np.clip((normal * half).sum(1), 0, 1) ** 24 * appearance.specular * lit
+    ambient = appearance.ambient * (0.75 + 0.25 * normal[:, 2])
     headlight = 0.15 * np.clip(-(normal * view).sum(1), 0, 1)
-    return albedo * (ambient + headlight + look.diffuse * lambert)[:, None] + highlight[:, None]
+    return albedo * (ambient + headlight + appearance.diffuse * lambert)[:, None] + highlight[:, None]

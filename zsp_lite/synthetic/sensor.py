@@ -1,11 +1,10 @@
-"""From exact renderings to data like CO3D's: depth with holes and noise, soft masks, a fused point cloud.
+"""Simulated capture: depth with holes and noise, soft masks and a fused point cloud, as in CO3D.
 
-CO3D's depth comes from multi-view stereo (COLMAP), which finds no match where there is no texture, at depth
-edges and at grazing angles; its masks come from a segmentation network (PointRend), right to a pixel or two.
+CO3D's depth comes from multi-view stereo (COLMAP), which finds no match without texture, at depth edges and at
+grazing angles. Its masks come from a segmentation network (PointRend), accurate to one or two pixels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,31 +15,22 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 
-_DEPTH_NOISE = 0.005  # of the depth, at the object
-# Unknown share of the object's and of the floor's pixels, drawn per sequence; the wall is too far away.
+_DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
+# Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
 _OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
 
 
-@dataclass(frozen=True, eq=False)
-class PointCloud:
-    """World points with unit normals and 8-bit colours."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    colours: UInt8[np.ndarray, "n 3"]
-
-
 def smooth_noise(rng: np.random.Generator, size: tuple[int, int], sigma: float) -> Float[np.ndarray, "h w"]:
-    """Gaussian noise (H, W) correlated over `sigma` pixels, of unit variance."""
+    """Return Gaussian noise of unit variance, smoothed by a Gaussian of `sigma` pixels."""
     noise = _blur(rng.standard_normal(size).astype(np.float32), sigma)
     return noise / (noise.std() + 1e-6)
 
 
 def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """How readily stereo would match each pixel, (H, W), in no particular unit.
+    """Return a score of how well stereo would match each pixel.
 
-    High where the picture has texture at a coarse scale; low at depth edges and at grazing angles; the rest
-    is luck, in patches.
+    The score has no unit. It is high in textured regions and low at depth edges and grazing angles, plus smooth
+    noise.
     """
     rng = np.random.default_rng(seed)
     scale = min(view.mask.shape) / 100
@@ -56,17 +46,26 @@ def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float
     ray = view.camera.unproject_camera(np.stack([x, y], -1), np.ones((h, w)))
     facing = np.abs((view.normals * ray).sum(-1)) / np.linalg.norm(ray, axis=-1)
     grazing = np.where(view.mask, np.clip(1 - facing / 0.5, 0, 1), 0)
-    luck = 0.7 * smooth_noise(rng, (h, w), 5 * scale) + 0.4 * smooth_noise(rng, (h, w), 1.5 * scale)
-    return texture + luck - 1.5 * edge - 1.5 * grazing
+    noise = 0.7 * smooth_noise(rng, (h, w), 5 * scale) + 0.4 * smooth_noise(rng, (h, w), 1.5 * scale)
+    return texture + noise - 1.5 * edge - 1.5 * grazing
 
 
 def stereo_depth(
     view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.2
 ) -> Float[np.ndarray, "h w"]:
-    """Depth (float32, 0 = unknown) as stereo would give it, with the wanted shares of unknown pixels.
+    """Simulate the depth map of multi-view stereo.
 
-    The shares hold for the object's pixels and for those of the floor. The noise is mostly correlated; it is
-    0.5 % of the depth at the object and grows with the square of the depth, as stereo's does.
+    The noise is mostly correlated between pixels. It is 0.5 % of the depth at the object and grows with the square
+    of the depth.
+
+    Args:
+        view: Exact rendering.
+        seed: Seed or source of the draws.
+        object_holes: Fraction of the object's pixels without depth.
+        floor_holes: Fraction of the floor's pixels without depth.
+
+    Returns:
+        Depth map (float32), 0 where there is no measurement.
     """
     rng = np.random.default_rng(seed)
     confidence = stereo_confidence(view, rng)
@@ -81,7 +80,7 @@ def stereo_depth(
 
 
 def soft_mask(mask: Bool[np.ndarray, "h w"], seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """A segmentation network's probability (float32): a blurred edge that wanders by a pixel or two."""
+    """Simulate the probability map (float32) of a segmentation network: a soft edge, displaced by up to two pixels."""
     rng = np.random.default_rng(seed)
     inside = mask.astype(np.uint8)
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
@@ -95,8 +94,12 @@ def fused_cloud(
     depths: Sequence[Float[np.ndarray, "h w"]],
     n_points: int,
     seed: int | np.random.Generator,
-) -> PointCloud:
-    """At most `n_points` object points of the views' known depths, drawn at random, in the views' world."""
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Sample at most `n_points` points of the object from the depth maps of all views.
+
+    Returns:
+        World points, unit normals and 8-bit colours.
+    """
     rng = np.random.default_rng(seed)
     points, normals, colours = [], [], []
     for view, depth in zip(views, depths, strict=True):
@@ -106,16 +109,24 @@ def fused_cloud(
         colours.append(view.rgb[row, col])
     points, normals, colours = (np.concatenate(values) for values in (points, normals, colours))
     chosen = np.sort(rng.choice(len(points), min(n_points, len(points)), replace=False))
-    return PointCloud(points[chosen], normals[chosen].astype(np.float64), colours[chosen])
+    return points[chosen], normals[chosen].astype(np.float64), colours[chosen]
 
 
-def observe(
+def simulate_capture(
     sequence: RenderedSequence, name: str, seed: int | np.random.Generator
 ) -> tuple[SequenceData, RenderedSequence]:
-    """The sequence as CO3D would hold it, and its exact twin in the same unit.
+    """Convert an exact rendering to a sequence with the errors of CO3D's data.
 
-    The unit of the world is set so that the point cloud has unit standard deviation, averaged over its axes;
-    cameras and depth follow. The quality scores are drawn from the range of sequences worth labelling.
+    The world is scaled so that the point cloud has unit standard deviation, averaged over its axes. The quality
+    scores are drawn from the range of the sequences that the paper labels.
+
+    Args:
+        sequence: Exact rendering.
+        name: Name of the sequence.
+        seed: Seed or source of the draws.
+
+    Returns:
+        The sequence with simulated depth, masks and point cloud, and the exact rendering in the same unit.
     """
     rng = np.random.default_rng(seed)
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
@@ -124,8 +135,8 @@ def observe(
         shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)
         depths.append(stereo_depth(view, rng, *shares))
         masks.append(soft_mask(view.mask, rng))
-    cloud = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
-    factor = round(float(1 / cloud.points.std(0).mean()), 9)
+    points, normals, colours = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
+    factor = round(float(1 / points.std(0).mean()), 9)
     exact = rescaled(sequence, factor)
     frames = [
         Frame(view.rgb, depth * np.float32(factor), mask, view.camera, f"{name}/{number}")
@@ -135,9 +146,9 @@ def observe(
         name=name,
         frames=frames,
         timestamps=sequence.timestamps,
-        points=cloud.points * factor,
-        colours=cloud.colours,
-        normals=cloud.normals,
+        points=points * factor,
+        colours=colours,
+        normals=normals,
         viewpoint_quality=round(rng.uniform(1.3, 3.0), 4),
         point_cloud_quality=round(rng.uniform(0.35, 1.0), 4),
         depth_scale_adjustment=round(rng.uniform(0.4, 2.5), 4),

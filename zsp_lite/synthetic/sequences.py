@@ -1,4 +1,4 @@
-"""A hand-held camera walks around an object: the renderings of one sequence, in a world of its own."""
+"""Rendered sequences: a hand-held camera moves once around an object."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,15 +13,18 @@ from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.render import Rendering, Scene, orbit_pose
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
-_FRAME_MARGIN = 0.03  # the object keeps this share of each image side free at either end
+_FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedSequence:
-    """Views of one object and the frame they live in.
+    """Exact views of one object, and the pose of the object in the world of the sequence.
 
-    The cameras of `views` map the sequence's world to theirs. `object_pose` (4, 4, rigid) and `scale` place
-    the object: `world = R @ (scale * canonical) + t`. `timestamps` are in seconds.
+    Attributes:
+        views: Renderings; their cameras map from the world.
+        timestamps: Time of each view in seconds.
+        object_pose: Rigid transform [R t] of the object: `world = R @ (scale * canonical) + t`.
+        scale: Scale of the object.
     """
 
     views: tuple[Rendering, ...]
@@ -30,12 +33,12 @@ class RenderedSequence:
     scale: float
 
     def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """World points of canonical object coordinates."""
+        """Map canonical object coordinates to world coordinates."""
         return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
 
 
 def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
-    """(height, width) of a square, upright or wide picture whose shorter side is `image_size` pixels."""
+    """Draw (height, width) of a square, portrait or landscape picture whose shorter side has `image_size` pixels."""
     rng = np.random.default_rng(seed)
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     unit = image_size / min(tall, wide)
@@ -45,10 +48,20 @@ def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, 
 def handheld_sweep(
     vertices: Float[np.ndarray, "v 3"], seed: int | np.random.Generator, frames: int, size: tuple[int, int]
 ) -> list[Camera]:
-    """`frames` cameras of (height, width) `size` once around the object, in the frame of its vertices.
+    """Draw the cameras of a hand-held camera that moves once around the object.
 
-    The walk starts anywhere and goes either way; height, distance, aim and roll drift and shake. One focal
-    length for all, so that the object fills 55 to 75 % of the shorter image side in the typical view and is never cut.
+    The start and the direction are random. Elevation, distance, viewing direction and roll change smoothly, with
+    jitter. All cameras share one focal length: the object fills 55 to 75 % of the shorter image side in the median
+    view and is inside the image in all views.
+
+    Args:
+        vertices: Vertices of the object.
+        seed: Seed or source of the draws.
+        frames: Number of cameras.
+        size: (height, width) of the images in pixels.
+
+    Returns:
+        Cameras that map from the coordinates of the vertices.
     """
     rng = np.random.default_rng(seed)
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
@@ -65,7 +78,7 @@ def handheld_sweep(
     aim = (vertices.max(0) + vertices.min(0)) / 2 + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
     poses = [orbit_pose(*view) for view in zip(azimuth, elevation, roll, distance, aim, strict=True)]
 
-    # Corners of the object's image at focal length 1, relative to the optical axis.
+    # Bounding box of the object's image at focal length 1, relative to the optical axis.
     plane = [(v := vertices @ R.T + t)[:, :2] / v[:, 2:] for R, t in poses]
     low, high = np.array([p.min(0) for p in plane]), np.array([p.max(0) for p in plane])
     sides = np.array(size[::-1], float)
@@ -78,32 +91,40 @@ def handheld_sweep(
 
 
 def render_sequence(shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int) -> RenderedSequence:
-    """Render `frames` views around `shape`; the same seed gives the same pictures.
+    """Render views around an object; the same seed gives the same pictures.
 
-    The shorter image side has `image_size` pixels. The world is the first camera's frame, so where the object
-    stands in it, and where it faces, says nothing about its category. The room always has a floor: structure
-    from motion needs something that stands still around the object.
+    The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
+    There is always a floor, because structure from motion needs a static background.
+
+    Args:
+        shape: Object.
+        seed: Seed or source of the draws.
+        frames: Number of views.
+        image_size: Shorter image side in pixels.
+
+    Returns:
+        The exact views, without sensor errors other than pixel noise.
     """
     rng = np.random.default_rng(seed)
     scene = Scene(shape)
-    look = replace(random_appearance(rng), has_ground=True)
+    appearance = replace(random_appearance(rng), has_ground=True)
     cameras = handheld_sweep(scene.vertices, rng, frames, image_shape(image_size, rng))
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
-    # The last digits of sines and products depend on the processor: rounded, files are equal on any of them.
-    tidy = partial(np.round, decimals=9)
+    # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
+    rounded = partial(np.round, decimals=9)
     views = []
     for camera in cameras:
-        exposed = replace(look, gain=look.gain * np.exp(rng.normal(0, 0.02)))
+        exposed = replace(appearance, gain=appearance.gain * np.exp(rng.normal(0, 0.02)))
         view = scene.render(camera, exposed, rng)
-        pose = tidy(camera.matrix @ to_object) + 0.0  # no negative zeros
+        pose = rounded(camera.matrix @ to_object) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
-    return RenderedSequence(tuple(views), tuple(seconds.tolist()), tidy(first), 1.0)
+    return RenderedSequence(tuple(views), tuple(seconds.tolist()), rounded(first), 1.0)
 
 
 def rescaled(sequence: RenderedSequence, factor: float) -> RenderedSequence:
-    """The same sequence with the unit of its world changed: all lengths times `factor`; canonical stays."""
+    """Multiply all lengths of the world by `factor`; canonical coordinates stay."""
     views = tuple(
         replace(view, depth=view.depth * np.float32(factor), camera=replace(view.camera, t=view.camera.t * factor))
         for view in sequence.views

@@ -1,8 +1,8 @@
-"""The categories by which trained backbones are compared: none is trained on, none is part of the benchmark.
+"""The categories for choosing between trained backbones; none is trained on, none is part of the benchmark.
 
-Which of several backbones is best on categories that it has not seen cannot be asked of the training categories, and
-must not be chosen by the evaluation categories. Each generator builds one object from the draws of its Assembly:
-front +x, up +z, left +y.
+The training categories cannot show how a backbone generalises to new categories, and the evaluation categories must
+not be used for model selection. Each generator builds one object from the draws of its Assembly: front +x, left +y,
+up +z.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ _QUARTER_TURN = np.pi / 2
 
 
 def _wheel(a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True) -> None:
-    """A wheel that stands on the ground and turns about y."""
-    a.add(cylinder(radius, radius, width, 20).turned("x", _QUARTER_TURN).moved((x, y, radius)), 3, mirror)
+    """Add a wheel with its hub on the ground, with its axis along y."""
+    a.add(cylinder(radius, radius, width, 20).rotated("x", _QUARTER_TURN).translated((x, y, radius)), 3, mirror)
     hub = cylinder(radius * 0.5, radius * 0.5, width * 1.2, 12)
-    a.add(hub.turned("x", _QUARTER_TURN).moved((x, y, radius)), 4, mirror)
+    a.add(hub.rotated("x", _QUARTER_TURN).translated((x, y, radius)), 4, mirror)
 
 
 def helicopter(a: Assembly) -> None:
@@ -26,12 +26,12 @@ def helicopter(a: Assembly) -> None:
     a.add(ellipsoid((length * 0.5, r * 0.85, r * 0.7), (length * 0.55, 0, z + 0.05)), 4)
     tail = np.array([-length - a.u(0.6, 1.0), 0, z + a.u(0.1, 0.3)])
     a.add(rod((-length * 0.7, 0, z + 0.05), tail, r * 0.4, 0.07), 0)
-    a.add(extrusion([[0.1, 0], [-0.12, 0], [-0.25, 0.4], [-0.1, 0.4]], 0.05).moved(tail), 1)
-    blades, phase, reach = 2 + a.pick(3), a.u(0, 3), a.u(0.9, 1.3)
+    a.add(extrusion([[0.1, 0], [-0.12, 0], [-0.25, 0.4], [-0.1, 0.4]], 0.05).translated(tail), 1)
+    blades, phase, reach = 2 + a.choice(3), a.u(0, 3), a.u(0.9, 1.3)
     top = z + r * 1.2 + 0.2
     a.add(rod((0, 0, z), (0, 0, top), 0.05), 2)
     for k in range(blades):
-        blade = box((reach, 0.11, 0.03), (reach / 2, 0, top)).turned("z", phase + 2 * np.pi * k / blades)
+        blade = box((reach, 0.11, 0.03), (reach / 2, 0, top)).rotated("z", phase + 2 * np.pi * k / blades)
         a.add(blade, 2)
     a.add(torus(0.2, 0.025, (0, 1, 0), tail + [0, 0.08, 0.05]), 3)
     if a.chance(0.7):
@@ -47,7 +47,7 @@ def wheelbarrow(a: Assembly) -> None:
     length, w, wheel = a.u(0.9, 1.2), a.u(0.55, 0.8), a.u(0.2, 0.32)
     z, depth = wheel + a.u(0.15, 0.3), a.u(0.25, 0.45)
     side = [[-length / 2, z + depth], [-length * 0.3, z], [length * 0.25, z], [length * a.u(0.55, 0.75), z + depth]]
-    a.add(extrusion(side, 0.05).moved((0, w / 2, 0)), 0, mirror=True)
+    a.add(extrusion(side, 0.05).translated((0, w / 2, 0)), 0, mirror=True)
     a.add(box((length * 0.6, w, 0.05), (0, 0, z)), 0)
     a.add(rod((length * 0.3, 0, z + 0.02), (length * 0.6, 0, z + depth * 0.9), w * 0.45, w * 0.5), 0)
     grip = np.array([-length / 2 - a.u(0.4, 0.7), w * 0.4, z + a.u(0.1, 0.4)])
@@ -67,14 +67,14 @@ def watering_can(a: Assembly) -> None:
     a.add(rod((r * 0.7, 0, h), tip * [0.8, 1, 1] - [0, 0, 0.15], 0.025), 2)
     a.add(torus(h * a.u(0.3, 0.4), 0.05, (0, 1, 0), (-r * 0.85, 0, h * 0.55), np.pi * 0.95, np.pi * 2.05), 2)
     if a.chance(0.5):
-        a.add(cylinder(r * 1.05, r * 1.05, 0.08, 20).moved((0, 0, h * a.u(0.3, 0.7))), 3)
+        a.add(cylinder(r * 1.05, r * 1.05, 0.08, 20).translated((0, 0, h * a.u(0.3, 0.7))), 3)
 
 
 def vacuum_cleaner(a: Assembly) -> None:
     length, r = a.u(0.5, 0.75), a.u(0.28, 0.4)
     a.add(capsule((-length, 0, r + 0.08), (length * 0.6, 0, r + 0.05), r, r * a.u(0.7, 0.95)), 0)
     a.add(box((length * 0.8, r * 1.1, 0.12), (-length * 0.4, 0, 2 * r + 0.05)), 1)
-    a.add(cylinder(0.12, 0.12, 0.1).moved((length * 0.1, 0, 2 * r + 0.08)), 2)
+    a.add(cylinder(0.12, 0.12, 0.1).translated((length * 0.1, 0, 2 * r + 0.08)), 2)
     _wheel(a, -length * 0.9, r * 0.95, a.u(0.2, 0.32), 0.1)
     hose = np.array([length * 0.6 + r + 0.3, 0, r + a.u(0.3, 0.6)])
     a.add(rod((length * 0.6, 0, r), hose, 0.07), 3)
@@ -128,7 +128,7 @@ def mailbox(a: Assembly) -> None:
     a.add(box((0.04, r * 1.6, r * 1.3), (length / 2 + 0.02, 0, h + r * 0.8)), 1)
     a.add(box((0.08, 0.12, 0.06), (length / 2 + 0.06, 0, h + r * 1.4)), 3)
     a.add(rod((0, 0, 0), (a.u(-0.1, 0.1), 0, h), a.u(0.06, 0.1)), 2)
-    a.add(cylinder(a.u(0.2, 0.4), 0.15, 0.1).moved((0, 0, 0.05)), 2)
+    a.add(cylinder(a.u(0.2, 0.4), 0.15, 0.1).translated((0, 0, 0.05)), 2)
     flag = a.u(-0.1, 0.3) * length
     a.add(rod((flag, r, h + r), (flag, r + 0.05, h + 2 * r + 0.2), 0.025), 3)
     a.add(box((0.22, 0.03, 0.16), (flag - 0.1, r + 0.05, h + 2 * r + 0.2)), 4)
@@ -146,7 +146,7 @@ def excavator(a: Assembly) -> None:
     a.add(rod((length * 0.35, -side * 0.6, 0.6), elbow, 0.1, 0.08), 0)
     a.add(rod(elbow, wrist, 0.08, 0.06), 0)
     scoop = [[0.12, 0.05], [-0.15, -0.05], [-0.22, -0.35], [0.02, -0.4]]
-    a.add(extrusion(scoop, w * a.u(0.35, 0.55)).moved(wrist), 2)
+    a.add(extrusion(scoop, w * a.u(0.35, 0.55)).translated(wrist), 2)
     a.add(rod((-length * 0.3, w * 0.25, 0.8), (-length * 0.3, w * 0.25, 1.1), 0.05), 3)
 
 
@@ -183,11 +183,11 @@ def skateboard(a: Assembly) -> None:
     length, w, z = a.u(1.6, 2.2), a.u(0.4, 0.55), 0.25
     a.add(box((length * 0.66, w, 0.05), (0, 0, z)), 0)
     for end, reach, rise in ((1, a.u(0.2, 0.3), a.u(0.35, 0.6)), (-1, a.u(0.14, 0.22), a.u(0.15, 0.35))):
-        deck = box((length * reach, w * 0.92, 0.05), (length * reach / 2 - 0.01, 0, 0)).turned("y", -rise)
-        deck = deck if end == 1 else deck.turned("z", np.pi)
-        a.add(deck.moved((end * length * 0.33, 0, z)), 0)
+        deck = box((length * reach, w * 0.92, 0.05), (length * reach / 2 - 0.01, 0, 0)).rotated("y", -rise)
+        deck = deck if end == 1 else deck.rotated("z", np.pi)
+        a.add(deck.translated((end * length * 0.33, 0, z)), 0)
     for x in (-0.24 * length, 0.26 * length):
-        a.add(cylinder(0.09, 0.09, 0.1).turned("x", _QUARTER_TURN).moved((x, w * 0.42, 0.09)), 2, mirror=True)
+        a.add(cylinder(0.09, 0.09, 0.1).rotated("x", _QUARTER_TURN).translated((x, w * 0.42, 0.09)), 2, mirror=True)
         a.add(rod((x, -w * 0.4, 0.1), (x, w * 0.4, 0.1), 0.04), 1)
         a.add(box((0.2, 0.15, 0.12), (x, 0, 0.18)), 1)
     a.add(box((length * 0.25, w * 0.98, 0.02), (length * a.u(0.05, 0.15), 0, z + 0.03)), 3)
@@ -198,8 +198,8 @@ def tram(a: Assembly) -> None:
     rake, belt, roof = a.u(0.1, 0.3), floor + h * 0.45, floor + h
     front, rear = [[length / 2, floor], [length / 2, belt]], [[-length / 2, roof], [-length / 2, floor]]
     a.add(extrusion([*front, [length / 2 - rake, roof], *rear], w), 0)
-    screen = box((0.03, w * 0.8, h * 0.36)).turned("y", -np.arctan(rake / (roof - belt)))
-    a.add(screen.moved((length / 2 - rake / 2 + 0.01, 0, (belt + roof) / 2)), 4)
+    screen = box((0.03, w * 0.8, h * 0.36)).rotated("y", -np.arctan(rake / (roof - belt)))
+    a.add(screen.translated((length / 2 - rake / 2 + 0.01, 0, (belt + roof) / 2)), 4)
     a.add(box((0.03, w * 0.5, h * 0.3), (-length / 2, 0, (belt + roof) / 2)), 4)
     for k in range(4):
         a.add(box((length * 0.15, 0.03, h * 0.3), ((k - 1.6) * length * 0.2, w / 2, (belt + roof) / 2)), 4, mirror=True)
@@ -212,7 +212,8 @@ def tram(a: Assembly) -> None:
     a.add(box((0.05, w * 0.7, 0.03), arm), 3)
 
 
-# The last four, long bodies whose ends differ in details only, were made to look into half turns (see the model card).
+# The last four are long bodies whose ends differ only in details. They measure errors of half a turn (see the model
+# card).
 VALIDATION = {
     generator.__name__: generator
     for generator in (

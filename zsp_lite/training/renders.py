@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_arrays
 from zsp_lite.synthetic.appearance import random_appearance
-from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_sibling
+from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_variant
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 
@@ -50,7 +50,7 @@ def render_object(
     a quarter turn from one another: the two of a pair are 5 to 45 degrees of azimuth apart, about as far as a reference
     is from the nearest of a few target views, and never farther than two of different pairs; every side's opposite is
     there too.
-    Every view shows a copy with other proportions (`make_sibling`, by that amount), gently deformed (`deform`), now and
+    Every view shows a copy with other proportions (`make_variant`, by that amount), gently deformed (`deform`), now and
     then without one of its parts, under its own materials, light and room, so that only what all views share, the
     object's build, can tell one place from another.
     """
@@ -67,7 +67,7 @@ def render_object(
         if view % 2 == 0:
             azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*APART)
             elevation = rng.uniform(-0.05, 0.9)
-        scene = _altered(shape, make_sibling(generator, [seed, 1], rng, proportions), rng, deformation)
+        scene = _altered(shape, make_variant(generator, [seed, 1], rng, proportions), rng, deformation)
         R, t = orbit_pose(
             azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
             rng.uniform(5, 10), scene.centre,

@@ -34,7 +34,7 @@ from zsp_lite.errors import InputError
 if TYPE_CHECKING:
     from ipywidgets import ValueWidget, VBox
 
-    from zsp_lite.synthetic.truth import TruePair
+    from zsp_lite.synthetic.ground_truth import GroundTruthPair
     from zsp_lite.views import View
 
 _LABEL = {"description_width": "initial"}
@@ -167,15 +167,15 @@ def show(figure: Figure, alt: str) -> None:
 
 
 @cache
-def example_truth() -> "TruePair":
+def example_truth() -> "GroundTruthPair":
     """The true correspondences of a sample pair; for trying widgets out."""
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import demo_pairs
-    from zsp_lite.synthetic.truth import true_pair
+    from zsp_lite.synthetic.ground_truth import ground_truth_pair
 
     dataset = Co3D(sample_data())
-    return true_pair(dataset, demo_pairs(dataset)[-1])
+    return ground_truth_pair(dataset, demo_pairs(dataset)[-1])
 
 
 @cache

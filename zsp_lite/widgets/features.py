@@ -15,7 +15,7 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.errors import InputError
 from zsp_lite.matching import plain_similarities, similarity
-from zsp_lite.synthetic.truth import hits
+from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
@@ -102,7 +102,7 @@ def facets(
 ) -> "VBox":
     """Choose a patch, and by which layer and facet it is described; see its nearest neighbour and its true partner.
 
-    features: of both images by (layer, facet).  partners, found: as `synthetic.truth.true_partners` gives them.
+    features: of both images by (layer, facet).  partners, found: as `ground_truth_matches` returns them.
     """
     layers, names = sorted({layer for layer, _ in features}), list(dict.fromkeys(facet for _, facet in features))
     grid = found.shape
@@ -111,7 +111,7 @@ def facets(
     def compared(layer: int, facet: str) -> tuple[np.ndarray, np.ndarray, float]:
         sim = similarity(*features[layer, facet])
         nearest = np.stack(np.divmod(sim.argmax(1).numpy(), grid[1]), -1).reshape(*grid, 2)
-        return sim.numpy(), nearest, hits(nearest, partners)[found].mean()
+        return sim.numpy(), nearest, correct_matches(nearest, partners)[found].mean()
 
     panels = _SimilarityPanels(reference, [target], grid, ["similarity to the framed patch"])
 
@@ -253,14 +253,14 @@ def example_facets() -> "VBox":
     truth = example_truth()
     found = all_facets(load_backbone("zsp-tiny", "cpu"), [truth.reference.rgb, truth.target.rgb])
     features = {name: tuple(values[:, 1:].unflatten(1, (28, 28))) for name, values in found.items()}
-    return facets(truth.reference.rgb, truth.target.rgb, features, truth.partners, truth.found)
+    return facets(truth.reference.rgb, truth.target.rgb, features, truth.cells, truth.valid)
 
 
 def example_context() -> "VBox":
     """`context` on a sample pair."""
     truth, views = example_truth(), example_pair()
     keys = tuple(view.features.keys for view in views)
-    return context(truth.reference.rgb, truth.target.rgb, keys, truth.partners, truth.found)
+    return context(truth.reference.rgb, truth.target.rgb, keys, truth.cells, truth.valid)
 
 
 def example_saliency() -> "VBox":

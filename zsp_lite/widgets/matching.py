@@ -12,7 +12,7 @@ from torch import Tensor
 
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import match, nearest_neighbours, similarity
-from zsp_lite.synthetic.truth import hits
+from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
@@ -105,7 +105,7 @@ def matches(
 ) -> "VBox":
     """Choose how matches are made, how many, and whether k-means spreads them; see which of them are right.
 
-    partners, found: as `synthetic.truth.true_partners` gives them.
+    partners, found: as `synthetic.ground_truth.ground_truth_matches` gives them.
     """
     grid = reference.features.grid
     height, width = reference.frame.rgb.shape[:2]
@@ -136,7 +136,7 @@ def matches(
     def update(way: str, k: int, kmeans: bool) -> str:
         made = chosen(way, k, kmeans)
         known = found[tuple(made.reference.T)]
-        right = hits(made.target, partners[tuple(made.reference.T)]) & known
+        right = correct_matches(made.target, partners[tuple(made.reference.T)]) & known
         ends = np.stack(
             [
                 plots.patch_centres(made.reference, grid, (height, width)),
@@ -171,4 +171,4 @@ def example_cycle() -> "VBox":
 def example_matches() -> "VBox":
     """`matches` on a sample pair."""
     views, truth = example_pair(), example_truth()
-    return matches(*views, similarity(*(view.features for view in views)), truth.partners, truth.found)
+    return matches(*views, similarity(*(view.features for view in views)), truth.cells, truth.valid)

@@ -1,14 +1,14 @@
-"""Evaluation categories of the road. Each generator builds one object: front +x, up +z, left +y."""
+"""Evaluation categories of the street (front +x, left +y, up +z)."""
 
 import numpy as np
 
 from zsp_lite.synthetic.assembly import Assembly
-from zsp_lite.synthetic.evaluation_parts import Y, pane, rounded_box, tapered, wheel_pair
-from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, rod, torus
+from zsp_lite.synthetic.evaluation_parts import Y, bolt_circle, pane, rounded_box, tapered, wheel_pair
+from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 
 def bicycle(a: Assembly) -> None:
-    """Diamond or step-through frame; flat, swept or drop bars; basket, rack, mudguards."""
+    """Build a bicycle: diamond or step-through frame; flat, swept or drop bars; optional basket, rack, mudguards."""
     wheel, tyre, tube = a.u(0.36, 0.52), a.u(0.022, 0.05), a.u(0.028, 0.048)
     half_base = a.u(0.5, 0.66)
     front, rear = np.array([half_base, 0, wheel]), np.array([-half_base, 0, wheel])
@@ -35,7 +35,7 @@ def bicycle(a: Assembly) -> None:
     stem = head + [0.02, 0, a.u(0.08, 0.2)]
     a.add(rod(head, stem, tube), 2)
     reach = a.u(0.25, 0.4)
-    style = a.pick(3)
+    style = a.choice(3)
     if style == 0:
         a.add(rod(stem, stem + [-0.03, reach, 0.02], 0.024), 3, mirror=True)
     elif style == 1:
@@ -51,8 +51,8 @@ def bicycle(a: Assembly) -> None:
         pedal = crank + [foot, side * 0.13, -foot]
         a.add(rod(crank + [0, side * 0.09, 0], pedal, 0.02), 2)
         a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), 3)
-    # The chain ring is on the right of every bicycle.
-    a.add(cylinder(0.12, 0.12, 0.02).turned("x", np.pi / 2).moved(crank - [0, 0.06, 0]), 2)
+    # The chain ring of a bicycle is on its right side.
+    a.add(cylinder(0.12, 0.12, 0.02).rotated("x", np.pi / 2).translated(crank - [0, 0.06, 0]), 2)
     if a.chance(0.35):
         a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), 5)
     if a.chance(0.4):
@@ -64,8 +64,8 @@ def bicycle(a: Assembly) -> None:
 
 
 def motorcycle(a: Assembly) -> None:
-    """Cruiser, sport machine with fairing, or scooter with leg shield; the exhaust is on the right."""
-    style = a.pick(3)
+    """Build a cruiser, a sport motorcycle with a fairing, or a scooter with a leg shield; exhaust on the right."""
+    style = a.choice(3)
     scooter = style == 2
     wheel = a.u(0.26, 0.32) if scooter else a.u(0.36, 0.46)
     tyre = a.u(0.07, 0.11)
@@ -73,8 +73,8 @@ def motorcycle(a: Assembly) -> None:
     front, rear = np.array([half_base, 0, wheel]), np.array([-half_base, 0, wheel])
     for hub in (front, rear):
         a.add(torus(wheel - tyre, tyre, Y, hub), 3)
-        a.add(cylinder(wheel * 0.62, wheel * 0.62, 0.06, 16).turned("x", np.pi / 2).moved(hub), 2)
-        a.add(cylinder(wheel * 0.25, wheel * 0.25, 0.2, 12).turned("x", np.pi / 2).moved(hub), 2)
+        a.add(cylinder(wheel * 0.62, wheel * 0.62, 0.06, 16).rotated("x", np.pi / 2).translated(hub), 2)
+        a.add(cylinder(wheel * 0.25, wheel * 0.25, 0.2, 12).rotated("x", np.pi / 2).translated(hub), 2)
     a.add(torus(wheel + 0.04, 0.05, Y, rear, -1.5, 0.6, sides=14), 0)
     a.add(torus(wheel + 0.04, 0.05, Y, front, -0.8, 0.7, sides=14), 0)
 
@@ -111,12 +111,7 @@ def motorcycle(a: Assembly) -> None:
             a.add(rod(engine, engine + [lean, 0, 0.34], 0.12), 2)
         tank = np.array([head[0] * 0.45, 0, seat_height + 0.14])
         a.add(ellipsoid((a.u(0.28, 0.36), a.u(0.14, 0.19), a.u(0.13, 0.18)), tank), 0)
-        for start, end in (
-            (head, engine),
-            (head, tank),
-            (engine, rear),
-            (rear, rear * [0.8, 1, 1] + [0, 0, 0.35]),
-        ):
+        for start, end in ((head, engine), (head, tank), (engine, rear), (rear, rear * [0.8, 1, 1] + [0, 0, 0.35])):
             a.add(rod(np.add(start, [0, 0.04, 0]), np.add(end, [0, 0.06, 0]), 0.032), 2, mirror=True)
         a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_height), 3), 6)
         back = (-half_base * a.u(0.95, 1.25), seat_height + a.u(0.08, 0.25))
@@ -139,8 +134,8 @@ def motorcycle(a: Assembly) -> None:
 
 
 def car(a: Assembly) -> None:
-    """Saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
-    style = a.pick(4)
+    """Build a saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
+    style = a.choice(4)
     length, width = a.u(2.2, 2.8), a.u(0.95, 1.15)
     wheel = a.u(0.2, 0.27)
     sill, belt = wheel * a.u(0.6, 0.9), wheel * a.u(2.1, 2.5)
@@ -166,13 +161,13 @@ def car(a: Assembly) -> None:
     taper = a.u(0.76, 0.88)
     cabin = extrusion([rear_window, windscreen, roof_front, roof_rear], width * 0.92)
     a.add(tapered(cabin, belt, roof, taper), 0)
-    # Side windows: the cabin's outline, shrunk, a little wider, and cut by pillars.
+    # Side windows: the outline of the cabin, reduced in size, slightly wider, and divided by pillars.
     middle = np.mean([rear_window, windscreen, roof_front, roof_rear], axis=0)
     low_rear, low_front, top_front, top_rear = (
         middle + (np.array(corner) - middle) * [0.86, 0.7]
         for corner in (rear_window, windscreen, roof_front, roof_rear)
     )
-    n_windows = 1 if style == 2 else 2 + a.pick(2)
+    n_windows = 1 if style == 2 else 2 + a.choice(2)
     for k in range(n_windows):
         start, stop = (k + 0.04) / n_windows, (k + 0.96) / n_windows
         window = [
@@ -194,9 +189,7 @@ def car(a: Assembly) -> None:
         a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), 0)
     light_height = sill + (nose_height - sill) * 0.72
     a.add(
-        ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose - 0.01, width * 0.34, light_height)),
-        5,
-        mirror=True,
+        ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose - 0.01, width * 0.34, light_height)), 5, mirror=True
     )
     a.add(box((0.05, width * a.u(0.25, 0.4), a.u(0.07, 0.12)), (nose + 0.01, 0, light_height - 0.02)), 6)
     a.add(box((0.04, 0.1, a.u(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), 7, mirror=True)
@@ -211,3 +204,68 @@ def car(a: Assembly) -> None:
     if style in (1, 3) and a.chance(0.4):
         rail = (roof_front[0] - roof_rear[0]) * 0.8
         a.add(box((rail, 0.03, 0.05), (middle[0] - 0.05, width * 0.3, roof + 0.05)), 3, mirror=True)
+
+
+def hydrant(a: Assembly) -> None:
+    """Build a hydrant: barrel, flange and bonnet; large outlet at the front, small outlets at the sides; chain."""
+    radius, height = a.u(0.24, 0.36), a.u(0.9, 1.35)
+    neck = radius * a.u(0.85, 1)
+    a.add(
+        lathe(
+            [
+                [0.001, 0],
+                [radius * 1.45, 0],
+                [radius * 1.45, 0.09],
+                [radius, 0.11],
+                [neck, height * 0.75],
+                [radius * 1.22, height * 0.76],
+                [radius * 1.22, height * 0.82],
+                [neck, height * 0.83],
+            ],
+            24,
+        ),
+        0,
+    )
+    cap = height * 0.82
+    if a.chance(0.5):
+        dome = [[radius * np.cos(t), cap + height * 0.25 * np.sin(t)] for t in np.linspace(0, np.pi / 2, 7)]
+    else:
+        dome = [
+            [radius * 1.05, cap],
+            [radius * 0.9, cap + height * 0.14],
+            [radius * 0.35, cap + height * 0.2],
+            [0.001, cap + height * 0.22],
+        ]
+    a.add(lathe(dome, 24), 1 if a.chance(0.6) else 0)
+    top = max(point[1] for point in dome)
+    a.add(rod((0, 0, top - 0.04), (0, 0, top + a.u(0.07, 0.14)), 0.07, sides=6), 2)
+
+    outlet, bore = height * a.u(0.5, 0.64), a.u(0.15, 0.21)
+    reach = radius + a.u(0.14, 0.26)
+    a.add(rod((0, 0, outlet), (reach, 0, outlet), bore), 0)
+    a.add(rod((reach - 0.02, 0, outlet), (reach + 0.1, 0, outlet), bore * 1.2, sides=8), 1)
+    a.add(rod((reach + 0.08, 0, outlet), (reach + 0.18, 0, outlet), 0.055, sides=5), 2)
+    side_outlet, side_bore = outlet + a.u(-0.03, 0.13), a.u(0.09, 0.13)
+    side_reach = radius + a.u(0.1, 0.2)
+    a.add(rod((0, 0, side_outlet), (0, side_reach, side_outlet), side_bore), 0, mirror=True)
+    a.add(
+        rod((0, side_reach - 0.02, side_outlet), (0, side_reach + 0.08, side_outlet), side_bore * 1.22, sides=8),
+        1,
+        mirror=True,
+    )
+    a.add(rod((0, side_reach + 0.06, side_outlet), (0, side_reach + 0.14, side_outlet), 0.045, sides=5), 2, mirror=True)
+    for angle in np.arange(8) * TAU / 8 + 0.2:
+        a.add(
+            cylinder(0.035, 0.035, 0.05, 6).translated(
+                (radius * 1.27 * np.cos(angle), radius * 1.27 * np.sin(angle), 0.11)
+            ),
+            2,
+        )
+    if a.chance(0.5):
+        bolt_circle(a, (reach + 0.1, 0, outlet), bore * 0.85, 6, 0.025, 2)
+    if a.chance(0.6):
+        a.add(torus(a.u(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), 3)
+    if a.chance(0.4):
+        a.add(
+            lathe([[radius * 1.08, height * 0.2], [radius * 1.12, height * 0.22], [radius * 1.08, height * 0.3]], 24), 4
+        )

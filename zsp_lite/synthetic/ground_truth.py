@@ -1,0 +1,184 @@
+"""Ground-truth correspondences between views of synthetic objects, for evaluation only.
+
+The file `object_poses.json` of a category holds the pose of each sequence's object in its world. With the depth and
+the camera of a frame, it gives the point of the object that each patch shows (`patch_coordinates`), and for two views
+the patches that show the same point (`ground_truth_matches`). `ground_truth_pair` does both for an evaluation pair.
+
+Instances of a category have different proportions. Their points are therefore compared in box coordinates, from 0
+(rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
+"""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from sklearn.neighbors import NearestNeighbors
+
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.depth import patch_points
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.pairs import Pair
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import read_bytes
+from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
+from zsp_lite.views import object_crop, patch_mask
+
+_MARGIN = 0.05  # a point farther outside the box than this belongs to the background
+_MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
+
+_Row = tuple[float, float, float, float]
+
+
+class _Settings(msgspec.Struct):
+    seed: int
+
+
+class _Pose(msgspec.Struct):
+    trans: tuple[_Row, _Row, _Row, _Row]
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box.
+
+    `low` and `high` are the corners of the box in object coordinates.
+    """
+
+    R: Float[np.ndarray, "3 3"]
+    t: Float[np.ndarray, "3"]
+    scale: float
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+
+    def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
+        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
+
+    def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to box coordinates, 0 to 1 along each object axis."""
+        return (self.to_object(world) - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruthPair:
+    """Object crops of two instances of a category with their ground-truth matches.
+
+    Attributes:
+        category: Category of both.
+        reference: Object crop of the reference frame.
+        target: Object crop of the target frame.
+        cells: Matching target patch (row, col) of each reference patch, see `ground_truth_matches`.
+        valid: Reference patches that have a match.
+    """
+
+    category: str
+    reference: Frame
+    target: Frame
+    cells: Int[np.ndarray, "rows cols 2"]
+    valid: Bool[np.ndarray, "rows cols"]
+
+
+def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
+    """Read the object pose of every sequence of a category; the box is that of the exact mesh.
+
+    Returns:
+        Sequence name to pose.
+
+    Raises:
+        InputError: If the folder is not a synthetic export, or a file of the export is damaged.
+    """
+    settings, poses = dataset.root / SETTINGS_FILE, dataset.root / category / POSES_FILE
+    for path in (settings, poses):
+        if not path.is_file():
+            raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
+    seed = decode(read_bytes(settings, "settings"), _Settings, settings).seed
+    found = {}
+    for sequence, pose in decode(read_bytes(poses, "object poses"), dict[str, _Pose], poses).items():
+        trans, vertices = np.array(pose.trans), make_object(category, sequence, seed).vertices
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, low, high)
+    return found
+
+
+def patch_coordinates(
+    frame: Frame, pose: ObjectPose, grid: tuple[int, int]
+) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+    """Return the box coordinates of the object point that each patch shows.
+
+    Args:
+        frame: Frame, whole or cropped to the object, with depth and mask.
+        pose: Pose of the object in the world of the frame.
+        grid: Patches (rows, columns).
+
+    Returns:
+        Box coordinates, and the patches where they are known: the mask covers a quarter of the patch, an object pixel
+        of the patch has depth, and the point is inside the box.
+
+    Raises:
+        InputError: If the frame has no depth or no mask.
+    """
+    if frame.depth is None or frame.mask is None:
+        raise InputError(f"{frame.name or 'frame'}: expected a depth map and a mask for the coordinates of its patches")
+    # Object pixels only: the floor between the spokes of a bicycle is inside the box as well.
+    points, measured = patch_points(np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid)
+    coordinates = pose.to_box(frame.camera.to_world(points))
+    inside = (np.abs(coordinates - 0.5) <= 0.5 + _MARGIN).all(axis=-1)
+    return coordinates, measured & inside & patch_mask(frame, grid).numpy()
+
+
+def ground_truth_matches(
+    reference: tuple[Float[np.ndarray, "r1 c1 3"], Bool[np.ndarray, "r1 c1"]],
+    target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
+    tolerance: float = 0.1,
+) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
+    """Match each reference patch to the target patch with the nearest box coordinates.
+
+    Args:
+        reference: Coordinates and validity of the reference patches, from `patch_coordinates`.
+        target: The same of the target patches.
+        tolerance: Largest distance of a match in box coordinates.
+
+    Returns:
+        Target patch (row, col) of each reference patch, and the reference patches that have a match. Patches without
+        a match (not visible in the target view, or unknown) have the cell (0, 0).
+    """
+    (points, known), (target_points, target_known) = reference, target
+    cells, valid = np.zeros((*known.shape, 2), int), np.zeros_like(known)
+    if known.any() and target_known.any():
+        search = NearestNeighbors(n_neighbors=1).fit(target_points[target_known])
+        distance, index = search.kneighbors(points[known])
+        cells[known] = np.argwhere(target_known)[index[:, 0]]
+        valid[known] = distance[:, 0] <= tolerance
+        cells[~valid] = 0
+    return cells, valid
+
+
+def correct_matches(
+    cells: Int[np.ndarray, "*batch 2"], true_cells: Int[np.ndarray, "*batch 2"], tolerance: float = 1
+) -> Bool[np.ndarray, "*batch"]:
+    """Return which cells (row, col) are within `tolerance` patches of the true cells, in rows and in columns."""
+    return np.abs(np.asarray(cells) - true_cells).max(axis=-1) <= tolerance
+
+
+def ground_truth_pair(dataset: Co3D, pair: Pair, grid: tuple[int, int] = (28, 28)) -> GroundTruthPair:
+    """Load a pair with its ground-truth matches, for the target view that has the most of them.
+
+    Args:
+        dataset: Synthetic export.
+        pair: Evaluation pair.
+        grid: Patches (rows, columns).
+
+    Raises:
+        InputError: If the folder is not a synthetic export, or lacks a frame of the pair.
+    """
+    poses = object_poses(dataset, pair.category)
+    reference, targets = dataset.load_pair(pair)
+    reference, targets = object_crop(reference), [object_crop(target) for target in targets]
+    coordinates = patch_coordinates(reference, poses[pair.reference_sequence], grid)
+    target_pose = poses[pair.target_sequence]
+    matches = [ground_truth_matches(coordinates, patch_coordinates(target, target_pose, grid)) for target in targets]
+    best = int(np.argmax([valid.sum() for _, valid in matches]))
+    return GroundTruthPair(pair.category, reference, targets[best], *matches[best])
