@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3, _draw_samples, ransac, umeyama
 from zsp_lite.errors import InputError
@@ -248,6 +249,42 @@ def test_scales_out_of_range_are_not_considered():
     with pytest.raises(InputError, match="scale"):
         ransac(source, 10 * source, scale_range=(0.2, 5))
     assert ransac(source, 10 * source, scale_range=(1, 20))[0].scale == pytest.approx(10)
+
+
+def shrunk_target(seed: int):
+    """Points whose inliers fit a scale below 0.2, though samples of them fit scales above."""
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(40, 3))
+    return source, 0.19 * source + 0.05 * rng.normal(size=(40, 3))
+
+
+def test_the_final_fit_keeps_to_the_scale_range():
+    source, target = shrunk_target(0)
+    free, _ = ransac(source, target)
+    assert free.scale < 0.2
+    bounded, inliers = ransac(source, target, scale_range=(0.2, 5))
+    assert bounded.scale == 0.2
+
+    # No other similarity of that scale fits the inliers better: the best rotation and translation by scipy.
+    x, y = source[inliers], target[inliers]
+    expected, _ = Rotation.align_vectors(y - y.mean(axis=0), x - x.mean(axis=0))
+    np.testing.assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"trials": 10.5}, {"trials": True}, {"sample_size": 3.5}, {"seed": -1}, {"seed": 0.5}, {"scale_range": (2, 1)}],
+    ids=str,
+)
+def test_settings_of_ransac_out_of_range_are_refused(settings):
+    with pytest.raises(InputError, match=next(iter(settings))):
+        ransac(cloud(0), cloud(0), **settings)
+
+
+def test_the_repr_of_a_similarity_has_at_most_five_lines():
+    text = repr(similarity(0))
+    assert "scale=1.3000" in text and text.count("\n") < 5
 
 
 def test_fewer_points_than_a_sample_are_refused():

@@ -37,7 +37,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import object_crop
+from zsp_lite.views import object_crop
 
 
 def torchvision_shapes() -> dict[str, tuple[int, ...]]:

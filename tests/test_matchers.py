@@ -7,8 +7,8 @@ import torch
 from test_matching import feature_map
 
 from zsp_lite.errors import InputError
-from zsp_lite.matchers import MATCHERS, dual_softmax, mutual, optimal_transport, sinkhorn
-from zsp_lite.matching import match, plain_similarities
+from zsp_lite.matchers import MATCHERS, dual_softmax, mutual_nearest_neighbours, optimal_transport, sinkhorn
+from zsp_lite.matching import key_similarities, match
 from zsp_lite.pipeline import ZeroShotPose
 
 
@@ -44,7 +44,7 @@ def test_the_dual_softmax_is_the_product_of_two_softmaxes():
 
 def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
     sim, (on1, on2) = similarities(), masks()
-    partner, score = mutual(sim, on1, on2)
+    partner, score = mutual_nearest_neighbours(sim, on1, on2)
     hidden = sim.clone()
     hidden[~on1] = hidden[:, ~on2] = -1
     for u in range(len(sim)):
@@ -85,7 +85,7 @@ def test_your_own_matcher_goes_where_a_name_would():
 
 def test_plain_similarity_is_the_cosine_of_the_keys():
     first, second = feature_map(5), feature_map(6)
-    (found,) = plain_similarities(first, [second])
+    (found,) = key_similarities(first, [second])
     u, v = first.keys[2, 3], second.keys[4, 5]
     assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(float(u @ v / u.norm() / v.norm()), abs=1e-6)
 

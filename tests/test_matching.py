@@ -14,9 +14,9 @@ from zsp_lite.matching import (
     _cluster,
     _gram,
     cyclical_distances,
+    key_similarities,
     match,
     nearest_neighbours,
-    plain_similarities,
     similarities,
     similarity,
 )
@@ -180,7 +180,7 @@ def test_bare_keys_are_clustered_as_bare_keys():
     np.testing.assert_allclose(_gram(features, index, False), expected.numpy(), atol=1e-6)
     assert np.abs(_gram(features, index, True) - expected.numpy()).max() > 0.1
     bare, binned = (match(features, feature_map(4), k=20, binning=binning) for binning in (False, True))
-    (sim,) = plain_similarities(features, [feature_map(4)])
+    (sim,) = key_similarities(features, [feature_map(4)])
     np.testing.assert_array_equal(bare.target, match(features, feature_map(4), k=20, binning=False, sim=sim).target)
     assert not np.array_equal(bare.target, binned.target)
 
@@ -294,7 +294,7 @@ def test_from_the_target_salience_is_the_targets():
     assert [4, 4] in chosen
 
 
-@pytest.mark.parametrize("options", [{"k": 0}, {"cycle_from": "both"}])
+@pytest.mark.parametrize("options", [{"k": 0}, {"k": 2.5}, {"seed": -1}, {"cycle_from": "both"}])
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(InputError, match="match"):
         match(feature_map(0), feature_map(1), **options)

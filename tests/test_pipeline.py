@@ -11,8 +11,9 @@ from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import PoseEstimate, ZeroShotPose, extract_views, match_points, object_crop, patch_mask
+from zsp_lite.pipeline import PoseEstimate, ZeroShotPose, match_points, view_alignment
 from zsp_lite.verified import VerifiedSolver
+from zsp_lite.views import extract_views, object_crop, patch_mask
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +147,36 @@ def test_a_frame_without_a_mask_is_taken_whole(reference):
     whole = object_crop(replace(reference, mask=None))
     assert whole.rgb.shape == (224, 224, 3)
     np.testing.assert_allclose(whole.camera.principal_point, 112)
+
+
+def test_crops_have_the_size_that_the_backbone_takes(reference, targets):
+    class Large(CoordinateBackbone):
+        image_size = 448
+
+    estimate = ZeroShotPose(Large()).estimate(reference, targets[:2])
+    assert {view.frame.rgb.shape for view in (estimate.reference_view, *estimate.target_views)} == {(448, 448, 3)}
+    np.testing.assert_allclose(
+        ZeroShotPose(Large()).views([replace(reference, mask=None)])[0].frame.camera.K[:2, 2], 224
+    )
+
+
+def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, reference):
+    # The same view in a world of half the unit, shifted along the ray: all points are half as far.
+    near = replace(reference, depth=reference.depth / 2)
+    first, second = method.views([reference, near])
+    sim3 = view_alignment(first, second)
+    assert sim3.scale == pytest.approx(0.5, rel=1e-4)
+    points, known = first.patch_points
+    np.testing.assert_allclose(sim3.apply(points[known]), second.patch_points[0][known], atol=1e-3)
+
+
+def test_a_printed_estimate_has_at_most_five_lines(estimate, method, reference, targets):
+    for found in (estimate, replace(method, solver="verified").estimate(reference, targets[:2])):
+        text = str(found)
+        assert len(text) < 400 and text.count("\n") < 5
+        assert f"target view {found.view} of {len(found.target_views)}" in text
+    for part in (estimate.reference_view, estimate.matches, estimate.reference_view.features):
+        assert len(repr(part)) < 200 and "tensor(" not in repr(part)
 
 
 def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):

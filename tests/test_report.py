@@ -9,7 +9,8 @@ import pytest
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.data.frames import read_image
-from zsp_lite.demo import demo_pairs, object_cloud, run_demo
+from zsp_lite.demo import demo_pairs, run_demo
+from zsp_lite.points import object_cloud
 from zsp_lite.viz.report import page, table_row, write_overview, write_report
 
 

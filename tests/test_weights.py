@@ -13,12 +13,12 @@ from zsp_lite.benchmark.run import random_backbone
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
-from zsp_lite.pipeline import object_crop, patch_mask
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.export import GENERATORS
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
 from zsp_lite.training.train import CONTINUATION
+from zsp_lite.views import object_crop, patch_mask
 
 
 def test_the_file_is_small_and_in_half_precision():

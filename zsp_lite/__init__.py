@@ -7,20 +7,21 @@
 Read the files in this order:
 
     minimal      the whole method on one page
-    pipeline     the method composed of its stages, each in a file of its own:
+    pipeline     the method, composed of stages, each in a file of its own:
     views        object crop, features, foreground
     features     feature maps and log-binned descriptors
-    matching     cyclical distances and correspondences; matchers has the alternatives of the supplement
-    best_view    which target view to align with
-    alignment    Umeyama in RANSAC
+    matching     cyclical distances and correspondences; matchers: the alternatives of the supplement
+    best_view    selection of the target view to align with
+    alignment    Umeyama's method in RANSAC
+    points       points of the object
     metrics      rotation errors and their statistics
-    demo         one pair of each category, from folder to pose
+    demo         one pair of each category, from data folder to pose error
 
     data         CO3D folders, frames, cameras, depth, labels, pairs
     backbones    vision transformers and how to load them
     viz          plots, 3D scenes, the HTML report
     io           files, downloads, PLY, Open3D
-    verified     a solver beyond the paper that tests many poses against all views
+    verified     a solver beyond the paper that tests many poses in all target views
     benchmark    the paper's tables
     baselines, labelling, importers, synthetic, training, widgets, cli
 """
@@ -30,33 +31,62 @@ from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-if TYPE_CHECKING:  # for editors and type checkers; a test holds this against `_HOMES`
-    from zsp_lite import alignment, best_view, demo, errors, features, matchers, matching, metrics, pipeline, views
+if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HOMES`
+    from zsp_lite import (
+        alignment,
+        backbones,
+        baselines,
+        benchmark,
+        best_view,
+        cli,
+        data,
+        demo,
+        errors,
+        features,
+        importers,
+        io,
+        labelling,
+        matchers,
+        matching,
+        metrics,
+        pipeline,
+        points,
+        synthetic,
+        training,
+        verified,
+        views,
+        viz,
+        widgets,
+    )
     from zsp_lite.alignment import Sim3
-    from zsp_lite.backbones import facets, vit
+    from zsp_lite.backbones import checkpoints, facets, huggingface, vit
     from zsp_lite.backbones.load import Backbone, load_backbone
-    from zsp_lite.data import annotations, cameras, co3d, depth, frames, labels, pairs, samples
+    from zsp_lite.data import annotations, cameras, check, co3d, depth, frames, labels, pairs, samples
     from zsp_lite.data.cameras import Camera
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.frames import Frame
     from zsp_lite.errors import InputError
     from zsp_lite.features import FeatureMap
+    from zsp_lite.io import download, files, ply
     from zsp_lite.matching import Matches
     from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
     from zsp_lite.viz import plots, report, scene3d
 
-# Names and modules by where they live, imported on first use: torch takes seconds, `zsp-lite --help` need not.
+# Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
+# which `zsp-lite --help` does not need.
 _HOMES = {
-    "": "alignment best_view demo errors features matchers matching metrics pipeline views",
+    "": "alignment best_view demo errors features matchers matching metrics pipeline points views "
+    "backbones baselines benchmark cli data importers io labelling synthetic training verified viz widgets",
     "alignment": "Sim3",
-    "backbones": "facets vit",
+    "backbones": "checkpoints facets huggingface vit",
     "backbones.load": "Backbone load_backbone",
-    "data": "annotations cameras co3d depth frames labels pairs samples",
+    "data": "annotations cameras check co3d depth frames labels pairs samples",
     "data.cameras": "Camera",
     "data.co3d": "Co3D",
     "data.frames": "Frame",
     "errors": "InputError",
     "features": "FeatureMap",
+    "io": "download files ply",
     "matching": "Matches",
     "pipeline": "PoseEstimate ZeroShotPose",
     "viz": "plots report scene3d",

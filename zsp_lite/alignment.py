@@ -1,6 +1,6 @@
-"""Rigid alignment with scale: Umeyama's least squares inside RANSAC (paper eq. 4, supplement "Rigid body transform").
+"""Rigid alignment with scale: Umeyama's least squares in RANSAC (paper eq. 4; supplement).
 
-All trials of RANSAC go through one batched SVD, which is what makes a thousand of them cost milliseconds.
+All trials of RANSAC are fitted by one batched SVD, so that a thousand of them take milliseconds.
 """
 
 from dataclasses import dataclass
@@ -9,22 +9,30 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer, check_seed
 
-# Below this ratio of the second to the first singular value of the covariance, the rotation about the points'
-# common line is noise. It is a ratio of squared widths: 1e-6 is a cloud a thousand times longer than it is wide.
+# Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
+# paper gives none; without a range, RANSAC can shrink the source into a dense spot of the target.
+SCALE_RANGE = (0.2, 5.0)
+# Below this ratio of the second to the first singular value of the covariance, the points are taken for collinear: the
+# rotation about their line is noise. It is a ratio of squared widths: 1e-6 is a cloud 1000 times longer than wide.
 _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
-# The same for one cloud by itself, a ratio of widths: what float32 rounding leaves of a line is below it.
+# The same for a single cloud, as a ratio of widths: the rounding of float32 coordinates on a line stays below it.
 _COLLINEAR_CLOUD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Sim3:
-    """A similarity `y = scale * R @ x + t`, from reference-camera points to target-camera points.
+    """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera points.
 
-    scale: positive, unitless.  R: (3, 3) rotation.  t: (3,), in units of the target's scene.
-    Raises InputError where these are not finite, not of that shape, or R is not a rotation.
+    Attributes:
+        scale: Positive, unitless.
+        R: (3, 3) rotation matrix.
+        t: (3,) translation, in units of the target's scene.
+
+    Raises:
+        InputError: A value is not finite or has another shape, `scale` is not positive, or `R` is not a rotation.
     """
 
     scale: float
@@ -46,14 +54,19 @@ class Sim3:
         object.__setattr__(self, "R", rotation)
         object.__setattr__(self, "t", translation)
 
+    def __repr__(self) -> str:
+        rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
+        first, second, third, translation = rows
+        return f"Sim3(scale={self.scale:.4f}, t={translation},\n     R=[{first},\n        {second},\n        {third}])"
+
     @classmethod
     def identity(cls) -> "Sim3":
-        """The transformation that moves nothing."""
+        """Return the identity transform."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """The same as a homogeneous matrix for column vectors; its upper left block is scale * R."""
+        """Homogeneous matrix for column vectors; its upper left block is `scale * R`."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.R
         matrix[:3, 3] = self.t
@@ -64,21 +77,28 @@ class Sim3:
         return self.scale * np.asarray(points, dtype=np.float64) @ self.R.T + self.t
 
     def inverse(self) -> "Sim3":
-        """The similarity that undoes this one."""
+        """Return the inverse transform."""
         return Sim3(1 / self.scale, self.R.T, -(self.R.T @ self.t) / self.scale)
 
     def __matmul__(self, other: "Sim3") -> "Sim3":
-        """`(a @ b).apply(x) == a.apply(b.apply(x))`."""
+        """Compose two transforms: `(a @ b).apply(x) == a.apply(b.apply(x))`."""
         return Sim3(self.scale * other.scale, self.R @ other.R, self.apply(other.t))
 
 
 def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Sim3:
-    """The similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4; Umeyama 1991).
+    """Fit the similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4; Umeyama 1991).
 
-    source, target: (N, 3) corresponding points, N >= 3, numpy or torch.  with_scale: False fixes the scale at
-    1. R is always a rotation, also where a reflection would fit better.
-    Raises InputError for wrong or unequal shapes, fewer than 3 points, non-finite values, and points that are
-    all equal or collinear (the rotation about their line is then undetermined).
+    Args:
+        source: (N, 3) points, N >= 3, NumPy or torch.
+        target: (N, 3) corresponding points.
+        with_scale: False fixes the scale at 1.
+
+    Returns:
+        The best similarity. Its R is a rotation even where a reflection would fit better.
+
+    Raises:
+        InputError: Shapes are wrong or unequal, there are fewer than 3 points, values are not finite, or the points
+            are all equal or collinear (which leaves the rotation about their line undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
     scale, rotation, translation, conditioning = umeyama_batch(source[None], target[None], with_scale)
@@ -91,23 +111,36 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
 
 
 def umeyama_batch(
-    source: Float[np.ndarray, "b n 3"], target: Float[np.ndarray, "b n 3"], with_scale: bool = True
+    source: Float[np.ndarray, "b n 3"],
+    target: Float[np.ndarray, "b n 3"],
+    with_scale: bool = True,
+    scale_range: tuple[float, float] = (0.0, np.inf),
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
-    """`umeyama` on a batch of point sets, unchecked: scales, rotations, translations, and conditionings.
+    """Fit similarities to a batch of point sets, without checks (see `umeyama`).
 
-    The conditioning is the ratio of the covariance's second to its first singular value: 0 for collinear points.
+    Args:
+        source: (B, N, 3) points.
+        target: (B, N, 3) corresponding points.
+        with_scale: False fixes the scales at 1.
+        scale_range: Bounds on the scales. The fit is the least-squares optimum within them: the best rotation does
+            not depend on the scale, and the error is quadratic in it.
+
+    Returns:
+        Scales (B,), rotations (B, 3, 3), translations (B, 3), and conditionings (B,): the ratio of the second to the
+        first singular value of the covariance, 0 for collinear points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
     left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
     rotation = left @ right
-    # The sign on the last axis keeps det(R) = +1: the best rotation, where the best orthogonal matrix is a mirror.
+    # The best orthogonal matrix may be a reflection; flipping the last axis gives the best rotation, det(R) = +1.
     flip = np.sign(np.linalg.det(rotation))
     mirrored = np.flatnonzero(flip < 0)
     rotation[mirrored] -= 2 * left[mirrored, :, 2:] * right[mirrored, 2:, :]
     if with_scale:
-        spread = np.square(centred_source).sum(axis=(1, 2))
-        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(spread > 0, spread, 1)
+        variance = np.square(centred_source).sum(axis=(1, 2))
+        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(variance > 0, variance, 1)
+        scale = scale.clip(*scale_range)
     else:
         scale = np.ones(len(singular))
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
@@ -124,24 +157,36 @@ def ransac(
     seed: int | np.random.Generator = 0,
     scale_range: tuple[float, float] = (0.0, np.inf),
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
-    """Umeyama in RANSAC: the most inliers among `trials` samples, then a fit on those inliers.
+    """Fit a similarity to points with outliers: Umeyama's method in RANSAC (paper, sec. 4.3).
 
-    source, target: (N, 3) corresponding points, N >= sample_size, numpy or torch.
-    threshold: largest distance |target - (scale * R @ source + t)| of an inlier, in target units; the paper's
-    0.2 is for clouds of unit standard deviation.  sample_size: points per trial, drawn without replacement;
-    the paper takes 4 because 3 can be degenerate.  scale_range: hypotheses with another scale are discarded;
-    a lower bound keeps out those that shrink the source into one dense spot of the target.
-    Returns the similarity and the (N,) bool inliers of the best trial (ties: the smaller sum of their
-    residuals), which are what the fit used; where those cannot carry a fit of their own, the best trial's
-    similarity. Deterministic for a seed.
-    Raises InputError for bad shapes, too few points, non-finite values, and where every sample is collinear
-    or has a scale out of range.
+    Each trial fits the similarity to a random sample. The trial with the most inliers wins (ties: the smaller sum of
+    their residuals), and the similarity is fitted again to its inliers.
+
+    Args:
+        source: (N, 3) points, N >= sample_size, NumPy or torch.
+        target: (N, 3) corresponding points.
+        threshold: Largest residual |target - (scale * R @ source + t)| of an inlier, in target units. The paper's 0.2
+            is for scenes of unit standard deviation.
+        trials: Number of samples.
+        sample_size: Points per sample, drawn without replacement. The paper takes 4, since 3 can be degenerate.
+        seed: Seed or generator of the samples; the same seed gives the same result.
+        scale_range: Smallest and largest scale. Trials outside are discarded; the final fit is the best within.
+
+    Returns:
+        The similarity fitted to the inliers, or that of the best trial if they are fewer than 3 or collinear; and
+        the (N,) inliers of the best trial.
+
+    Raises:
+        InputError: Shapes are wrong, there are too few points, values are not finite, a setting is out of range, or
+            every sample is collinear or has a scale out of range.
     """
-    if not (threshold > 0 and trials >= 1 and sample_size >= 3):
-        raise InputError(
-            f"ransac: threshold={threshold}, trials={trials}, sample_size={sample_size}; "
-            "expected a positive threshold, at least 1 trial and at least 3 points per sample"
-        )
+    check_integer("ransac: trials", trials, 1)
+    check_integer("ransac: sample_size", sample_size, 3)
+    check_seed("ransac: seed", seed)
+    if not threshold > 0:
+        raise InputError(f"ransac: threshold is {threshold}, expected a positive number")
+    if not 0 <= scale_range[0] <= scale_range[1]:
+        raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
@@ -161,7 +206,7 @@ def ransac(
     chosen = inlier[best]
 
     if counts[best] >= 3:
-        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen])
+        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range=scale_range)
         if conditioning[0] > _COLLINEAR_SAMPLE:
             return Sim3(*(part[0] for part in fit)), chosen
     return Sim3(scale[best], rotation[best], translation[best]), chosen
@@ -174,32 +219,33 @@ def _residuals(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "trials n"]:
-    """|target - (scale * R @ source + t)| for every trial and point.
+    """Compute |target - (scale * R @ source + t)| for every trial and point.
 
-    The square, multiplied out, is one matrix product of what is known of the trials with what is known of the
-    points: a third of the time of moving every point. Taken about the clouds' means, so that little cancels.
+    The squared residual, expanded, is a matrix product of coefficients per trial with coefficients per point. This
+    takes a third of the time of transforming the points by every trial. Coordinates are relative to the clouds' means,
+    which limits cancellation.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     x, y = source - source_mean, target - target_mean
     linear = scale[:, None, None] * rotation
     t = translation + linear @ source_mean - target_mean
     ones = np.ones((len(scale), 1))
-    of_trials = np.hstack([
+    trial_terms = np.hstack([
         np.square(t).sum(axis=1, keepdims=True), ones, np.square(scale)[:, None],
         2 * (t[:, None, :] @ linear)[:, 0], -2 * t, -2 * linear.reshape(-1, 9),
     ])  # fmt: skip
-    of_points = np.hstack([
+    point_terms = np.hstack([
         np.ones((len(x), 1)),
         np.square(y).sum(axis=1, keepdims=True), np.square(x).sum(axis=1, keepdims=True),
         x, y, (y[:, :, None] * x[:, None, :]).reshape(-1, 9),
     ])  # fmt: skip
-    return np.sqrt(np.maximum(of_trials @ of_points.T, 0))
+    return np.sqrt(np.maximum(trial_terms @ point_terms.T, 0))
 
 
 def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:
-    """`trials` uniform samples of `size` different indices below n, without a loop over the trials.
+    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials.
 
-    The k-th draw picks among the n - k indices left: step over every earlier pick that is not above it.
+    The k-th draw is a rank among the n - k indices left: it is moved up past each earlier index that is not larger.
     """
     samples = np.empty((trials, size), dtype=np.int64)
     for k in range(size):
@@ -211,6 +257,7 @@ def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> I
 
 
 def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np.ndarray, np.ndarray]:
+    """Convert corresponding points to float64 arrays and check them."""
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
@@ -221,5 +268,7 @@ def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np
     for name, points in (("source", source), ("target", target)):
         longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _COLLINEAR_CLOUD * longest:
-            raise InputError(f"the {len(points)} {name} points are all equal or collinear, expected some off the line")
+            raise InputError(
+                f"the {len(points)} {name} points are all equal or collinear, expected points that span a plane"
+            )
     return source, target

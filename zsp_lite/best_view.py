@@ -1,11 +1,11 @@
-"""Which target view to align with: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
+"""Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
 
-Each score is a plain function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a
-`ViewPair`. The view with the highest score is chosen.
+Each score is a function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a `ViewPair`. The view of
+highest score is selected.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,13 +17,23 @@ from zsp_lite.matching import Matches, cyclical_distances
 
 Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
-# A match that could not be made counts like one between orthogonal descriptors.
+# Distance of a missing match: that of orthogonal descriptors.
 _ORTHOGONAL = 2**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """A target view beside the reference: all that a selector may look at."""
+    """The reference and one target view, with their matches: the input of a view selector.
+
+    Attributes:
+        reference: Features of the reference.
+        target: Features of the target view.
+        reference_foreground: Foreground patches of the reference.
+        target_foreground: Foreground patches of the target view.
+        similarity: Cosines between the descriptors of the reference's patches and the target's.
+        matches: At most k matches.
+        k: Number of matches that were asked for.
+    """
 
     reference: FeatureMap
     target: FeatureMap
@@ -33,30 +43,55 @@ class ViewPair:
     matches: Matches
     k: int
 
+    def __repr__(self) -> str:
+        foregrounds = int(self.reference_foreground.sum()), int(self.target_foreground.sum())
+        return f"ViewPair({foregrounds[0]} and {foregrounds[1]} foreground patches, k={self.k},\n  {self.matches!r})"
+
+
+@runtime_checkable
+class ViewSelector(Protocol):
+    """A score of how well a target view suits the reference. Any callable with this signature will do.
+
+    A selector that counts the matches whose descriptors are close:
+
+        def close_matches(pair):
+            return float((pair.matches.similarity > 0.8).sum())
+
+        ZeroShotPose(backbone, view_selector=close_matches)
+    """
+
+    def __call__(self, pair: ViewPair, /) -> float:
+        """Score a target view; the view of highest score is selected."""
+        ...
+
 
 def correspondence_score(matches: Matches, k: int) -> float:
-    """Eq. 3, "CorrespondSim": the sum over the K matches of -d, d the L2 distance of normalised descriptors.
+    """Score the matches of a view (eq. 3, "CorrespondSim"): the sum of -d over the k matches.
 
-    With fewer than k matches, each missing one counts as orthogonal, d = sqrt(2): otherwise a view with
-    hardly any foreground in common would win by having little to sum.
+    d is the L2 distance of normalised descriptors. A missing match counts as orthogonal, d = sqrt(2). Otherwise a view
+    with few matches would win by having few terms to sum.
+
+    Args:
+        matches: At most k matches.
+        k: Number of matches that were asked for.
     """
     return score_from_cosines(torch.as_tensor(matches.similarity), k)
 
 
 def score_from_cosines(cosines: Float[torch.Tensor, " n"], k: int) -> float:
-    """`correspondence_score` of matches whose descriptors have these cosines."""
+    """Compute `correspondence_score` from the cosines of at most k matches."""
     distances = (2 - 2 * cosines).clamp_min(0).sqrt()
     return -float(distances.sum()) - max(k - len(cosines), 0) * _ORTHOGONAL
 
 
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:
-    """ "GlobalSim": cosine of the two images' global features."""
+    """Compute the cosine of the two images' global features ("GlobalSim")."""
     first, second = torch.as_tensor(reference.global_feature), torch.as_tensor(target.global_feature)
     return float(F.cosine_similarity(first, second, dim=0))
 
 
 def mask_iou(first: Mask, second: Mask) -> float:
-    """Intersection over union of two masks of one shape, 0 where both are empty. "SaliencyIoU" of two foregrounds."""
+    """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two foregrounds)."""
     first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
@@ -67,11 +102,14 @@ def cyclical_iou(
     target_foreground: Bool[torch.Tensor, "target_rows target_cols"],
     threshold: float = 1.5,
 ) -> float:
-    """ "CyclicalDistIoU": IoU of the target's foreground and its patches that cycle through the reference back
-    to within `threshold` patches of themselves.
+    """Compute "CyclicalDistIoU": the IoU of the target's foreground and its patches of small cyclical distance.
 
-    The paper does not give its threshold; 1.5 patches takes a return to the patch itself or to one of its
-    eight neighbours. (The published code compares a rescaled map with the saliency without thresholding either.)
+    Args:
+        similarity: Cosines between the reference's and the target's descriptors.
+        reference_foreground: Foreground patches of the reference.
+        target_foreground: Foreground patches of the target.
+        threshold: Largest cyclical distance, in patches, of a target patch through the reference back to the target.
+            The paper gives none; 1.5 takes a return to the patch itself or to one of its eight neighbours.
     """
     distances = cyclical_distances(
         similarity.T,
@@ -83,9 +121,9 @@ def cyclical_iou(
     return mask_iou(distances >= -threshold, target_foreground)
 
 
-VIEW_SELECTORS: dict[str, Callable[[ViewPair], float]] = {
-    "correspond": lambda c: correspondence_score(c.matches, c.k),
-    "global": lambda c: global_score(c.reference, c.target),
-    "saliency": lambda c: mask_iou(c.reference_foreground, c.target_foreground),
-    "cyclical": lambda c: cyclical_iou(c.similarity, c.reference_foreground, c.target_foreground),
+VIEW_SELECTORS: dict[str, ViewSelector] = {
+    "correspond": lambda pair: correspondence_score(pair.matches, pair.k),
+    "global": lambda pair: global_score(pair.reference, pair.target),
+    "saliency": lambda pair: mask_iou(pair.reference_foreground, pair.target_foreground),
+    "cyclical": lambda pair: cyclical_iou(pair.similarity, pair.reference_foreground, pair.target_foreground),
 }

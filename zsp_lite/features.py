@@ -1,12 +1,14 @@
-"""What a backbone says about one image, and the log-binned descriptors built on it (Amir et al. 2021).
+"""Feature maps of a vision transformer, and log-binned descriptors (Amir et al. 2021).
 
-A descriptor has 17 bins: the 3x3 neighbourhood of a patch at stride 1, and around it the eight neighbours at
-stride 3 of the keys averaged over 3x3. `log_bin` writes that down literally and needs 17 times the memory of
-the keys; `matching.similarity` compares such descriptors without ever making them.
+The descriptor of a patch has 17 bins: the keys of the patch and its eight neighbours at stride 1, and the eight
+neighbours at stride 3 of the keys averaged over 3x3 patches. `log_bin` follows this definition literally and needs 17
+times the memory of the keys; `matching.similarity` compares such descriptors without building them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,7 +22,16 @@ Grid = tuple[int, int]  # (rows, columns) of patches
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Descriptors on the patch grid, saliency in [0, 1] and one global feature. InputError on misfits."""
+    """Features of one image.
+
+    Attributes:
+        keys: (H, W, D) key of each patch.
+        saliency: (H, W) saliency of each patch, in [0, 1].
+        global_feature: (E,) feature of the whole image.
+
+    Raises:
+        InputError: Shapes do not fit together, or values are not finite.
+    """
 
     keys: Float[Tensor, "h w d"]
     saliency: Float[Tensor, "h w"]
@@ -36,26 +47,71 @@ class FeatureMap:
         if not bool(self.keys.isfinite().all() & self.saliency.isfinite().all()):
             raise InputError("FeatureMap: keys or saliency hold values that are not finite")
 
+    def __repr__(self) -> str:
+        rows, columns, channels = self.keys.shape
+        return (
+            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} with saliency > 0.05, keys of "
+            f"{channels} channels, global feature of {len(self.global_feature)}, {self.keys.device})"
+        )
+
     @property
     def grid(self) -> Grid:
+        """Rows and columns of patches."""
         return self.keys.shape[0], self.keys.shape[1]
 
     def foreground(self, threshold: float = 0.05) -> Bool[Tensor, "h w"]:
-        """Patches on the object: saliency above the threshold (the paper takes 0.05)."""
+        """Select the patches whose saliency is above the threshold; 0.05 is that of the published code."""
         return self.saliency > threshold
+
+
+@runtime_checkable
+class FeatureExtractor(Protocol):
+    """A backbone: maps images to feature maps. Any callable with this signature will do.
+
+    An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the default is 224.
+
+    A backbone whose keys are the mean colours of 8 x 8 pixels:
+
+        class Colours:
+            image_size = 224
+
+            def __call__(self, images):
+                maps = []
+                for image in images:
+                    patches = torch.as_tensor(image / 255).float().unfold(0, 8, 8).unfold(1, 8, 8)
+                    keys = patches.mean((-2, -1))
+                    maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), keys.mean((0, 1))))
+                return maps
+
+        ZeroShotPose(Colours())
+    """
+
+    def __call__(self, images: Sequence[np.ndarray]) -> list[FeatureMap]:
+        """Extract the features of images.
+
+        Args:
+            images: (H, W, 3) arrays, uint8 or float in [0, 1].
+
+        Returns:
+            One feature map per image, all on one grid.
+        """
+        ...
 
 
 @lru_cache(maxsize=32)
 def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
-    """For each bin and patch (row-major) the flat index of the patch that fills it, clamped at the border.
+    """Compute, for each bin and patch, the index of the patch that fills it.
 
-    Bins 0 to 8 read the raw keys (offsets -1, 0, 1, row-major), bins 9 to 16 the pooled keys (offsets -3, 0,
-    3, row-major, without the centre).
+    Bins 0 to 8 read the keys (offsets -1, 0, 1 in rows and columns, row-major), bins 9 to 16 the pooled keys (offsets
+    -3, 0, 3, row-major, without the centre). Offsets beyond the border are clamped to it.
+
+    Returns:
+        (17, rows * columns) row-major patch indices.
     """
     near = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
     height, width = grid
-    with torch.inference_mode(False):  # kept for later callers, who may want gradients
+    with torch.inference_mode(False):  # the result is cached, and later callers may need gradients
         rows, columns = torch.arange(height)[:, None], torch.arange(width)
         filled = [
             (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1) for dy, dx in near + far
@@ -64,9 +120,9 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
 
 
 def average_pool(x: Tensor, axis: int) -> Tensor:
-    """Mean over each index and its neighbours along one axis; at the ends over the two that exist.
+    """Average each index with its two neighbours along one axis; the ends are averaged with their one neighbour.
 
-    Twice, over rows and over columns, this is 3x3 average pooling at stride 1 with count_include_pad off.
+    Applied to rows and to columns, this is 3x3 average pooling at stride 1 with count_include_pad=False.
     """
     n = x.shape[axis]
     if n == 1:
@@ -80,7 +136,14 @@ def average_pool(x: Tensor, axis: int) -> Tensor:
 
 
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
-    """The 17 bins of every patch one after the other, in `bin_indices`' order. InputError on bad shapes."""
+    """Compute the log-binned descriptor of every patch: its 17 bins, concatenated in the order of `bin_indices`.
+
+    Args:
+        x: (B, H, W, D) keys.
+
+    Raises:
+        InputError: x has another shape, or an empty one.
+    """
     x = torch.as_tensor(x)
     if x.ndim != 4 or 0 in x.shape:
         raise InputError(f"log_bin: x has shape {tuple(x.shape)}, expected (B, H, W, D), none of them 0")

@@ -1,83 +1,125 @@
-"""Ways to choose, for each patch of one image, a partner in the other (supplement, "Design of correspondence method").
+"""Alternatives to cyclical distances (supplement, "Design of correspondence method").
 
-A matcher is a function `(similarity (n1, n2), on1 (n1,), on2 (n2,)) -> (partner (n1,), score (n1,))`: for each patch
-of the first image the index of its partner in the second, and how good a match that is, -inf for none. The masks say
-which patches are the object. `matching.match` keeps the best scores and thins them by k-means; "cyclical", the
-paper's own, lives there. Your own function of this form goes where a name would.
+A `Matcher` selects, for each patch of one image, a partner in the other, and scores the match. `matching.match` keeps
+the matches of highest score and selects among them by k-means; the paper's matcher, "cyclical", is in `matching`.
 """
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-Matcher = Callable[
-    [Float[Tensor, "n1 n2"], Bool[Tensor, " n1"], Bool[Tensor, " n2"]], tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]
-]
 
-# Neither is given in the paper. 0.1 is what LoFTR (Sun et al. 2021) divides its similarities by before a dual softmax,
-# 0.05 the entropy weight of SCOT (Liu et al. 2020), the optimal transport that the paper cites.
+@runtime_checkable
+class Matcher(Protocol):
+    """A way to match patches. Any callable with this signature will do.
+
+    A matcher that takes the nearest neighbour if it is clearly better than the second nearest (Lowe's ratio test):
+
+        def ratio_test(similarity, foreground1, foreground2):
+            distance = (2 - 2 * similarity).clamp_min(0).sqrt()
+            distance[:, ~foreground2] = torch.inf
+            (first, second), (partner, _) = (part.T for part in distance.topk(2, largest=False))
+            score = (second - first).masked_fill(~foreground1, -torch.inf)
+            return partner, score
+
+        ZeroShotPose(backbone, matcher=ratio_test)
+    """
+
+    def __call__(
+        self,
+        similarity: Float[Tensor, "n1 n2"],
+        foreground1: Bool[Tensor, " n1"],
+        foreground2: Bool[Tensor, " n2"],
+        /,
+    ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
+        """Match the patches of image 1 with those of image 2.
+
+        Args:
+            similarity: (n1, n2) cosines between the patches' descriptors.
+            foreground1: (n1,) which patches of image 1 are foreground.
+            foreground2: (n2,) which patches of image 2 are foreground.
+
+        Returns:
+            For each patch of image 1, the index of its partner in image 2, and the score of the match, higher is
+            better; -inf for no match.
+        """
+        ...
+
+
+# The paper gives neither. LoFTR (Sun et al. 2021) divides its similarities by 0.1 before a dual softmax; 0.05 is the
+# weight of the entropy in SCOT (Liu et al. 2020), the optimal transport that the paper cites.
 SOFTMAX_TEMPERATURE = 0.1
 TRANSPORT_REGULARISATION = 0.05
 TRANSPORT_STEPS = 100
 
 
-def mutual(
-    similarity: Float[Tensor, "n1 n2"], on1: Bool[Tensor, " n1"], on2: Bool[Tensor, " n2"]
+def mutual_nearest_neighbours(
+    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-    """Mutual nearest neighbours among the objects' patches, scored by their similarity."""
+    """Match mutual nearest neighbours among the foreground patches, scored by their similarity."""
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
         best, partner = sim.max(dim=1)
         returned = sim.argmax(dim=0)[partner]
         return partner, best.masked_fill(returned != torch.arange(len(sim), device=sim.device), -torch.inf)
 
-    return _among_objects(choose, similarity, on1, on2)
+    return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
 def dual_softmax(
     similarity: Float[Tensor, "n1 n2"],
-    on1: Bool[Tensor, " n1"],
-    on2: Bool[Tensor, " n2"],
+    foreground1: Bool[Tensor, " n1"],
+    foreground2: Bool[Tensor, " n2"],
     temperature: float = SOFTMAX_TEMPERATURE,
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-    """The product of both softmaxes: the chance that each patch is the other's choice (Cheng et al. 2021)."""
+    """Match each patch with the partner of highest probability under a dual softmax (Cheng et al. 2021).
+
+    The score is the logarithm of the product of the softmax over rows and the softmax over columns.
+    """
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
         sharp = sim / temperature
-        # Added logarithms keep the order where the product of small chances would underflow.
+        # The sum of logarithms keeps the order where a product of small probabilities would underflow.
         best, partner = (sharp.log_softmax(0) + sharp.log_softmax(1)).max(dim=1)
         return partner, best
 
-    return _among_objects(choose, similarity, on1, on2)
+    return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
 def optimal_transport(
     similarity: Float[Tensor, "n1 n2"],
-    on1: Bool[Tensor, " n1"],
-    on2: Bool[Tensor, " n2"],
+    foreground1: Bool[Tensor, " n1"],
+    foreground2: Bool[Tensor, " n2"],
     regularisation: float = TRANSPORT_REGULARISATION,
     steps: int = TRANSPORT_STEPS,
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-    """The plan that moves an even mass from one object's patches to the other's at cost 1 - similarity.
+    """Match each patch with the partner that receives most of its mass under optimal transport (Liu et al. 2020).
 
-    (Liu et al. 2020.) A patch's partner is where most of its mass goes, the score that mass.
+    The plan moves uniform mass between the foreground patches at cost 1 - similarity. The score is the mass moved.
     """
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
         best, partner = sinkhorn(1 - sim, regularisation, steps).max(dim=1)
         return partner, best
 
-    return _among_objects(choose, similarity, on1, on2)
+    return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
 def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
-    """Entropy-regularised transport plan between uniform masses (Cuturi 2013); its rows sum to 1 / n1, in the limit.
+    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013).
 
-    regularisation: the entropy's weight, in the unit of the cost.  steps: of scaling rows and columns.
+    Args:
+        cost: (n1, n2) cost of moving mass.
+        regularisation: Weight of the entropy, in the unit of the cost.
+        steps: Number of Sinkhorn iterations, each of which scales the rows and the columns.
+
+    Returns:
+        (n1, n2) plan in float64; its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
-    # Costs less their minimum: the plan is the same, and its kernel does not underflow.
+    # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.
     kernel = torch.exp((cost.min() - cost.to(torch.float64)) / regularisation)
     n1, n2 = kernel.shape
     rows, columns = kernel.new_ones(n1), kernel.new_ones(n2)
@@ -88,20 +130,20 @@ def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) ->
 
 
 MATCHERS: dict[str, Matcher] = {
-    "mutual": mutual,
+    "mutual": mutual_nearest_neighbours,
     "dual softmax": dual_softmax,
     "optimal transport": optimal_transport,
 }
 
 
-def _among_objects(
-    choose: Callable[[Tensor], tuple[Tensor, Tensor]], similarity: Tensor, on1: Tensor, on2: Tensor
+def _match_foreground(
+    choose: Callable[[Tensor], tuple[Tensor, Tensor]], similarity: Tensor, foreground1: Tensor, foreground2: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """`choose` on the objects' patches alone, its answer in terms of all patches."""
-    partner = torch.zeros(len(on1), dtype=torch.long, device=similarity.device)
-    score = torch.full((len(on1),), -torch.inf, dtype=torch.float64, device=similarity.device)
-    if on1.any() and on2.any():
-        chosen, found = choose(similarity[on1][:, on2])
-        partner[on1] = on2.nonzero()[:, 0][chosen]
-        score[on1] = found.to(torch.float64)
+    """Apply `choose` to the similarities of the foreground patches; return its matches by index of all patches."""
+    partner = torch.zeros(len(foreground1), dtype=torch.long, device=similarity.device)
+    score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64, device=similarity.device)
+    if foreground1.any() and foreground2.any():
+        chosen, found = choose(similarity[foreground1][:, foreground2])
+        partner[foreground1] = foreground2.nonzero()[:, 0][chosen]
+        score[foreground1] = found.to(torch.float64)
     return partner, score

@@ -1,13 +1,13 @@
-"""Semantic correspondences between two images from cyclical distances (section 4.1, eq. 2, and supplement).
+"""Semantic correspondences between two images from cyclical distances (sec. 4.1, eq. 2, and supplement).
 
-`similarity` is the cosine of log-binned descriptors, `cyclical_distances` follows each patch to the other
-image and back, `match` keeps the 2K patches that come back nearest and thins them to K by k-means.
+`similarity` is the cosine of log-binned descriptors. `cyclical_distances` follows each patch to its nearest neighbour
+in the other image and back. `match` takes the 2K patches of smallest cyclical distance and selects K by k-means.
 
-Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two of them is a sum
-over bins of products of keys, and every such product stands already in one small matrix S of all keys against
-all keys, only shifted on both images at once. With J_s[S](r1,c1,r2,c2) = sum over i in (-1,0,1) of S(r1+si,
-c1, r2+si, c2) and likewise for columns, and with P the 3x3 pooling on both images, the whole is J_1 J_1' S +
-(J_3 J_3' - 1) P S: a dozen additions of S to itself.
+Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two descriptors is a sum over
+bins of products of keys. Each of these products is an entry of one matrix S of all keys against all keys, shifted by
+the bin's offset in both images. With J_s[S](r1, c1, r2, c2) = sum over i in (-1, 0, 1) of S(r1 + s i, c1, r2 + s i,
+c2), J_s' the same for columns, and P the 3x3 average pooling in both images, the sum is J_1 J_1' S + (J_3 J_3' - 1)
+P S: a dozen additions of S to itself.
 """
 
 import warnings
@@ -22,7 +22,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer, check_seed
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
 from zsp_lite.matchers import MATCHERS, Matcher
 
@@ -31,28 +31,51 @@ Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Patches that correspond, best cyclical distance first; K may be 0."""
+    """K corresponding patches of two images, best first; K may be 0.
 
-    reference: Int[np.ndarray, "k 2"]  # (row, column) on the reference's grid
-    target: Int[np.ndarray, "k 2"]  # (row, column) on the target's grid
-    similarity: Float[np.ndarray, " k"]  # cosine of the two descriptors
-    distance: Float[np.ndarray, " k"]  # d(u, u') >= 0 of the cycle, in patches; of another matcher minus its score
+    Attributes:
+        reference: (K, 2) row and column on the reference's patch grid.
+        target: (K, 2) row and column on the target's patch grid.
+        similarity: (K,) cosine of the two descriptors.
+        distance: (K,) cyclical distance d(u, u') >= 0 in patches; for another matcher, minus its score.
+    """
+
+    reference: Int[np.ndarray, "k 2"]
+    target: Int[np.ndarray, "k 2"]
+    similarity: Float[np.ndarray, " k"]
+    distance: Float[np.ndarray, " k"]
 
     def __len__(self) -> int:
         return len(self.reference)
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Matches(none)"
+        low, high = self.similarity.min(), self.similarity.max()
+        return (
+            f"Matches({len(self)}, similarity {low:.3f} to {high:.3f}, distance {self.distance.min():.3g} to "
+            f"{self.distance.max():.3g})"
+        )
+
 
 def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
-    """Cosine of the log-binned descriptors of all patches of one image against all of the other, row-major.
+    """Compute the cosine similarity of the log-binned descriptors of all pairs of patches.
 
-    ref and target are FeatureMaps or keys (H1, W1, D), (H2, W2, D). Descriptors without length have
-    similarity 0. Raises InputError on other shapes.
+    Args:
+        ref: Feature map, or keys (H1, W1, D), of the reference.
+        target: Feature map, or keys (H2, W2, D), of the target.
+
+    Returns:
+        (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have similarity 0.
+
+    Raises:
+        InputError: Keys have another shape, or unequal channels.
     """
     return similarities(ref, [target])[0]
 
 
 def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
-    """`similarity` of one reference against several targets; the reference is prepared once."""
+    """Compute `similarity` of one reference with several targets."""
     keys1 = _keys(ref, "ref")
     inverse_norm1 = _inverse_norm(keys1)
     results = []
@@ -70,8 +93,8 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     return results
 
 
-def plain_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
-    """Cosine of the bare keys of one reference against several targets, without the log-binned surroundings."""
+def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
+    """Compute the cosine similarities of the keys themselves, without log-binning (see `similarities`)."""
     first = F.normalize(_keys(ref, "ref").flatten(0, 1), dim=1)
     return [
         first @ F.normalize(_keys(target, f"target {index}").flatten(0, 1), dim=1).T
@@ -82,7 +105,7 @@ def plain_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
 ) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
-    """For each row its most similar column, for each column its most similar row (the argmins of eq. 2)."""
+    """Find each row's most similar column and each column's most similar row (the argmins of eq. 2)."""
     sim = torch.as_tensor(sim)
     return sim.argmax(dim=1), sim.argmax(dim=0)
 
@@ -95,11 +118,22 @@ def cyclical_distances(
     fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     published: bool = False,
 ) -> Float[Tensor, "h1 w1"]:
-    """Cyclical distance map C_u = -d(u, u') in patches (eq. 2): u's neighbour is v in image 2, v's is u'.
+    """Compute the cyclical distance map C_u = -d(u, u') (eq. 2): u's nearest neighbour is v, and v's is u'.
 
-    -inf where u, v or u' is off the foreground. published=True masks as the published code does: u' need not
-    be on the foreground, but may not lie in row 0 or column 0 (that code marks "no cycle" by index 0, and
-    looks for the mark in each coordinate by itself). Raises InputError where shapes do not fit.
+    Args:
+        sim: (H1 * W1, H2 * W2) similarities.
+        grid1: Rows and columns of image 1, in which the cycles start.
+        grid2: Rows and columns of image 2.
+        fg1: (H1, W1) foreground of image 1; None for all patches.
+        fg2: (H2, W2) foreground of image 2; None for all patches.
+        published: Mask the cycles as the published code does. It does not check that u' is foreground, and discards
+            every u' in row 0 or column 0: it marks "no cycle" by index 0, and looks for the mark in each coordinate.
+
+    Returns:
+        (H1, W1) negative distances in patches; -inf where u, v or u' is not foreground.
+
+    Raises:
+        InputError: Shapes do not fit together.
     """
     sim, grid1, grid2 = torch.as_tensor(sim), tuple(grid1), tuple(grid2)
     n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
@@ -127,42 +161,54 @@ def match(
     kmeans: bool = True,
     seed: int | np.random.Generator = 0,
     cycle_from: Literal["reference", "target"] = "reference",
-    threshold: float = 0.05,
+    saliency_threshold: float = 0.05,
     ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,
     matcher: str | Matcher = "cyclical",
     binning: bool = True,
 ) -> Matches:
-    """At most k correspondences between two feature maps (section 4.1; supplement, "K-Means clustering").
+    """Find at most k correspondences (sec. 4.1; supplement, "Number and diversity of correspondences").
 
-    The 2k patches with the least cyclical distance (ties: more similar first, then row-major) are clustered
-    by k-means on their descriptors into k clusters, and each cluster gives its most salient patch.
-    kmeans=False takes the k best patches. Fewer valid cycles than 2k: what there is, down to none.
+    The 2k patches of smallest cyclical distance (ties: more similar first, then row-major) are clustered by k-means on
+    their descriptors into k clusters. The most salient patch of each cluster is returned. With fewer than 2k valid
+    cycles all of them are clustered; with at most k, all are returned, which may be none.
 
-    cycle_from="reference" is the paper's way. "target" is the published code's: cycles start in the target,
-    clusters and salience are the target's, and `cyclical_distances` masks in its published form. Foreground
-    is saliency above `threshold`, unless a mask is given. sim: their `similarity`, if computed already.
-    matcher: another way to choose and rank partners than by cyclical distance, a name in `MATCHERS` or a function.
-    binning: compare and cluster log-binned descriptors, or bare keys.
-    Raises InputError for a k below 1, an unknown name, and a mask or `sim` of another shape than the maps'.
+    Args:
+        ref: Feature map of the reference.
+        target: Feature map of the target.
+        k: Number of matches.
+        kmeans: False returns the k best patches without clustering.
+        seed: Seed or generator of k-means.
+        cycle_from: Image in which cycles start and whose patches are clustered and compared in saliency. "reference"
+            is the paper's; "target" follows the cycle step of the published code, with its masking (see
+            `cyclical_distances`). docs/published_code.md lists all differences.
+        saliency_threshold: A patch is foreground if its saliency is above this, unless a foreground is given.
+        ref_foreground: (H1, W1) foreground of the reference.
+        target_foreground: (H2, W2) foreground of the target.
+        sim: (H1 * W1, H2 * W2) similarities, if they are computed already.
+        matcher: "cyclical" ranks by cyclical distance; or a name in `MATCHERS`, or a `Matcher`.
+        binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
+
+    Raises:
+        InputError: k is below 1, a name is unknown, or a foreground or `sim` does not fit the maps.
     """
-    if k < 1:
-        raise InputError(f"match: k is {k}, expected at least 1")
+    check_integer("match: k", k, 1)
+    check_seed("match: seed", seed)
     if isinstance(matcher, str) and matcher not in ("cyclical", *MATCHERS):
         raise InputError(f"match: matcher is {matcher!r}, expected one of cyclical, {', '.join(MATCHERS)}")
     if cycle_from not in ("reference", "target"):
         raise InputError(f"match: cycle_from is {cycle_from!r}, expected 'reference' or 'target'")
     if sim is None:
-        (sim,) = (similarities if binning else plain_similarities)(ref, [target])
+        (sim,) = (similarities if binning else key_similarities)(ref, [target])
     sim = torch.as_tensor(sim)
     if sim.shape != (ref.grid[0] * ref.grid[1], target.grid[0] * target.grid[1]):
         raise InputError(
             f"match: sim has shape {tuple(sim.shape)}, expected one row and column per patch of "
             f"{ref.grid} and {target.grid}"
         )
-    on_ref = ref.foreground(threshold) if ref_foreground is None else ref_foreground
-    on_target = target.foreground(threshold) if target_foreground is None else target_foreground
+    on_ref = ref.foreground(saliency_threshold) if ref_foreground is None else ref_foreground
+    on_target = target.foreground(saliency_threshold) if target_foreground is None else target_foreground
     on_ref = _mask(on_ref, ref.grid, "match: ref_foreground", sim.device).reshape(ref.grid)
     on_target = _mask(on_target, target.grid, "match: target_foreground", sim.device).reshape(target.grid)
     if cycle_from == "reference":
@@ -178,7 +224,7 @@ def match(
         neighbour, score = rank(sim, on_start.flatten(), on_end.flatten())
         best = sim.gather(1, neighbour[:, None])[:, 0]
 
-    # Off the device once; a few hundred candidates are a matter for numpy.
+    # The rest works on a few hundred numbers, in NumPy.
     score, best, neighbour = (x.cpu().numpy() for x in (score, best, neighbour))
     order = np.lexsort((np.arange(len(best)), -best, -score))
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
@@ -192,6 +238,7 @@ def match(
 
 
 def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
+    """Get the keys as a float32 tensor and check their shape."""
     keys = torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
     if keys.ndim != 3 or 0 in keys.shape:
         raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D)")
@@ -199,6 +246,7 @@ def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
 
 
 def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, " n"]:
+    """Flatten a foreground mask after a check of its shape; None selects all patches."""
     if mask is None:
         return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
     mask = torch.as_tensor(mask, device=device)
@@ -208,14 +256,14 @@ def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, " n
 
 
 def _bin_products(product: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
-    """Sum over the 17 bins of products of keys (module docstring), from the products of single keys."""
+    """Sum the products of keys over the 17 bins, as the module's docstring explains."""
 
     def rows(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         pooled = average_pool(average_pool(x, 0), 2)
         return _joint_shifts(x, 1), _joint_shifts(pooled, 3), pooled
 
     def columns(x: Tensor) -> Tensor:
-        # Swapping rows and columns makes the inner runs of memory long: cheaper than many short ones.
+        # Swapping rows and columns makes the contiguous runs of memory longer, which is faster.
         return x.permute(1, 0, 3, 2).contiguous()
 
     near, far, centre = (columns(x) for x in rows(product))
@@ -225,7 +273,7 @@ def _bin_products(product: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1
 
 
 def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
-    """x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border, summed."""
+    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border."""
     n1, n2 = x.shape[0], x.shape[2]
     padded = x
     for axis, n in ((0, n1), (2, n2)):
@@ -235,7 +283,7 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
 
 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
-    """1 / length of each patch's log-binned descriptor."""
+    """Compute 1 / length of each patch's log-binned descriptor."""
     index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
     raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(average_pool(keys, 0), 1)))
     squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
@@ -243,11 +291,11 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 
 def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
-    """Cosines between the descriptors of a few patches; for so few the bins are cheap to make."""
+    """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
     keys = features.keys.to(torch.float32)
     if not binning:
-        bare = F.normalize(keys.flatten(0, 1)[torch.from_numpy(index).to(keys.device)], dim=1)
-        return (bare @ bare.T).cpu().numpy().astype(np.float64)
+        normed = F.normalize(keys.flatten(0, 1)[torch.from_numpy(index).to(keys.device)], dim=1)
+        return (normed @ normed.T).cpu().numpy().astype(np.float64)
     bins = bin_indices(features.grid)[:, torch.from_numpy(index)].to(keys.device)
     pooled = average_pool(average_pool(keys, 0), 1)
     descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
@@ -256,21 +304,21 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = Tr
 
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
-    """k-means labels of m points known by their inner products.
+    """Cluster m points, given by their inner products, by k-means; returns their labels.
 
     The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
-    products, hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, only faster.
+    products, hence the same distances. k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
     """
     values, vectors = np.linalg.eigh(gram)
     points = vectors * np.sqrt(np.maximum(values, 0.0))
     with warnings.catch_warnings():
-        # Equal descriptors (a uniform surface) can leave clusters empty: fewer matches, no reason for alarm.
+        # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
 
 
 def _most_salient(labels: Int[np.ndarray, " m"], salience: Float[np.ndarray, " m"]) -> Int[np.ndarray, " clusters"]:
-    """Index of each cluster's most salient point (ties: the first), ascending."""
+    """Find the index of each cluster's most salient point (ties: the first), in ascending order."""
     order = np.lexsort((np.arange(len(labels)), -salience, labels))
     _, first = np.unique(labels[order], return_index=True)
     return np.sort(order[first])

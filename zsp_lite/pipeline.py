@@ -6,44 +6,27 @@ from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from zsp_lite.alignment import Sim3, ransac
-from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
+from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
+from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import Matches, match, plain_similarities, similarities
-from zsp_lite.views import (
-    IMAGE_SIZE,
-    View,
-    extract_views,
-    frame_defect,
-    frame_view,
-    object_crop,
-    patch_mask,
-    usable_targets,
-)
+from zsp_lite.matching import Matches, key_similarities, match, similarities
+from zsp_lite.metrics import rotation_error
+from zsp_lite.points import standard_deviation
+from zsp_lite.views import View, crop_size, extract_views, frame_defect, object_crop, usable_targets
 
-if TYPE_CHECKING:
-    from zsp_lite.backbones.load import Backbone
-
-# Views are part of this module's interface as well.
-__all__ = [
-    "Hypothesis", "IMAGE_SIZE", "PoseEstimate", "Solver", "View", "ZeroShotPose", "align_best_view", "extract_views",
-    "frame_view", "match_points", "object_crop", "patch_mask", "view_alignment",
-]  # fmt: skip
-
-# Range of the scale between two objects of a category; the paper gives none.
-SCALE_RANGE = (0.2, 5.0)
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
-_FEW = 10
+_FEW = 10  # fewer points do not give a standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +101,17 @@ class PoseEstimate:
         """The flags as one line."""
         return "; ".join(self.flags)
 
+    def __repr__(self) -> str:
+        matches = f"{int(self.inliers.sum())} of {len(self.matches)} matches agree"
+        sure = "" if self.confidence is None else f", confidence {self.confidence:.2f}"
+        angle = rotation_error(np.eye(3), self.sim3.R)
+        lines = [
+            f"PoseEstimate(target view {self.view} of {len(self.target_views)}, {matches}{sure},",
+            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale {self.sim3.scale:.3f},",
+            f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})",
+        ]
+        return "\n".join(lines)
+
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6).
 
@@ -181,20 +175,21 @@ class ZeroShotPose:
     """Zero-shot category-level pose estimation; the defaults are the paper's.
 
     Attributes:
-        backbone: Maps a list of images to a list of `FeatureMap`.
+        backbone: Computes the features of images; any `FeatureExtractor`.
         k: Number of matches.
         kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best.
-        view_selector: Name in `best_view.VIEW_SELECTORS`.
+        view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`.
         trials: Number of RANSAC trials.
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
             deviation.)
         adaptive_threshold: Multiply the threshold by the standard deviation of the object points in the chosen view,
             for scenes in other units (supplement, "RANSAC parameters").
         sample_size: Points per RANSAC trial.
-        saliency_threshold: A patch is foreground if its saliency is above this.
+        saliency_threshold: A patch is foreground if its saliency is above this. The default is the published code's.
         foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
-        cycle_from: View in which cycles start: "reference", as in the paper, or "target".
-        matcher: "cyclical", as in the paper, a name in `matchers.MATCHERS`, or a function (see `matchers.Matcher`).
+        cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the cycle step of the
+            published code (see `matching.match`; docs/published_code.md lists all its differences).
+        matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
         solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
             or a `Solver`.
@@ -204,10 +199,10 @@ class ZeroShotPose:
         InputError: A setting is out of range.
     """
 
-    backbone: "Backbone"
+    backbone: FeatureExtractor
     k: int = 50
     kmeans: bool = True
-    view_selector: str = "correspond"
+    view_selector: str | ViewSelector = "correspond"
     trials: int = 1000
     threshold: float = 0.2
     adaptive_threshold: bool = False
@@ -229,7 +224,7 @@ class ZeroShotPose:
             ("solver", ("paper", *SOLVERS)),
         ):
             value = getattr(self, name)
-            if name in ("matcher", "solver") and callable(value):
+            if name in ("matcher", "view_selector", "solver") and callable(value):
                 continue
             if value not in allowed:
                 raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
@@ -255,10 +250,16 @@ class ZeroShotPose:
         """
         timings: dict[str, float] = {}
         with _timed(timings, "crop"):
-            frames = [object_crop(frame) for frame in (reference, *targets)]
+            size = crop_size(self.backbone)
+            frames = [object_crop(frame, size) for frame in (reference, *targets)]
         with _timed(timings, "features"):
             views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
         return self.estimate_from_views(views[0], views[1:], timings)
+
+    def views(self, frames: Sequence[Frame]) -> list[View]:
+        """Crop frames to their objects and extract features and foregrounds, as `estimate` does."""
+        crops = [object_crop(frame, crop_size(self.backbone)) for frame in frames]
+        return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
 
     def estimate_from_views(
         self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
@@ -266,7 +267,7 @@ class ZeroShotPose:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
         Args:
-            reference: Reference view (see `views.extract_views`).
+            reference: Reference view (see `views`).
             targets: Target views.
             timings: Seconds of earlier stages, to include in the estimate's.
         """
@@ -278,7 +279,7 @@ class ZeroShotPose:
 
     def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
         """Compute the cosine similarities between the reference's and each target's patch descriptors."""
-        function = similarities if self.binning else plain_similarities
+        function = similarities if self.binning else key_similarities
         return function(reference.features, [target.features for target in targets])
 
     def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
@@ -343,7 +344,7 @@ def align_best_view(
     *,
     seed: int = 0,
     threshold: float = 0.2,
-    view_selector: str = "correspond",
+    view_selector: str | ViewSelector = "correspond",
     trials: int = 1000,
     sample_size: int = 4,
     adaptive_threshold: bool = False,
@@ -354,12 +355,13 @@ def align_best_view(
     """
     timings: dict[str, float] = {}
     with _timed(timings, "view"):
-        scores = np.array([VIEW_SELECTORS[view_selector](pair) for pair in pairs])
+        select = VIEW_SELECTORS[view_selector] if isinstance(view_selector, str) else view_selector
+        scores = np.array([select(pair) for pair in pairs], dtype=np.float64)
         best = int(scores.argmax())
         matches = pairs[best].matches
     with _timed(timings, "alignment"):
         points = match_points(reference, targets[best], matches)
-        unit = _spread(_foreground_points(targets[best])) if adaptive_threshold else 1.0
+        unit = (standard_deviation(_foreground_points(targets[best])) or 1.0) if adaptive_threshold else 1.0
         flags: tuple[str, ...] = ()
         try:
             sim3, inliers = ransac(
@@ -390,22 +392,15 @@ def view_alignment(reference: View, target: View) -> Sim3:
         reference's foreground points onto those of the target's.
     """
     first, second = _foreground_points(reference), _foreground_points(target)
-    spread = np.sqrt(np.square(first - first.mean(axis=0)).sum(axis=1).mean())
-    target_spread = np.sqrt(np.square(second - second.mean(axis=0)).sum(axis=1).mean())
-    scale = float(target_spread / spread) if spread > 0 and target_spread > 0 else 1.0
+    spread, target_spread = standard_deviation(first), standard_deviation(second)
+    scale = target_spread / spread if spread > 0 and target_spread > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 
 
-def _spread(points: Float[np.ndarray, "n 3"]) -> float:
-    """Standard deviation: the root of the axes' mean variance."""
-    return float(np.sqrt(points.var(axis=0).mean())) or 1.0
-
-
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
+    """Get the points of the foreground patches of measured depth; if they are too few, those of the whole crop."""
     points, known = view.patch_points
-    foreground = np.asarray(view.foreground.cpu())
-    # Fewer than ten foreground points do not give a spread: then those of the whole crop.
-    for chosen in (foreground & known, known):
+    for chosen in (view.known_foreground, known):
         if chosen.sum() >= _FEW:
             return points[chosen]
     return points.reshape(-1, 3)

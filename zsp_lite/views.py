@@ -1,9 +1,8 @@
-"""What one image brings to every pair it is in: its object crop, features, foreground and 3D points (fig. 2, left)."""
+"""Views: the object crop of a frame with its features, foreground patches and 3D points (fig. 2, left)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,21 +12,22 @@ from jaxtyping import Bool, Float
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureMap
+from zsp_lite.features import FeatureExtractor, FeatureMap
 
-if TYPE_CHECKING:
-    from zsp_lite.backbones.load import Backbone
-
-IMAGE_SIZE = 224
-# Thin parts (a chair's legs) never fill half a patch.
-_MASK_PATCH = 0.25
+IMAGE_SIZE = 224  # pixels of an object crop for a backbone that does not say its size
+# Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
+_MASK_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame cropped to its object, with its features and what of it is the object.
+    """An object crop with its features and foreground.
 
-    foreground: patches.  object_mask: how surely each pixel is the object, in [0, 1]; None: unknown.
+    Attributes:
+        frame: The crop.
+        features: Features of the crop's image.
+        foreground: Patches on the object.
+        object_mask: Probability of each pixel of being on the object, in [0, 1]; None if unknown.
     """
 
     frame: Frame
@@ -35,9 +35,16 @@ class View:
     foreground: Bool[torch.Tensor, "rows cols"]
     object_mask: Float[np.ndarray, "height width"] | None = None
 
+    def __repr__(self) -> str:
+        (height, width), (rows, columns) = self.frame.camera.size, self.features.grid
+        return (
+            f"View({self.frame.name!r}, {height} x {width} pixels, {int(self.foreground.sum())} of {rows} x {columns} "
+            f"patches foreground)"
+        )
+
     @property
     def soft_mask(self) -> Float[np.ndarray, "height width"]:
-        """`object_mask`, or where there is none the foreground patches, interpolated between their centres."""
+        """`object_mask`, or if there is none, the foreground patches interpolated between their centres."""
         if self.object_mask is not None:
             return self.object_mask
         patches = self.foreground.cpu().numpy().astype(np.float32)
@@ -45,30 +52,46 @@ class View:
 
     @cached_property
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether a measured depth stands behind it (see `depth.patch_points`).
+        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`).
 
-        Worked out when first asked for: of N target views only the chosen one's are needed.
-        Raises InputError where the frame has no known depth.
+        Computed on first use: of N target views the paper's solver needs only those of the chosen one.
+
+        Raises:
+            InputError: The frame has no known depth.
         """
         name = self.frame.name or "frame"
         if self.frame.depth is None:
-            raise InputError(f"{name}: no depth map, expected one to lift matches to 3D")
+            raise InputError(f"{name}: no depth map, expected one to unproject matches")
         try:
             return patch_points(self.frame.depth, self.frame.camera, self.features.grid)
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
+
+    @property
+    def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
+        """Foreground patches of measured depth."""
+        return np.asarray(self.foreground.cpu()) & self.patch_points[1]
+
+
+def crop_size(backbone: FeatureExtractor) -> int:
+    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224."""
+    return getattr(backbone, "image_size", IMAGE_SIZE)
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
 
     A frame without a mask, or with an empty one, is not cropped.
+
+    Args:
+        frame: Frame, whole.
+        size: Pixels; see `crop_size` for the size that a backbone takes.
     """
     return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
 
 
 def extract_views(
-    backbone: "Backbone",
+    backbone: FeatureExtractor,
     frames: Sequence[Frame],
     foreground: str = "saliency",
     saliency_threshold: float = 0.05,
@@ -76,7 +99,7 @@ def extract_views(
     """Extract the views of cropped frames, their features in one batch.
 
     Args:
-        backbone: Maps a list of images to a list of `FeatureMap`.
+        backbone: Computes the features.
         frames: Object crops (see `object_crop`).
         foreground: "saliency" or "mask" (see `frame_view`).
         saliency_threshold: A patch is foreground if its saliency is above this.
@@ -149,15 +172,24 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
 def soft_saliency(
     features: FeatureMap, size: tuple[int, int], threshold: float = 0.05
 ) -> Float[np.ndarray, "height width"]:
-    """Saliency as a soft mask of (height, width) pixels: 0 where there is none, a half at the threshold, 1 from
-    twice the threshold on, interpolated between the patches' centres."""
+    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the threshold, 1 from twice the threshold on.
+
+    Args:
+        features: Features of the image.
+        size: (height, width) of the mask in pixels; values are interpolated between the patches' centres.
+        threshold: Threshold of the foreground.
+    """
     ramp = (features.saliency.cpu().numpy() / max(2 * threshold, 1e-6)).clip(0, 1)
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
-    """Which patches the frame's mask covers by a quarter or more.  Raises InputError for a frame without a mask."""
+    """Select the patches of which the frame's mask covers at least a quarter.
+
+    Raises:
+        InputError: The frame has no mask.
+    """
     if frame.mask is None:
         raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
     covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(covered >= _MASK_PATCH)
+    return torch.from_numpy(covered >= _MASK_SHARE)

@@ -4,14 +4,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from zsp_lite.alignment import ransac
+from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, lifted, mutual_matches
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import SCALE_RANGE
 
 _K = 50
 

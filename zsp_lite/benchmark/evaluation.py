@@ -17,7 +17,8 @@ from zsp_lite.data.labels import PoseLabel, relative_pose
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error, translation_error
-from zsp_lite.pipeline import patch_mask, view_alignment
+from zsp_lite.pipeline import view_alignment
+from zsp_lite.views import patch_mask
 
 # A pair whose frames cannot be used counts as wrong as can be: leaving it out would reward failing.
 FAILED = 180.0

@@ -15,7 +15,8 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import PoseEstimate, View, ZeroShotPose
+from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+from zsp_lite.views import View
 
 # What is found out about an answer: no detail may go by one of these names.
 MEASURED = ("error", "failed", "translation_error", "scale", "view", "note")
@@ -99,7 +100,7 @@ class Problem:
         return self.views()[1:]
 
     def frames(self) -> list[Frame]:
-        """Object crops of 224 x 224 pixels, the reference's first. Raises InputError where one has no object."""
+        """Object crops of the backbone's image size, the reference's first."""
         return [self.store.frame(key) for key in self.keys]
 
     def full_frames(self) -> list[Frame]:
@@ -113,7 +114,7 @@ class Problem:
     def views(
         self, features: str = "backbone", foreground: str = "saliency", saliency_threshold: float = 0.05
     ) -> list[View]:
-        """The crops with their features and foregrounds (see `pipeline.frame_view`)."""
+        """The crops with their features and foregrounds (see `views.frame_view`)."""
         return [self.store.view(features, key, foreground, saliency_threshold) for key in self.keys]
 
     def first_cameras(self) -> tuple[Camera, Camera]:

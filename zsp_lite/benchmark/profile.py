@@ -26,7 +26,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import log_bin
 from zsp_lite.matching import similarities
-from zsp_lite.pipeline import ZeroShotPose, extract_views, object_crop
+from zsp_lite.pipeline import ZeroShotPose
 
 N_TARGETS = 5
 
@@ -87,8 +87,7 @@ def stage_rows(repeats: int = 5) -> list[Row]:
 def verified_row(repeats: int = 5) -> Row:
     """Median milliseconds of all stages of the verified solver that follow features, similarities and matches."""
     method = ZeroShotPose(random_vits8(), foreground="mask", solver="verified")
-    crops = [object_crop(frame) for frame in made_up_frames(1 + N_TARGETS)]
-    reference, *targets = extract_views(method.backbone, crops, method.foreground)
+    reference, *targets = method.views(made_up_frames(1 + N_TARGETS))
     compared = [method.match_pair(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     (seconds,) = _median_seconds([lambda: method.estimate_from_pairs(reference, targets, compared)], repeats)
     note = f"beyond features, similarities and matches; {torch.get_num_threads()} threads"

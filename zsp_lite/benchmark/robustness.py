@@ -20,6 +20,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
 from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+from zsp_lite.points import object_points, standard_deviation
 from zsp_lite.views import frame_view
 
 _HOLES = 0.3  # share of the known pixels that become unknown, in patches about a sixteenth of the crop wide
@@ -108,11 +109,8 @@ class Damaged:
 
 def object_spread(frame: Frame) -> float:
     """Standard deviation, the root of the axes' mean variance, of the points seen on the object (no mask: of all)."""
-    depth = _depth(frame)
-    on = (depth > 0) & (True if frame.mask is None else frame.mask > 0.5)
-    row, column = np.nonzero(on if on.any() else depth > 0)
-    points = frame.camera.unproject_camera(np.stack([column + 0.5, row + 0.5], axis=-1), depth[row, column])
-    return float(np.sqrt(points.var(axis=0).mean()))
+    points = object_points(frame)
+    return standard_deviation(points if len(points) else object_points(replace(frame, mask=None)))
 
 
 def exact(frame: Frame, root: str | Path, category: str, sequence: str) -> Frame:

@@ -15,7 +15,8 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import View, ZeroShotPose, frame_view, object_crop
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.views import View, crop_size, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence and frame number
 
@@ -58,7 +59,7 @@ class FrameStore:
                 with self._timed("reading"):
                     frame = self.full_frame(key)
                     try:
-                        self._frames[key] = object_crop(frame)
+                        self._frames[key] = object_crop(frame, crop_size(self.extractors.get("backbone")))
                     except InputError as error:
                         self._frames[key] = error
 

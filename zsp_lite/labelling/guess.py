@@ -11,7 +11,6 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import extract_views, object_crop
 
 if TYPE_CHECKING:
     from zsp_lite.backbones.load import Backbone
@@ -28,7 +27,7 @@ def guess_alignment(
     """
     method = ZeroShotPose(backbone, solver="verified")
     first, second = _frames(dataset, category, reference, references), _frames(dataset, category, sequence, views)
-    seen = extract_views(backbone, [object_crop(frame) for frame in (*first, *second)])
+    seen = method.views([*first, *second])
     found = [method.estimate_from_views(view, seen[len(first) :]) for view in seen[: len(first)]]
     best = int(np.argmax([estimate.confidence for estimate in found]))
     to_camera, from_camera = _rigid(first[best].camera), _rigid(found[best].target_camera).inverse()

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from zsp_lite.data.frames import Frame
-from zsp_lite.demo import DemoResult, object_cloud
+from zsp_lite.demo import DemoResult
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.pipeline import object_crop
+from zsp_lite.points import object_cloud
+from zsp_lite.views import object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz.scene3d import aligned_clouds
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Real
 from matplotlib.collections import LineCollection
 
-from zsp_lite.alignment import ransac, umeyama
+from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ipywidgets import VBox
 
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_SCALES = (0.2, 5.0)  # as `ZeroShotPose` allows
 
 
 def ransac_settings(
@@ -54,7 +53,7 @@ def ransac_settings(
     def update(trials: int, threshold: float, draw: int) -> str:
         line.set_ydata([threshold, threshold])
         try:
-            sim3, inliers = ransac(source, target, threshold, trials, seed=draw, scale_range=_SCALES)
+            sim3, inliers = ransac(source, target, threshold, trials, seed=draw, scale_range=SCALE_RANGE)
         except InputError as error:
             canvas.draw(*pixels, np.zeros(n, bool))
             for dots in (inside, outside):

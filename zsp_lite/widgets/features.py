@@ -14,7 +14,7 @@ from zsp_lite.backbones.load import Backbone, load_backbone, prepare_images
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.errors import InputError
-from zsp_lite.matching import plain_similarities, similarity
+from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
@@ -143,7 +143,7 @@ def context(
 ) -> "VBox":
     """Choose a patch; see its similarities by bare keys and by log-binned descriptors side by side."""
     grid = found.shape
-    kinds = {"bare keys": plain_similarities(keys[0], [keys[1]])[0], "log-binned": similarity(*keys)}
+    kinds = {"bare keys": key_similarities(keys[0], [keys[1]])[0], "log-binned": similarity(*keys)}
     sims = [sim.numpy() for sim in kinds.values()]
     panels = _SimilarityPanels(reference, [target, target], grid, list(kinds))
 

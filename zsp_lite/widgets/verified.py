@@ -139,13 +139,12 @@ def _example_solution() -> tuple[Solution, tuple["View", ...]]:
     from zsp_lite.demo import demo_pairs
     from zsp_lite.pipeline import ZeroShotPose
     from zsp_lite.verified import VerifiedSolver
-    from zsp_lite.views import extract_views, object_crop
 
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset, n_targets=3)[-1]
     reference, targets = dataset.load_pair(pair)
     method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
-    reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
+    reference, *targets = method.views([reference, *targets])
     sims = method.similarities(reference, targets)
     pairs = [method.match_pair(reference, *pair) for pair in zip(targets, sims)]
     return VerifiedSolver().solve(reference, targets, pairs), tuple(targets)

@@ -192,7 +192,6 @@ def example_best_view() -> "VBox":
     from zsp_lite.demo import demo_pairs
     from zsp_lite.metrics import rotation_error
     from zsp_lite.pipeline import ZeroShotPose
-    from zsp_lite.views import extract_views, object_crop
 
     dataset = Co3D(sample_data())
     pair = demo_pairs(dataset)[0]
@@ -200,10 +199,9 @@ def example_best_view() -> "VBox":
         read_labels(dataset.root, pair.category)[s] for s in (pair.reference_sequence, pair.target_sequence)
     )
     reference, targets = dataset.load_pair(replace(pair, target_frames=(0, 6, 12, 18)))
-    frames = [object_crop(frame) for frame in (reference, *targets)]
-    backbone = load_backbone("zsp-tiny", "cpu")
-    reference, *targets = extract_views(backbone, frames)
-    method = ZeroShotPose(backbone)
+    method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
+    reference, *targets = method.views([reference, *targets])
+    frames = [view.frame for view in (reference, *targets)]
     compared = [method.match_pair(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     truths = [relative_pose(first, frames[0].camera, second, frame.camera) for frame in frames[1:]]
     seen_from = second.trans @ np.linalg.inv(first.trans) @ np.append(frames[0].camera.centre, 1)

@@ -1,0 +1,41 @@
+"""The package's public names, and the examples in its docstrings."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import zsp_lite
+
+# Names that the design document promises as attributes of the package.
+PROMISED = """
+    pipeline views features matching matchers best_view alignment points metrics errors demo
+    co3d pairs frames cameras depth annotations labels check samples vit checkpoints facets huggingface
+    plots scene3d report download ply files
+    data backbones viz io cli labelling importers baselines verified benchmark synthetic training widgets
+    load_backbone Backbone ZeroShotPose PoseEstimate FeatureMap Frame Camera Matches Co3D Sim3 InputError
+""".split()
+
+
+def test_every_promised_name_is_an_attribute_after_a_bare_import():
+    code = f"import zsp_lite\nfor name in {[*PROMISED, *zsp_lite.__all__]}: getattr(zsp_lite, name)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        zsp_lite.nothing  # noqa: B018
+
+
+def test_the_bare_import_does_not_import_torch():
+    code = "import sys, zsp_lite; assert 'torch' not in sys.modules and 'cv2' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_type_checkers_see_the_same_names_as_the_interpreter():
+    tree = ast.parse(Path(zsp_lite.__file__).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    homes = {alias.name: node.module for node in block.body for alias in node.names}
+    assert homes == {name: f"zsp_lite.{home}".rstrip(".") for name, home in zsp_lite._HOME_OF.items()}

@@ -1,0 +1,84 @@
+"""Points of the object: the pixels on it, their 3D points, outliers and standard deviation.
+
+Patches on the object are `View.foreground`; the functions here work on pixels and points.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
+from zsp_lite.errors import InputError
+from zsp_lite.views import View
+
+ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
+
+
+def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
+    """Select the pixels on the object that have known depth; a frame without a mask is all object.
+
+    Args:
+        frame: Frame with a depth map.
+        threshold: A pixel is on the object if its mask probability is above this.
+
+    Raises:
+        InputError: The frame has no depth map.
+    """
+    if frame.depth is None:
+        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one for the object's points")
+    known = frame.depth > 0
+    return known if frame.mask is None else known & (frame.mask > threshold)
+
+
+def object_points(frame: Frame, threshold: float = ON_OBJECT) -> Float[np.ndarray, "n 3"]:
+    """Unproject the pixels of `object_pixels` to camera-frame points; N may be 0."""
+    pixels = object_pixels(frame, threshold)
+    return unproject_depth(frame.depth, frame.camera)[pixels]
+
+
+def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:
+    """Select the points that are not outliers.
+
+    A mask that is too wide by a pixel includes points of the background, far behind the object.
+
+    Args:
+        points: (N, 3) points, N >= 1.
+        factor: Largest distance from the median point, in multiples of the median distance.
+    """
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return distance <= factor * np.median(distance)
+
+
+def standard_deviation(points: Float[np.ndarray, "n 3"]) -> float:
+    """Compute the standard deviation of points: the root of the mean variance of the three axes."""
+    return float(np.sqrt(np.square(points - points.mean(axis=0)).sum(axis=1).mean() / 3))
+
+
+def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Gather a view's object points for display, without outliers.
+
+    The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
+
+    Args:
+        view: Object crop with its foreground.
+        most: Largest number of points; more are subsampled at random.
+        seed: Seed of the subsampling.
+
+    Returns:
+        (N, 3) camera-frame points.
+
+    Raises:
+        InputError: No pixel of the object has a known depth.
+    """
+    frame = view.frame
+    pixels = object_pixels(frame, 0.9)
+    if frame.mask is None:
+        rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
+        pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
+    points = unproject_depth(frame.depth, frame.camera)[pixels]
+    if len(points) == 0:
+        raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
+    points = points[near_median(points, 2.5)]
+    if len(points) > most:
+        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
+    return points
