@@ -1,4 +1,4 @@
-"""The demo on a folder with a known answer, and the page made of it."""
+"""The demo on synthetic data with known poses, and its HTML report and overview picture."""
 
 import re
 from dataclasses import replace
@@ -11,7 +11,7 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite.data.frames import read_image
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.points import object_cloud
-from zsp_lite.viz.report import page, table_row, write_overview, write_report
+from zsp_lite.viz.report import COLUMNS, render_page, table_row, write_overview, write_report
 
 
 @pytest.fixture(scope="module")
@@ -21,20 +21,20 @@ def results(ellipsoids):
 
 @pytest.fixture(scope="module")
 def text(results):
-    return page(results, "some/folder", "synthetic ellipsoids <made here>", "coordinates")
+    return render_page(results, "some/folder", "synthetic ellipsoids <script>", "a & b")
 
 
-def test_the_demo_finds_the_pose_where_features_are_perfect(results):
+def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
     assert [result.pair.category for result in results] == ["ellipsoid"]
     assert results[0].error < 6
     assert results[0].estimate.inliers.sum() > 20
 
 
-def test_pairs_are_the_same_every_time(ellipsoids):
+def test_demo_pairs_are_deterministic(ellipsoids):
     assert demo_pairs(ellipsoids) == demo_pairs(ellipsoids)
 
 
-def test_shipped_evaluation_pairs_come_first(ellipsoids):
+def test_shipped_evaluation_pairs_are_preferred(ellipsoids):
     from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 
     pairs = sample_pairs(ellipsoids, "ellipsoid", 3, 2, seed=11)
@@ -47,13 +47,14 @@ def test_shipped_evaluation_pairs_come_first(ellipsoids):
 def test_the_object_cloud_is_the_visible_surface(results):
     cloud = object_cloud(results[0].estimate.reference_view, most=500)
     assert cloud.shape == (500, 3)
-    # The cameras stand 4 away from the middle of an object that reaches 1.6.
+    # The cameras are at a distance of 4 from the centre of an object of radius 1.6.
     assert (np.abs(cloud[:, 2] - 4) < 1.7).all()
 
 
-def test_the_table_says_what_the_estimate_says(results):
+def test_the_table_row_shows_the_estimate(results):
     category, view, inliers, error, seconds = table_row(results[0])
     estimate = results[0].estimate
+    assert len(COLUMNS) == 5
     assert (category, view) == ("ellipsoid", f"{estimate.view + 1} of 5")
     assert inliers == f"{estimate.inliers.sum()} of {len(estimate.inliers)}"
     assert error.endswith("°") and seconds.endswith(" s")
@@ -76,7 +77,7 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_well_formed_and_needs_nothing_beside_itself(text):
+def test_the_page_is_well_formed_and_self_contained(text):
     outline = Outline()
     outline.feed(text)
     assert not outline.open
@@ -84,37 +85,43 @@ def test_the_page_is_well_formed_and_needs_nothing_beside_itself(text):
     assert len(text) < 12_000_000
 
 
-def test_every_stage_is_on_the_page_and_every_picture_is_described(text):
+def test_the_page_has_every_stage_and_every_image_has_an_alternative_text(text):
     outline = Outline()
     outline.feed(text)
     for stage in ("Reference and target views", "Saliency", "Cyclical distances", "Correspondences",
-                  "Aligned point clouds", "The pose over the target sequence"):  # fmt: skip
+                  "Aligned point clouds", "The pose in the target sequence"):  # fmt: skip
         assert text.count(f"<h3>{stage}</h3>") == 1
     assert len(outline.images) == 5
     assert all(len(image["alt"]) > 20 for image in outline.images)
 
 
-def test_plotly_is_inline_once_and_draws_each_scene(text):
+def test_plotlys_script_is_inlined_once_and_draws_each_scene(text):
     assert len(re.findall(r"Plotly\.newPlot\(", text)) == 1
     assert "plotly.js v" in text
 
 
-def test_what_comes_from_outside_is_escaped(text):
-    assert "&lt;made here&gt;" in text and "<made here>" not in text
+def test_all_text_is_escaped(results, text):
+    assert "synthetic ellipsoids &lt;script&gt;" in text and "a &amp; b" in text
+    hostile = "<img src=x onerror=alert(1)>"
+    pair = replace(results[0].pair, category=hostile, reference_sequence=hostile, target_sequence=hostile)
+    estimate = replace(results[0].estimate, flags=(hostile,), timings={hostile: 1.0})
+    page = render_page([replace(results[0], pair=pair, estimate=estimate)], hostile, hostile, hostile)
+    assert hostile not in page
+    assert page.count("&lt;img src=x onerror=alert(1)&gt;") == 11
 
 
-def test_the_report_is_written_where_asked(results, tmp_path):
+def test_the_report_is_written_to_its_path(results, tmp_path):
     path = write_report(tmp_path / "deep" / "report.html", results, "folder", "note", "name")
     assert path.read_text().startswith("<!doctype html>")
 
 
-def test_the_overview_is_one_picture_of_all_results(results, tmp_path):
+def test_the_overview_shows_all_results(results, tmp_path):
     picture = read_image(write_overview(tmp_path / "deep" / "overview.jpg", results * 2))
     height, width = picture.shape[:2]
-    assert 2 < width / height < 4  # two rows of six square pictures
+    assert 2 < width / height < 4  # two rows of six square images
 
 
-def test_frames_that_do_not_show_the_object_stay_out_of_the_overview(results, tmp_path):
+def test_frames_with_an_empty_mask_are_left_out_of_the_overview(results, tmp_path):
     (result,) = results
     empty = [replace(frame, mask=np.zeros_like(frame.mask)) for frame in result.sequence[:4]]
     sequence = (*empty, *result.sequence[4:])

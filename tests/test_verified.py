@@ -14,9 +14,9 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.hypotheses import equally_good
-from zsp_lite.verified.refinement import rotations
-from zsp_lite.verified.verification import TERMS, Weights
+from zsp_lite.verified.poses import rotation_matrices
+from zsp_lite.verified.solver import tied_hypotheses
+from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 from zsp_lite.views import extract_views, object_crop
 
 
@@ -70,8 +70,10 @@ def test_hypotheses_are_ranked_and_apart_and_each_says_what_speaks_for_it(estima
     scores = [one.score for one in found]
     assert scores == sorted(scores, reverse=True)
     for one in found:
-        assert one.terms.keys() == set(TERMS)
-        assert one.score == pytest.approx(sum(getattr(Weights(), name) * one.terms[name] for name in TERMS), abs=1e-2)
+        assert one.terms.keys() == set(TERM_NAMES)
+        assert one.score == pytest.approx(
+            sum(getattr(ScoreWeights(), name) * one.terms[name] for name in TERM_NAMES), abs=1e-2
+        )
         assert 0 <= one.confidence <= 1
     assert max(one.confidence for one in found) == found[0].confidence
     cameras = [view.frame.camera for view in estimate.target_views]
@@ -213,7 +215,7 @@ def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
     frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])
     found = method.estimate_from_views(reference, targets)
-    assert "does not look alike" in found.note and not found.reliable
+    assert "are not similar" in found.note and not found.reliable
 
 
 def test_where_nothing_can_be_known_one_line_says_so(method, views, frames):
@@ -297,7 +299,7 @@ def test_a_symmetric_object_is_called_ambiguous(method, symmetry):
 
 
 def test_equally_good_are_only_distinct_answers_within_a_nat():
-    rotation = rotations(torch.deg2rad(torch.tensor([[0.0, 0, angle] for angle in (0, 20, 180, 190, 90)])))
-    assert equally_good(torch.tensor([5.0, 4.9, 4.5, 4.4, 3.9]), rotation) == [0, 2]  # 20 is 0's, 190 is 180's
-    assert equally_good(torch.tensor([5.0, 4.9, 3.5, 4.4, 4.2]), rotation) == [0, 3, 4]
-    assert equally_good(torch.tensor([5.0, 3.9, 3.5, 3.4, 3.2]), rotation) == [0]
+    rotation = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 0, angle] for angle in (0, 20, 180, 190, 90)])))
+    assert tied_hypotheses(torch.tensor([5.0, 4.9, 4.5, 4.4, 3.9]), rotation) == [0, 2]  # 20 is 0's, 190 is 180's
+    assert tied_hypotheses(torch.tensor([5.0, 4.9, 3.5, 4.4, 4.2]), rotation) == [0, 3, 4]
+    assert tied_hypotheses(torch.tensor([5.0, 3.9, 3.5, 3.4, 3.2]), rotation) == [0]

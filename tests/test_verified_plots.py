@@ -7,8 +7,8 @@ import torch
 
 from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import reliability
-from zsp_lite.verified.maps import Seen, ViewMaps
-from zsp_lite.verified.verification import FULL, TERMS, TOUCH, Evidence, Weights
+from zsp_lite.verified.maps import Projection, ViewMaps
+from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreWeights
 from zsp_lite.viz import plots
 from zsp_lite.viz import verified as verified_plots
 
@@ -37,61 +37,63 @@ def maps():
 
 @pytest.fixture
 def evidence():
-    touch = WEIGHT * torch.exp(-(BEHIND**2) / (2 * TOUCH**2))
-    front = WEIGHT * (-(BEHIND + TOUCH) / FULL).clamp(0, 1)
-    seen = Seen(*(x[None, None] for x in (3 + BEHIND, torch.full((5,), 3.0), WEIGHT, OFF, torch.arange(5), PIXELS)))
-    parts = (touch, OFF / FULL, front, torch.linspace(-0.2, 0.2, 5))
-    return Evidence(seen, *(part[None, None] for part in parts))
+    touch = WEIGHT * torch.exp(-(BEHIND**2) / (2 * SURFACE_SIGMA**2))
+    front = WEIGHT * (-(BEHIND + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
+    projection = Projection(
+        *(x[None, None] for x in (3 + BEHIND, torch.full((5,), 3.0), WEIGHT, OFF, torch.arange(5), PIXELS))
+    )
+    parts = (touch, OFF / MAX_VIOLATION, front, torch.linspace(-0.2, 0.2, 5))
+    return PointTerms(projection, *(part[None, None] for part in parts))
 
 
 def test_each_kind_of_point_is_told_from_the_others(evidence):
-    assert verified_plots.point_kinds(evidence).tolist() == [[0, 1, 2, 3, 4]]
-    assert list(verified_plots.KINDS)[2] == "floating before it"
+    assert verified_plots.classify_points(evidence).tolist() == [[0, 1, 2, 3, 4]]
+    assert list(verified_plots.POINT_CLASSES)[2] == "in free space"
 
 
 def test_points_are_drawn_where_they_project_in_the_image_itself(evidence, maps):
     figure, axes = plots.show_images([IMAGE])
-    counts = verified_plots.draw_kinds(axes, evidence, maps)
+    counts = verified_plots.draw_point_classes(axes, evidence, maps)
     assert counts.tolist() == [[1, 1, 1, 1, 1]]
     drawn = np.concatenate([collection.get_offsets() for collection in axes[0].collections])
     # Twice the map's pixels; the one beyond the border (110) stands at it (80).
     np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
-    assert len({marker for _, marker in verified_plots.KINDS.values()}) == len(verified_plots.KINDS)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(verified_plots.KINDS)
+    assert len({marker for _, marker in verified_plots.POINT_CLASSES.values()}) == len(verified_plots.POINT_CLASSES)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(verified_plots.POINT_CLASSES)
 
 
-@pytest.mark.parametrize("term", ["off", "front", "touch", "alike"])
+@pytest.mark.parametrize("term", ["silhouette", "free_space", "surface", "similarity"])
 def test_a_terms_values_are_the_colours(evidence, maps, term):
     _, axes = plots.show_images([IMAGE])
-    verified_plots.draw_term(axes, evidence, maps, term)
+    verified_plots.draw_point_term(axes, evidence, maps, term)
     drawn = axes[0].collections[0].get_array()
     np.testing.assert_allclose(sorted(drawn), sorted(getattr(evidence, term)[0, 0].tolist()), atol=1e-6)
 
 
 def test_the_worst_offence_is_the_largest_point(evidence, maps):
     _, axes = plots.show_images([IMAGE])
-    verified_plots.draw_term(axes, evidence, maps, "front")
+    verified_plots.draw_point_term(axes, evidence, maps, "free_space")
     drawn = axes[0].collections[0]
     np.testing.assert_allclose(drawn.get_offsets()[np.argmax(drawn.get_sizes())], [60, 10])
 
 
 def test_unknown_terms_and_too_few_axes_are_refused(evidence, maps):
     _, axes = plots.show_images([IMAGE] * 2)
-    with pytest.raises(InputError, match="expected one of off, front"):
-        verified_plots.draw_term(axes[:1], evidence, maps, "colour")
-    for draw in (lambda: verified_plots.draw_kinds(axes, evidence, maps),
-                 lambda: verified_plots.draw_term(axes, evidence, maps, "off")):  # fmt: skip
+    with pytest.raises(InputError, match="expected one of silhouette, free_space"):
+        verified_plots.draw_point_term(axes[:1], evidence, maps, "colour")
+    for draw in (lambda: verified_plots.draw_point_classes(axes, evidence, maps),
+                 lambda: verified_plots.draw_point_term(axes, evidence, maps, "silhouette")):  # fmt: skip
         with pytest.raises(InputError, match="2 axes, expected one for each of the 1 views"):
             draw()
 
 
 def test_contributions_add_up_to_the_score():
     rng = np.random.default_rng(0)
-    terms, weights = dict(zip(TERMS, rng.random(len(TERMS)))), Weights(*rng.normal(size=len(TERMS)))
-    parts = verified_plots.contributions(terms, weights)
-    assert sum(parts.values()) == pytest.approx(sum(getattr(weights, name) * terms[name] for name in TERMS))
+    terms, weights = dict(zip(TERM_NAMES, rng.random(len(TERM_NAMES)))), ScoreWeights(*rng.normal(size=len(TERM_NAMES)))
+    parts = verified_plots.score_contributions(terms, weights)
+    assert sum(parts.values()) == pytest.approx(sum(getattr(weights, name) * terms[name] for name in TERM_NAMES))
     _, axis = plt.subplots()
-    verified_plots.draw_contributions(axis, {"first": terms, "second": dict.fromkeys(TERMS, 0.0)}, weights)
+    verified_plots.draw_score_contributions(axis, {"first": terms, "second": dict.fromkeys(TERM_NAMES, 0.0)}, weights)
     bars, flat = axis.containers
     np.testing.assert_allclose([bar.get_width() for bar in bars], list(parts.values()))
     assert all(bar.get_width() == 0 for bar in flat)
@@ -99,13 +101,13 @@ def test_contributions_add_up_to_the_score():
 
 
 def test_a_term_without_weight_has_no_bar_and_five_hypotheses_are_too_many():
-    terms = dict.fromkeys(TERMS, 1.0)
-    weights = Weights(**(dict.fromkeys(TERMS, 0.0) | {"f_sim": 2.0}))
+    terms = dict.fromkeys(TERM_NAMES, 1.0)
+    weights = ScoreWeights(**(dict.fromkeys(TERM_NAMES, 0.0) | {"forward_similarity": 2.0}))
     _, axis = plt.subplots()
-    verified_plots.draw_contributions(axis, {"one": terms}, weights)
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["f_sim"]
+    verified_plots.draw_score_contributions(axis, {"one": terms}, weights)
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["forward similarity"]
     with pytest.raises(InputError, match="5 hypotheses to draw, expected 1 to 4"):
-        verified_plots.draw_contributions(axis, {str(i): terms for i in range(5)}, weights)
+        verified_plots.draw_score_contributions(axis, {str(i): terms for i in range(5)}, weights)
 
 
 def test_reliability_points_lie_at_confidence_and_frequency():

@@ -19,17 +19,32 @@ from zsp_lite.verified.confidence import (
     Calibration,
     auroc,
     calibration_for,
-    fit_calibration,
-    margins,
     reliability,
+    score_margins,
 )
-from zsp_lite.verified.maps import look_up, make_maps
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, angles, fit_poses, join, suppress
-from zsp_lite.verified.proposals import from_matches, propose, view_rotations
-from zsp_lite.verified.refinement import Search, refine, rotations
-from zsp_lite.verified.scene import contrast, make_scene, surface_shares
-from zsp_lite.verified.soft_icp import soft_icp, spread_indices
-from zsp_lite.verified.verification import TERMS, Terms, Weights, forward, reverse, same_side, verify
+from zsp_lite.verified.maps import build_maps, project_points
+from zsp_lite.verified.poses import (
+    SCALE_RANGE,
+    Poses,
+    concatenate,
+    fit_poses,
+    non_maximum_suppression,
+    rotation_angles,
+    rotation_matrices,
+)
+from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, propose_poses
+from zsp_lite.verified.refinement import SearchSchedule, refine
+from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
+from zsp_lite.verified.soft_icp import evenly_spaced_indices, soft_icp
+from zsp_lite.verified.verification import (
+    TERM_NAMES,
+    ScoreTerms,
+    ScoreWeights,
+    forward_terms,
+    reverse_terms,
+    score_terms,
+    viewpoint_term,
+)
 from zsp_lite.views import View, extract_views, object_crop
 
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
@@ -67,14 +82,14 @@ def scene(views):
     reference, *targets = views
     found = similarities(reference.features, [target.features for target in targets])
     matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
-    return make_scene(reference, targets, found, matches)
+    return build_scene(reference, targets, found, matches)
 
 
 @pytest.fixture(scope="module")
 def truth(frames, scene):
     """The true pose in working units."""
     first = true_pose(frames[0].camera, Sim3.identity(), frames[1].camera, ELSEWHERE)
-    return scene.poses([first], 0)
+    return scene.from_sim3([first], 0)
 
 
 # Poses
@@ -117,22 +132,22 @@ def test_angles_are_the_rotation_errors():
     rng = np.random.default_rng(0)
     one, two = (np.stack([some_rotation(rng) for _ in range(n)]) for n in (3, 4))
     np.testing.assert_allclose(
-        angles(torch.tensor(one), torch.tensor(two)), rotation_error(one[:, None], two[None]), atol=1e-6
+        rotation_angles(torch.tensor(one), torch.tensor(two)), rotation_error(one[:, None], two[None]), atol=1e-6
     )
 
 
 @given(seeds)
 def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     rng = np.random.default_rng(seed)
-    rotation = rotations(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
+    rotation = rotation_matrices(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
     score = torch.tensor(rng.normal(size=12))
-    kept = suppress(rotation, score, 25.0, 12)
-    apart = angles(rotation, rotation)
+    kept = non_maximum_suppression(rotation, score, 25.0, 12)
+    apart = rotation_angles(rotation, rotation)
     assert (score[kept].diff() <= 0).all()
     assert (apart[kept][:, kept] + 180 * torch.eye(len(kept)) >= 25).all()
     for dropped in set(range(12)) - set(kept.tolist()):
         assert any(apart[dropped, k] < 25 and score[k] >= score[dropped] for k in kept)
-    assert suppress(rotation, score, 25.0, 2).tolist() == kept[:2].tolist()
+    assert non_maximum_suppression(rotation, score, 25.0, 2).tolist() == kept[:2].tolist()
 
 
 # Maps and scene
@@ -143,17 +158,17 @@ def test_points_are_looked_up_where_the_camera_projects_them(views, scene):
     rng = np.random.default_rng(0)
     # In front of the second target, all over its picture.
     seen = camera.unproject(rng.uniform(5, 219, (200, 2)), rng.uniform(3, 6, 200))
-    working = scene.target_frame.apply(scene.cameras[0].to_camera(seen))
+    working = scene.target_to_working.apply(scene.target_cameras[0].to_camera(seen))
     identity = as_poses(Sim3.identity())
-    found = look_up(
+    found = project_points(
         scene.target_maps, identity.linear, identity.translation, torch.tensor(working, dtype=torch.float32)
     )
     pixels, depth = camera.project(seen)
-    np.testing.assert_allclose(found.pixels[0, 1] * scene.target_maps.zoom[1], pixels, atol=0.05)
-    np.testing.assert_allclose(found.depth[0, 1] / scene.target_frame.scale, depth, rtol=1e-4)
+    np.testing.assert_allclose(found.pixels[0, 1] * scene.target_maps.pixel_scale[1], pixels, atol=0.05)
+    np.testing.assert_allclose(found.depth[0, 1] / scene.target_to_working.scale, depth, rtol=1e-4)
     # The map is coarser than the frame: its pixel's depth is that of one of the frame's under it.
     known = target.frame.depth
-    for (x, y), surface in zip(pixels.astype(int), found.surface[0, 1].numpy() / scene.target_frame.scale):
+    for (x, y), surface in zip(pixels.astype(int), found.surface_depth[0, 1].numpy() / scene.target_to_working.scale):
         under = known[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
         assert np.abs(under - surface).min() < 1e-3
 
@@ -178,12 +193,12 @@ def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
     features = FeatureMap(torch.zeros(8, 8, 4), torch.ones(8, 8), torch.ones(4))
     frame = Frame(np.zeros((64, 64, 3), np.uint8), np.full((64, 64), 2, np.float32), mask, camera)
     view = View(frame, features, torch.ones(8, 8, dtype=torch.bool), mask)
-    maps = make_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(64)])
+    maps = build_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(64)])
     left, right = (torch.tensor([[x, 0.0, 2.0]]) for x in (-1.6, 1.6))
     one = torch.eye(3)[None], torch.zeros(1, 3)
-    assert float(look_up(maps, *one, left).off) == 0
+    assert float(project_points(maps, *one, left).silhouette_distance) == 0
     # 32 pixels to the border and 19.2 beyond are 51.2, at 32 pixels per unit of length.
-    assert float(look_up(maps, *one, right).off) == pytest.approx(51.2 / 32, rel=0.05)
+    assert float(project_points(maps, *one, right).silhouette_distance) == pytest.approx(51.2 / 32, rel=0.05)
 
 
 def test_working_units_have_mean_zero_and_unit_spread(scene):
@@ -196,16 +211,16 @@ def test_a_pose_survives_the_way_to_a_camera_and_back(scene):
     rng = np.random.default_rng(2)
     pose = Sim3(0.8, some_rotation(rng), rng.normal(size=3))
     for view in range(3):
-        back = scene.sim3(scene.poses([pose], view), 0, view)
+        back = scene.to_sim3(scene.from_sim3([pose], view), 0, view)
         np.testing.assert_allclose(back.matrix, pose.matrix, atol=1e-5)
 
 
 def test_contrast_has_no_mean_along_either_side():
     similarity = torch.tensor(np.random.default_rng(3).random((6, 9)))
-    found = contrast(similarity)
+    found = double_centre(similarity)
     np.testing.assert_allclose(found.mean(dim=0), 0, atol=1e-12)
     np.testing.assert_allclose(found.mean(dim=1), 0, atol=1e-12)
-    assert contrast(torch.zeros(6, 0)).shape == (6, 0)
+    assert double_centre(torch.zeros(6, 0)).shape == (6, 0)
 
 
 def test_strays_far_behind_the_object_are_left_out(views):
@@ -216,7 +231,7 @@ def test_strays_far_behind_the_object_are_left_out(views):
     depth[row : row + 8, column : column + 8] = 40
     spoilt = replace(reference, frame=replace(reference.frame, depth=depth))
     zeros = [torch.zeros(784, 784)] * 3
-    whole, without = (make_scene(view, targets, zeros) for view in (reference, spoilt))
+    whole, without = (build_scene(view, targets, zeros) for view in (reference, spoilt))
     assert len(without.reference_points) == len(whole.reference_points) - 1
     assert float(without.reference_points.abs().max()) < 4
 
@@ -231,32 +246,32 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
-    found = from_matches(*(torch.tensor(part, dtype=torch.float32) for part in (source, target)), seed)
+    found = poses_from_matches(*(torch.tensor(part, dtype=torch.float32) for part in (source, target)), seed)
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
-    assert len(found) <= 6 and (angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
+    assert len(found) <= 6 and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
 
 def test_too_few_matches_propose_nothing():
-    assert len(from_matches(torch.zeros(2, 3), torch.zeros(2, 3))) == 0
+    assert len(poses_from_matches(torch.zeros(2, 3), torch.zeros(2, 3))) == 0
     # All in one place: no scale is plausible.
-    assert len(from_matches(torch.zeros(5, 3), torch.zeros(5, 3))) == 0
+    assert len(poses_from_matches(torch.zeros(5, 3), torch.zeros(5, 3))) == 0
 
 
 def test_a_view_rotation_sees_the_reference_from_that_view(scene):
-    found = view_rotations(scene)
+    found = poses_from_views(scene)
     for view in range(3):
-        np.testing.assert_allclose(scene.sim3(found, view, view).R, np.eye(3), atol=1e-5)
+        np.testing.assert_allclose(scene.to_sim3(found, view, view).R, np.eye(3), atol=1e-5)
 
 
 def test_without_matches_the_views_still_propose(views):
     zeros = [torch.zeros(784, 784)] * 3
-    assert len(propose(make_scene(views[0], views[1:], zeros))) == 3
+    assert len(propose_poses(build_scene(views[0], views[1:], zeros))) == 3
 
 
 @pytest.mark.parametrize(("scale", "allowed"), [(0.45, False), (0.55, True), (1.9, True), (2.1, False)])
 def test_proposals_have_scales_from_a_half_to_two(scale, allowed):
     source = torch.tensor(np.random.default_rng(0).normal(size=(30, 3)), dtype=torch.float32)
-    found = from_matches(source, scale * source)
+    found = poses_from_matches(source, scale * source)
     assert (len(found) > 0) == allowed
     if allowed:
         assert float(found.scale[0]) == pytest.approx(scale, rel=1e-3)
@@ -266,32 +281,32 @@ def test_proposals_have_scales_from_a_half_to_two(scale, allowed):
 
 
 def test_soft_icp_comes_nearer_to_the_truth_and_stays_there(scene, truth):
-    turn = rotations(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
+    turn = rotation_matrices(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
     start = Poses(truth.scale * 0.8, turn @ truth.rotation, truth.translation + 0.15)
-    aligned = soft_icp(scene, join([start, truth]))
-    errors = angles(aligned.rotation, truth.rotation)[:, 0]
-    assert float(angles(start.rotation, truth.rotation)) > 20
+    aligned = soft_icp(scene, concatenate([start, truth]))
+    errors = rotation_angles(aligned.rotation, truth.rotation)[:, 0]
+    assert float(rotation_angles(start.rotation, truth.rotation)) > 20
     assert errors.max() < 10
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
 
 
 def test_features_lead_where_shape_alone_does_not(scene, truth):
-    turn = rotations(torch.deg2rad(torch.tensor([[0.0, 60, 0]])))
+    turn = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 60, 0]])))
     start = Poses(truth.scale, turn @ truth.rotation, truth.translation)
-    with_features, without = (soft_icp(scene, start, features=weight) for weight in (8.0, 0.0))
-    error = [float(angles(found.rotation, truth.rotation)) for found in (with_features, without)]
+    with_features, without = (soft_icp(scene, start, feature_weight=weight) for weight in (8.0, 0.0))
+    error = [float(rotation_angles(found.rotation, truth.rotation)) for found in (with_features, without)]
     assert error[0] < 20 and error[0] < error[1]
 
 
 def test_a_pose_is_aligned_by_itself(scene, truth):
-    start = join([truth, view_rotations(scene)])
+    start = concatenate([truth, poses_from_views(scene)])
     together = soft_icp(scene, start)
     np.testing.assert_allclose(soft_icp(scene, start[[1]]).rotation, together.rotation[[1]], atol=1e-4)
 
 
 def test_spread_indices_are_spread():
-    assert spread_indices(10, 4).tolist() == [0, 2, 5, 7]
-    assert spread_indices(3, 10).tolist() == [0, 1, 2]
+    assert evenly_spaced_indices(10, 4).tolist() == [0, 2, 5, 7]
+    assert evenly_spaced_indices(3, 10).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("scale", "reached"), [(0.3, 0.5), (0.6, 0.6), (1.8, 1.8), (3.0, 2.0)])
@@ -300,7 +315,7 @@ def test_soft_icp_reaches_scales_from_a_half_to_two(scene, scale, reached):
     columns = torch.arange(n)
     larger = replace(
         scene, target_points=scale * points, target_view=0 * columns, target_column=columns,
-        target_share=torch.full((n,), 1 / n), similarity=torch.eye(n),
+        target_weight=torch.full((n,), 1 / n), similarity=torch.eye(n),
     )  # fmt: skip
     start = as_poses(Sim3(min(max(0.9 * scale, 0.5), 2.0), np.eye(3), np.zeros(3)))
     assert float(soft_icp(larger, start, iterations=30).scale) == pytest.approx(reached, rel=0.05)
@@ -315,34 +330,34 @@ EVERY = (5, 10)  # by hand it takes a while
 def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
     """The terms as one would write them down, point by point, with the frames' own cameras."""
     reference, *targets = views
-    unit = 1 / scene.target_frame.scale  # of the targets' working frame
-    first = scene.cameras[0]
-    sums = dict.fromkeys(TERMS, 0.0)
-    in_reference = scene.reference_frame.inverse().apply(scene.reference_points[:: EVERY[0]].numpy())
+    unit = 1 / scene.target_to_working.scale  # of the targets' working frame
+    first = scene.target_cameras[0]
+    sums = dict.fromkeys(TERM_NAMES, 0.0)
+    in_reference = scene.reference_to_working.inverse().apply(scene.reference_points[:: EVERY[0]].numpy())
     for i, point in enumerate(in_reference):
         touched, alike = 0.0, 0.0
         for view, target in enumerate(targets):
             camera = target.frame.camera
             world = first.to_world(pose.apply(point))
             what = met(target, camera, world, unit)
-            sums["f_off"] += what["off"] / len(targets)
-            sums["f_front"] += what["front"] / len(targets)
+            sums["forward_silhouette"] += what["off"] / len(targets)
+            sums["forward_free_space"] += what["front"] / len(targets)
             column = patch_column(scene, targets, view, what["patch"])
             if column is not None:
                 touched += what["touch"]
                 alike += what["touch"] * float(scene.similarity[i * EVERY[0], column])
-        sums["f_sim"] += alike / (touched + 0.5)
-        sums["f_seen"] += min(touched, 1)
-    for name in TERMS[:4]:
+        sums["forward_similarity"] += alike / (touched + 0.5)
+        sums["forward_overlap"] += min(touched, 1)
+    for name in TERM_NAMES[:4]:
         sums[name] /= len(in_reference)
-    unit = 1 / scene.reference_frame.scale
-    in_first = scene.target_frame.inverse().apply(scene.target_points[:: EVERY[1]].numpy())
-    shares = scene.target_share[:: EVERY[1]]
+    unit = 1 / scene.reference_to_working.scale
+    in_first = scene.target_to_working.inverse().apply(scene.target_points[:: EVERY[1]].numpy())
+    shares = scene.target_weight[:: EVERY[1]]
     for point, share in zip(in_first, (shares / shares.sum()).tolist()):
         world = reference.frame.camera.to_world(pose.inverse().apply(point))
         what = met(reference, reference.frame.camera, world, unit)
-        sums["r_off"] += what["off"] * share
-        sums["r_front"] += what["front"] * share
+        sums["reverse_silhouette"] += what["off"] * share
+        sums["reverse_free_space"] += what["front"] * share
     return sums
 
 
@@ -373,84 +388,98 @@ def patch_column(scene, targets, view, patch):
 
 @pytest.mark.parametrize("turn", [(0, 0, 0), (25.0, 10, -15), (0, 180, 0)])
 def test_terms_are_what_one_works_out_point_by_point(scene, views, truth, turn):
-    turned = rotations(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
+    turned = rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
     poses = Poses(truth.scale, turned, truth.translation + 0.1)
-    found, expected = verify(scene, poses, EVERY).of(0), by_hand(scene, views, scene.sim3(poses, 0, 0))
-    for name in ("f_sim", "f_seen", "f_off", "f_front", "r_off", "r_front"):
+    found, expected = score_terms(scene, poses, EVERY).as_dict(0), by_hand(scene, views, scene.to_sim3(poses, 0, 0))
+    for name in (
+        "forward_similarity",
+        "forward_overlap",
+        "forward_silhouette",
+        "forward_free_space",
+        "reverse_silhouette",
+        "reverse_free_space",
+    ):
         assert found[name] == pytest.approx(expected[name], abs=0.02), name
 
 
 def test_the_truth_scores_above_other_poses(scene, truth):
-    turns = rotations(torch.deg2rad(torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]])))
+    turns = rotation_matrices(
+        torch.deg2rad(torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]]))
+    )
     others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
-    score = Weights().score(verify(scene, join([truth, others])))
+    score = ScoreWeights().score(score_terms(scene, concatenate([truth, others])))
     assert int(score.argmax()) == 0
-    terms = verify(scene, truth).of(0)
-    assert terms["f_off"] < 0.02 and terms["f_front"] < 0.02 and terms["r_off"] < 0.02 and terms["r_front"] < 0.02
+    terms = score_terms(scene, truth).as_dict(0)
+    assert (
+        terms["forward_silhouette"] < 0.02
+        and terms["forward_free_space"] < 0.02
+        and terms["reverse_silhouette"] < 0.02
+        and terms["reverse_free_space"] < 0.02
+    )
 
 
 def test_points_before_a_seen_surface_offend_and_hidden_ones_do_not(scene, truth):
     toward = -scene.target_maps.camera_centres[0] / scene.target_maps.camera_centres[0].norm()
     near, far = (Poses(truth.scale, truth.rotation, truth.translation + move * toward) for move in (-1.0, 1.0))
-    fronts = [float(forward(scene, pose).front[0, 0].mean()) for pose in (near, truth, far)]
+    fronts = [float(forward_terms(scene, pose).free_space[0, 0].mean()) for pose in (near, truth, far)]
     assert fronts[0] > 0.3 and fronts[1] < 0.02 and fronts[2] < 0.02
 
 
 def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
     reference, *targets = views
     zeros = [torch.zeros(784, 784)] * 3
-    scene = make_scene(reference, targets, zeros)
+    scene = build_scene(reference, targets, zeros)
     table = scene.target_maps.table.clone()
-    table[:, :2] = 0  # as make_maps writes it where no depth is known
+    table[:, :2] = 0  # as build_maps writes it where no depth is known
     blind = replace(scene, target_maps=replace(scene.target_maps, table=table))
     for shift in (-1.0, 0.0, 1.0):
         pose = Poses(truth.scale, truth.rotation, truth.translation + shift)
-        before, after = verify(scene, pose).of(0), verify(blind, pose).of(0)
-        assert after["f_front"] == after["f_seen"] == after["f_sim"] == 0
-        assert after["f_off"] == before["f_off"]
+        before, after = score_terms(scene, pose).as_dict(0), score_terms(blind, pose).as_dict(0)
+        assert after["forward_free_space"] == after["forward_overlap"] == after["forward_similarity"] == 0
+        assert after["forward_silhouette"] == before["forward_silhouette"]
 
 
 def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
-    poses = join([truth, view_rotations(scene)])
+    poses = concatenate([truth, poses_from_views(scene)])
     many = Poses(*(getattr(poses, name).repeat_interleave(60, 0) for name in ("scale", "rotation", "translation")))
-    alone, together = verify(scene, poses), verify(scene, many)
-    for name in TERMS:
+    alone, together = score_terms(scene, poses), score_terms(scene, many)
+    for name in TERM_NAMES:
         np.testing.assert_allclose(getattr(together, name)[::60], getattr(alone, name), atol=1e-5)
 
 
 def test_the_score_is_the_weighted_sum_of_the_terms():
     rng = np.random.default_rng(4)
-    terms = Terms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERMS))
-    weights = Weights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
-    by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERMS)
+    terms = ScoreTerms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERM_NAMES))
+    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
+    by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERM_NAMES)
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
 
 
 def test_the_view_term_prefers_the_pose_that_looks_from_the_side_of_the_likest_view(views):
     """Of two targets seen from far apart, one is alike: being seen from there is worth more, by likeness and angle."""
     alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
-    scene = make_scene(views[0], views[1:3], [alike, other])
-    np.testing.assert_allclose(scene.likeness, [0.3, -0.3], atol=1e-6)
-    sides = view_rotations(scene)
+    scene = build_scene(views[0], views[1:3], [alike, other])
+    np.testing.assert_allclose(scene.view_similarity, [0.3, -0.3], atol=1e-6)
+    sides = poses_from_views(scene)
     apart = rotation_error(*sides.rotation.double().numpy())
     expected = 0.3 * (1 - np.exp(-((apart / 45) ** 2)))
-    np.testing.assert_allclose(same_side(scene, sides), [expected, -expected], atol=1e-3)
-    np.testing.assert_allclose(verify(scene, sides).view, same_side(scene, sides))
+    np.testing.assert_allclose(viewpoint_term(scene, sides), [expected, -expected], atol=1e-3)
+    np.testing.assert_allclose(score_terms(scene, sides).viewpoint, viewpoint_term(scene, sides))
 
 
 def test_with_one_view_the_view_term_says_nothing(views):
-    scene = make_scene(views[0], views[1:2], [torch.rand(784, 784)])
-    np.testing.assert_array_equal(same_side(scene, view_rotations(scene)), [0])
+    scene = build_scene(views[0], views[1:2], [torch.rand(784, 784)])
+    np.testing.assert_array_equal(viewpoint_term(scene, poses_from_views(scene)), [0])
 
 
 def test_reverse_is_forward_with_the_sides_exchanged(views, truth):
     """With one target, what the targets' points meet in the reference is the forward test of the inverse pose."""
     zeros = [torch.zeros(784, 784)]
-    one, other = make_scene(views[0], [views[1]], zeros), make_scene(views[1], [views[0]], zeros)
-    pose = one.poses([Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3]))], 0)
-    there, back = reverse(one, pose), forward(other, pose.inverse())
-    np.testing.assert_allclose(there.off, back.off, atol=1e-4)
-    np.testing.assert_allclose(there.front, back.front, atol=1e-4)
+    one, other = build_scene(views[0], [views[1]], zeros), build_scene(views[1], [views[0]], zeros)
+    pose = one.from_sim3([Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3]))], 0)
+    there, back = reverse_terms(one, pose), forward_terms(other, pose.inverse())
+    np.testing.assert_allclose(there.silhouette, back.silhouette, atol=1e-4)
+    np.testing.assert_allclose(there.free_space, back.free_space, atol=1e-4)
 
 
 # Refinement
@@ -462,15 +491,17 @@ def test_refinement_climbs_and_never_descends():
 
     def score(poses: Poses) -> torch.Tensor:
         off = (poses.translation - goal.translation).square().sum(dim=1)
-        return -angles(poses.rotation, goal.rotation)[:, 0] / 20 - off - (poses.scale / goal.scale).log().square()
+        return (
+            -rotation_angles(poses.rotation, goal.rotation)[:, 0] / 20 - off - (poses.scale / goal.scale).log().square()
+        )
 
-    turn = rotations(torch.deg2rad(torch.tensor([[12.0, 5, -8], [-6, 10, 9]])))
+    turn = rotation_matrices(torch.deg2rad(torch.tensor([[12.0, 5, -8], [-6, 10, 9]])))
     start = Poses(torch.tensor([0.9, 1.2]), turn @ goal.rotation, goal.translation.expand(2, 3) + 0.1)
-    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.06, shrink=0.8)
+    search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8)
     found, reached = refine(start, score, search, seed=1)
     assert (reached >= score(start)).all()
     np.testing.assert_allclose(reached, score(found), atol=1e-3)
-    assert (angles(found.rotation, goal.rotation)[:, 0] < 4).all()
+    assert (rotation_angles(found.rotation, goal.rotation)[:, 0] < 4).all()
     still, same = refine(goal, score, search)
     assert float(same) == pytest.approx(float(score(goal)), abs=1e-4) and len(still) == 1
 
@@ -479,13 +510,13 @@ def test_refinement_climbs_and_never_descends():
 def test_refinement_reaches_the_ends_of_the_scale_range(scale):
     """Proposals and soft ICP reach scales up to 2; refinement once stopped at 1.6."""
     start = as_poses(Sim3(0.9 * scale if scale > 1 else 1.1 * scale, np.eye(3), np.zeros(3)))
-    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.06, shrink=0.8)
+    search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8)
     found, _ = refine(start, lambda poses: -(poses.scale / scale).log().square(), search)
     assert float(found.scale) == pytest.approx(scale, rel=0.005)
 
 
 def test_refinement_stays_within_the_scale_range():
-    search = Search(rounds=8, tries=40, rotation=6.0, translation=0.08, scale=0.2, shrink=0.9)
+    search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.2, decay=0.9)
     for sign, end in zip((-1, 1), SCALE_RANGE):
         found, _ = refine(as_poses(Sim3.identity()), lambda poses: sign * poses.scale, search)
         assert float(found.scale) == pytest.approx(end)
@@ -494,7 +525,7 @@ def test_refinement_stays_within_the_scale_range():
 @given(seeds)
 def test_rotation_vectors_turn_by_their_length_about_themselves(seed):
     vector = torch.tensor(np.random.default_rng(seed).normal(size=(1, 3)), dtype=torch.float64)
-    matrix = rotations(vector)
+    matrix = rotation_matrices(vector)
     np.testing.assert_allclose(matrix[0] @ matrix[0].T, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(matrix[0] @ vector[0], vector[0], atol=1e-6)
     expected = np.degrees(float(vector.norm())) % 360
@@ -505,16 +536,16 @@ def test_bad_scenes_are_refused_in_one_line(views):
     reference, *targets = views
     empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
     with pytest.raises(InputError, match="reference: 0 foreground patches of known depth, expected at least 8"):
-        make_scene(empty, targets, [torch.zeros(784, 784)] * 3)
+        build_scene(empty, targets, [torch.zeros(784, 784)] * 3)
     with pytest.raises(InputError, match="target views: 0 foreground patches"):
-        make_scene(reference, [empty], [torch.zeros(784, 784)])
+        build_scene(reference, [empty], [torch.zeros(784, 784)])
 
 
 def test_points_share_the_surface_evenly_however_densely_it_was_seen():
     rng = np.random.default_rng(6)
     angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
     ring = torch.tensor(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32)
-    share = surface_shares(ring)
+    share = surface_weights(ring)
     assert float(share.sum()) == pytest.approx(1, abs=1e-5)
     assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)
 
@@ -529,7 +560,7 @@ def test_fewer_views_are_trusted_less():
     assert calibration_for(1).confidence(margin, 0.0).max() < 0.5
     np.testing.assert_allclose(calibration_for(20).confidence(margin, 0.04), 1 / (1 + np.exp(-margin)))
     between = calibration_for(2)
-    assert (between.bias, between.margin, between.spread) == pytest.approx((-1.25, 0.45, 0))
+    assert (between.bias, between.margin, between.view_std) == pytest.approx((-1.25, 0.45, 0))
 
 
 def test_views_that_the_features_tell_apart_are_trusted_more():
@@ -550,23 +581,13 @@ def test_reliability_by_hand():
     np.testing.assert_allclose(found.confidence, [0.3, 2.3 / 3])
     np.testing.assert_allclose(found.accuracy, [1 / 3, 1])
     assert found.calibration_error == pytest.approx((1 / 3 - 0.3 + 1 - 2.3 / 3) / 2)
-    assert found.surest_half == 1 and "surest half 100.0 % right" in str(found)
-    with pytest.raises(InputError, match="6 outcomes and 6 confidences, expected equally many, at least 10"):
+    assert found.top_half_accuracy == 1 and "more confident half 100.0 %" in str(found)
+    with pytest.raises(InputError, match="6 outcomes and 6 confidences, expected equal numbers of at least 10"):
         reliability(confidence, right)
 
 
 def test_a_lead_is_over_the_best_rival_that_is_another_answer():
     score = np.array([5.0, 4.5, 3.0])
     apart = np.array([[0.0, 20, 90], [20, 0, 100], [90, 100, 0]])
-    np.testing.assert_allclose(margins(score, apart), [2, 1.5, -2])
-    np.testing.assert_allclose(margins(score[:1], apart[:1, :1]), [8])  # without a rival
-
-
-def test_a_logistic_function_is_fitted_again():
-    rng = np.random.default_rng(0)
-    margin, spread = rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000)
-    true = Calibration(-1.0, 0.8, 0.6)
-    fitted = fit_calibration(margin, spread, rng.random(4000) < true.confidence(margin, spread), ridge=0)
-    assert (fitted.bias, fitted.margin, fitted.spread) == pytest.approx((-1, 0.8, 0.6), abs=0.2)
-    with pytest.raises(InputError, match="4000 outcomes are all True"):
-        fit_calibration(margin, spread, np.ones(4000, dtype=bool))
+    np.testing.assert_allclose(score_margins(score, apart), [2, 1.5, -2])
+    np.testing.assert_allclose(score_margins(score[:1], apart[:1, :1]), [8])  # without a rival

@@ -120,7 +120,7 @@ def reliability_diagram(results: Results, row: str | None = None) -> Figure:
     above.set(ylim=(-0.02, 1.05), ylabel="share within 30°")
     above.set_title(
         f"AUROC {found.auroc:.2f}, calibration error {100 * found.calibration_error:.1f} points,\n"
-        f"surest half {100 * found.surest_half:.0f} % right (all: {100 * right.mean():.0f} %)", fontsize=10,
+        f"surest half {100 * found.top_half_accuracy:.0f} % right (all: {100 * right.mean():.0f} %)", fontsize=10,
     )  # fmt: skip
     above.legend(fontsize=8, loc="upper left")
     below.hist([confidence[right], confidence[~right]], bins=np.linspace(0, 1, 21), stacked=True,

@@ -17,7 +17,7 @@ from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.robustness import DAMAGES, Damaged
 from zsp_lite.errors import InputError
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.verification import Weights
+from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 
 
 @dataclass(frozen=True)
@@ -57,17 +57,20 @@ def _verified_rows() -> dict[str, Method]:
     rows = {"verified": Method(settings=_VERIFIED), "verified-mask": Method(settings=_VERIFIED | _MASK)}
     rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 10, 20)}
     rows |= {f"verified-mask-n{n}": Method(settings=_VERIFIED | _MASK, targets=n) for n in (1, 3, 5, 10)}
-    less = {
-        "nosilhouette": VerifiedSolver(weights=Weights(f_off=0, r_off=0)),
-        "nofreespace": VerifiedSolver(weights=Weights(f_front=0, r_front=0)),
-        "noview": VerifiedSolver(weights=Weights(view=0)),
-        "simonly": VerifiedSolver(weights=Weights(f_seen=0, f_off=0, f_front=0, r_seen=0, r_off=0, r_front=0, view=0)),
-        "forward": VerifiedSolver(weights=Weights(r_sim=0, r_seen=0, r_off=0, r_front=0, view=0)),
-        "nofeatures": VerifiedSolver(weights=Weights(f_sim=0, r_sim=0, view=0), features=0),
+    weights = ScoreWeights()
+    ablations = {
+        "nosilhouette": VerifiedSolver(weights.without("forward_silhouette", "reverse_silhouette")),
+        "nofreespace": VerifiedSolver(weights.without("forward_free_space", "reverse_free_space")),
+        "noview": VerifiedSolver(weights.without("viewpoint")),
+        "simonly": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "similarity" not in name))),
+        "forward": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "forward" not in name))),
+        "nofeatures": VerifiedSolver(
+            weights.without("forward_similarity", "reverse_similarity", "viewpoint"), feature_weight=0.0
+        ),
         "noicp": VerifiedSolver(icp=False),
         "norefinement": VerifiedSolver(refinement=False),
     }
-    return rows | {f"verified-{name}": Method(settings={"solver": one}) for name, one in less.items()}
+    return rows | {f"verified-{name}": Method(settings={"solver": one}) for name, one in ablations.items()}
 
 
 def _damaged_rows() -> dict[str, Method]:

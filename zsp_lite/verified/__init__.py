@@ -22,6 +22,6 @@ view term (87.6) was kept. Calling answers equally good by what both show to vie
 of the right answers.
 """
 
-from zsp_lite.verified.hypotheses import Solution, VerifiedSolver
+from zsp_lite.verified.solver import Solution, VerifiedSolver
 
 __all__ = ["Solution", "VerifiedSolver"]

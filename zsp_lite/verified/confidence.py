@@ -1,9 +1,8 @@
-"""How sure a hypothesis is: a calibrated chance that its rotation is within 30 degrees of the truth.
+r"""Calibrated confidence: the probability that a hypothesis's rotation is within 30 degrees of the truth.
 
-A logistic function of the hypothesis's margin, which says how much better it explains the views than any other more
-than 30 degrees away, and of how well the features tell this object's sides apart. Reliability is measured as ever:
-AUROC asks whether right answers get more confidence than wrong ones, the expected calibration error whether confidences
-are frequencies.
+A logistic function of two numbers: the margin of the hypothesis's score over the best one with another rotation, and
+the standard deviation of the target views' feature similarity to the reference. If that is small, the features hardly
+distinguish the sides of the object. `reliability` measures how well confidences are calibrated.
 """
 
 from dataclasses import dataclass
@@ -13,127 +12,127 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.errors import InputError
 
-# Poses further apart are different answers: the paper's wider threshold.
-MODES_APART = 30.0
-# Beyond this many nats a lead says nothing more; also the lead of a hypothesis without a rival.
-_MARGIN_CAP = 8.0
+# Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
+MODE_ANGLE = 30.0
+# Margins are clipped at this many nats. It is also the margin of a hypothesis without a distinct rival.
+_MAX_MARGIN = 8.0
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """chance = sigmoid(bias + margin * margin_slope + spread * spread_slope).
+    r"""Logistic calibration: confidence = 1 / (1 + \exp(-(bias + margin * x_1 + view_std * x_2))).
 
-    margin: of a hypothesis, see `margins`.  spread: standard deviation of the target views' likeness to the reference
-    (`scene.view_likeness`): where all views look alike to the features, they tell the sides of this object badly.
-    The defaults are for five target views, rounded from a fit on objects of training categories: -1.07, 0.97 and 25.6.
-    Scores are in nats, so a lead of so many should have the odds of e to it, and does.
+    The defaults are for five target views, rounded from a fit on objects of training categories (-1.07, 0.97, 25.6).
+    Scores are in nats, so a coefficient of 1 for the margin means that the score itself is calibrated.
+
+    Attributes:
+        bias: intercept.
+        margin: coefficient of the score margin in nats, x_1 (see `score_margins`).
+        view_std: coefficient of the standard deviation of view similarities, x_2 (see `Scene.view_similarity_std`).
     """
 
     bias: float = -1.0
     margin: float = 1.0
-    spread: float = 25.0
+    view_std: float = 25.0
 
     def confidence(
-        self, margin: Float[np.ndarray, " m"], spread: float | Float[np.ndarray, " m"]
-    ) -> Float[np.ndarray, " m"]:
-        """Confidences of hypotheses."""
-        return 1 / (1 + np.exp(-(self.bias + self.margin * margin + self.spread * spread)))
+        self, margin: float | Float[np.ndarray, " m"], view_std: float | Float[np.ndarray, " m"]
+    ) -> float | Float[np.ndarray, " m"]:
+        """Return confidences in [0, 1] from score margins in nats and standard deviations of view similarities."""
+        return 1 / (1 + np.exp(-(self.bias + self.margin * margin + self.view_std * view_std)))
 
 
-# By the number of target views, from the margin alone, fitted likewise. Few views show few surfaces, and a lead among
-# poses that could hardly be tested says little: with one view it is right two times of five.
+# By number of target views. With fewer views poses are tested less, and a given margin means less: with one view
+# the most confident hypotheses are correct in two of five cases. For one and three views only the margin is used.
 CALIBRATIONS = {1: Calibration(-1.8, 0.2, 0.0), 3: Calibration(-0.7, 0.7, 0.0), 5: Calibration()}
 
 
-def calibration_for(views: int) -> Calibration:
-    """The calibration for so many target views; between those that were fitted, and the nearest beyond them."""
-    parts = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "margin", "spread"))
-    return Calibration(*(float(np.interp(views, list(CALIBRATIONS), part)) for part in parts))
+def calibration_for(n_views: int) -> Calibration:
+    """Return the calibration for a number of target views, interpolated between those in `CALIBRATIONS`."""
+    columns = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "margin", "view_std"))
+    return Calibration(*(float(np.interp(n_views, list(CALIBRATIONS), column)) for column in columns))
 
 
-def margins(score: Float[np.ndarray, " m"], apart: Float[np.ndarray, "m m"]) -> Float[np.ndarray, " m"]:
-    """Each hypothesis's lead over the best of those more than 30 degrees away, at most 8 nats either way.
+def score_margins(score: Float[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]) -> Float[np.ndarray, " m"]:
+    """Return each hypothesis's score minus the best score more than 30 degrees away, clipped to [-8, 8] nats.
 
-    apart: degrees between their rotations.
+    Args:
+        score: scores of the hypotheses, nats.
+        angle: angles between their rotations, degrees.
     """
-    rivals = np.where(apart > MODES_APART, score, -np.inf)
-    return np.clip(score - rivals.max(axis=1), -_MARGIN_CAP, _MARGIN_CAP)
-
-
-def fit_calibration(
-    margin: Float[np.ndarray, " n"], spread: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], ridge: float = 1e-3
-) -> Calibration:
-    """The calibration under which the outcomes `right` are likeliest (logistic regression by Newton's method).
-
-    ridge: of the slopes, per standard deviation. Raises InputError where all outcomes are the same.
-    """
-    right = np.asarray(right, dtype=np.float64)
-    if right.min() == right.max():
-        raise InputError(f"{len(right)} outcomes are all {bool(right[0])}, expected some right and some wrong")
-    features = np.stack([margin, spread], axis=1)
-    mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
-    x = np.column_stack([np.ones(len(right)), (features - mean) / std])
-    penalty = ridge * len(right) * np.diag([0.0, 1.0, 1.0])
-    w = np.zeros(3)
-    for _ in range(50):
-        chance = 1 / (1 + np.exp(-x @ w))
-        gradient = x.T @ (right - chance) - penalty @ w
-        w += np.linalg.solve((x * (chance * (1 - chance))[:, None]).T @ x + penalty, gradient)
-    slopes = w[1:] / std
-    return Calibration(float(w[0] - slopes @ mean), *map(float, slopes))
+    rivals = np.where(angle > MODE_ANGLE, score, -np.inf)
+    return np.clip(score - rivals.max(axis=1), -_MAX_MARGIN, _MAX_MARGIN)
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """How far confidences can be trusted: AUROC, expected calibration error, and a row per bin.
+    """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table.
 
-    Bins hold equally many estimates, least confident first. count: of each.  confidence: its mean in each.
-    accuracy: share that was right.  surest_half: accuracy (share) among the more confident half.
+    Bins hold equal numbers of estimates, in order of confidence.
+
+    Attributes:
+        auroc: area under the ROC curve (see `auroc`).
+        calibration_error: expected calibration error, in [0, 1].
+        top_half_accuracy: fraction of correct estimates among the more confident half.
+        count: (bins,) number of estimates.
+        confidence: (bins,) mean confidence.
+        accuracy: (bins,) fraction of correct estimates.
     """
 
     auroc: float
     calibration_error: float
-    surest_half: float
+    top_half_accuracy: float
     count: np.ndarray
     confidence: Float[np.ndarray, " bins"]
     accuracy: Float[np.ndarray, " bins"]
 
     def __str__(self) -> str:
-        lines = [f"{'n':>5} {'confidence':>11} {'right':>7}"]
+        lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]
         lines += [
-            f"{n:5d} {100 * c:10.1f}% {100 * a:6.1f}%" for n, c, a in zip(self.count, self.confidence, self.accuracy)
+            f"{n:5d} {100 * c:10.1f}% {100 * a:7.1f}%" for n, c, a in zip(self.count, self.confidence, self.accuracy)
         ]
         lines.append(
             f"AUROC {self.auroc:.3f}, expected calibration error {100 * self.calibration_error:.1f} points, "
-            f"surest half {100 * self.surest_half:.1f} % right"
+            f"accuracy of the more confident half {100 * self.top_half_accuracy:.1f} %"
         )
         return "\n".join(lines)
 
 
-def reliability(confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
-    """The reliability of some confidences, given which of the estimates were right.
+def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
+    """Measure the reliability of confidences.
 
-    Raises InputError for unequal lengths and for fewer estimates than bins.
+    Args:
+        confidence: confidences of n estimates, in [0, 1].
+        correct: which of the estimates were correct.
+        bins: number of bins of equal count.
+
+    Raises:
+        InputError: If the lengths differ or there are fewer estimates than bins.
     """
-    confidence, right = np.asarray(confidence, dtype=np.float64), np.asarray(right, dtype=bool)
-    if confidence.shape != right.shape or confidence.ndim != 1 or len(right) < bins:
+    confidence, correct = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
+    if confidence.shape != correct.shape or confidence.ndim != 1 or len(correct) < bins:
         raise InputError(
-            f"{len(right)} outcomes and {len(confidence)} confidences, expected equally many, at least {bins}"
+            f"{len(correct)} outcomes and {len(confidence)} confidences, expected equal numbers of at least {bins}"
         )
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, bins)
     mean = np.array([confidence[part].mean() for part in parts])
-    share = np.array([right[part].mean() for part in parts])
+    accuracy = np.array([correct[part].mean() for part in parts])
     count = np.array([len(part) for part in parts])
-    upper = order[len(order) // 2 :]
-    error = float((count * np.abs(mean - share)).sum() / count.sum())
-    return Reliability(auroc(confidence, right), error, float(right[upper].mean()), count, mean, share)
+    upper_half = order[len(order) // 2 :]
+    error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
+    return Reliability(auroc(confidence, correct), error, float(correct[upper_half].mean()), count, mean, accuracy)
 
 
-def auroc(confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> float:
-    """Chance that a right estimate is more confident than a wrong one, ties counting half; nan where one kind lacks."""
-    sure, unsure = np.asarray(confidence)[right], np.asarray(confidence)[~np.asarray(right)]
-    if not len(sure) or not len(unsure):
+def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
+    """Probability that a correct estimate has a higher confidence than a wrong one, ties counting half.
+
+    Returns:
+        Area under the ROC curve in [0, 1]; nan if all estimates are correct or all are wrong.
+    """
+    correct = np.asarray(correct, dtype=bool)
+    positive, negative = np.asarray(confidence)[correct], np.asarray(confidence)[~correct]
+    if not len(positive) or not len(negative):
         return float("nan")
-    lead = sure[:, None] - unsure
-    return float(((lead > 0) + 0.5 * (lead == 0)).mean())
+    difference = positive[:, None] - negative
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())

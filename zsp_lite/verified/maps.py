@@ -1,7 +1,7 @@
-"""What a view knows about each of its pixels, as one table to look many projected points up in at once.
+"""Per-pixel maps of a set of views (depth, mask, silhouette distance, patch) and the projection of points into them.
 
-A pixel whose depth is unknown says nothing about surfaces: its weight is 0, so a point that falls on it is neither on
-the object nor off it. Whether it lies inside the silhouette is known all the same.
+A pixel of unknown depth gives no information about surfaces: its weight is 0. It may still lie inside or outside the
+silhouette, which comes from the mask.
 """
 
 from collections.abc import Sequence
@@ -17,87 +17,99 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.views import View
 
-# Finer maps than this change nothing that patches of 8 pixels could tell, and leave the processor's cache.
+# Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the processor's cache.
 _MAP_PIXELS = 128 * 128
-# The silhouette of a soft mask is uncertain: distances to it are averaged over these levels.
-_MASK_LEVELS = (0.3, 0.5, 0.7)
-_NO_SILHOUETTE = 1e4  # pixels
-_NEAREST = 1e-3  # working units; nothing is seen nearer to the camera than this
-# Columns of the table.
-_DEPTH, _WEIGHT, _OFF, _PATCH = range(4)
+# The silhouette of a soft mask is uncertain: distances to it are averaged over these thresholds.
+_MASK_THRESHOLDS = (0.3, 0.5, 0.7)
+_NO_SILHOUETTE = 1e4  # distance in pixels for an empty mask
+_MIN_DEPTH = 1e-3  # working units; depths are clamped to it before the projection
+# Columns of `ViewMaps.table`.
+_DEPTH, _WEIGHT, _SILHOUETTE, _PATCH = range(4)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewMaps:
-    """v views' cameras in working units, and a row for each of their pixels.
+    """Cameras of v views in working units, and one table row for each of their pixels.
 
-    rotation, translation: working frame to camera, `x_cam = rotation @ x + translation`.  focal_length: pixels;
-    the maps
-    are sized so that it is the same along both axes.  centre: principal point (x, y).  size: (width, height), whole
-    numbers.  start: the row of each view's first pixel.
-    table: per pixel (row-major, view after view) its depth, the weight of that depth (the soft mask; 0 where the
-    depth is unknown), its distance in pixels to the silhouette (0 inside), and its patch's column (-1 for none).
-    zoom: (x, y), pixels of the view's frame per pixel of the map.
+    Attributes:
+        rotation: (v, 3, 3) world-to-camera, `x_cam = rotation @ x + translation` with x in the working frame.
+        translation: (v, 3), working units.
+        focal_length: (v,) in map pixels; the maps are resampled so that it is equal along both axes.
+        principal_point: (v, 2), (x, y) in map pixels.
+        size: (v, 2), (width, height) in map pixels, whole numbers.
+        first_row: (v,) table row of each view's first pixel.
+        table: (pixels, 4), row-major, view after view: depth in working units; weight of that depth (the soft mask, 0
+            where the depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the
+            patch (-1 for none).
+        pixel_scale: (v, 2), (x, y) pixels of the view's frame per map pixel.
     """
 
     rotation: Float[Tensor, "v 3 3"]
     translation: Float[Tensor, "v 3"]
     focal_length: Float[Tensor, " v"]
-    centre: Float[Tensor, "v 2"]
+    principal_point: Float[Tensor, "v 2"]
     size: Float[Tensor, "v 2"]
-    start: Int[Tensor, " v"]
+    first_row: Int[Tensor, " v"]
     table: Float[Tensor, "pixels 4"]
-    zoom: Float[Tensor, "v 2"]
+    pixel_scale: Float[Tensor, "v 2"]
 
     def __len__(self) -> int:
         return len(self.focal_length)
 
     @property
     def camera_centres(self) -> Float[Tensor, "v 3"]:
-        """Where the cameras stand in the working frame."""
+        """Camera centres in the working frame."""
         return -(self.rotation.transpose(1, 2) @ self.translation[..., None])[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What n points under m poses meet in v views.
+class Projection:
+    """n points under m poses, projected into v views, with the map values at their pixels.
 
-    depth: of the point.  surface, weight: depth of what the view saw there, and the weight of that (0 unknown or
-    background).  off: distance to the silhouette in working units (0 inside).  patch: its column, -1 for none.
-    pixels: (x, y) in the view's map.
+    Attributes:
+        depth: (m, v, n) depth of the point, working units.
+        surface_depth: (m, v, n) measured depth at its pixel, working units.
+        weight: (m, v, n) weight of the measured depth in [0, 1], 0 where it is unknown or background.
+        silhouette_distance: (m, v, n) distance to the silhouette at the point's depth, working units, 0 inside.
+        patch: (m, v, n) similarity column of the patch at its pixel, -1 for none.
+        pixels: (m, v, n, 2), (x, y) in map pixels.
     """
 
     depth: Float[Tensor, "m v n"]
-    surface: Float[Tensor, "m v n"]
+    surface_depth: Float[Tensor, "m v n"]
     weight: Float[Tensor, "m v n"]
-    off: Float[Tensor, "m v n"]
+    silhouette_distance: Float[Tensor, "m v n"]
     patch: Int[Tensor, "m v n"]
     pixels: Float[Tensor, "m v n 2"]
 
 
-def make_maps(
+def build_maps(
     views: Sequence[View],
     world_to_camera: Sequence[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]],
-    frame: Sim3,
+    world_to_working: Sim3,
     columns: Sequence[Int[np.ndarray, " patches"]],
 ) -> ViewMaps:
-    """The maps of some views.
+    """Build the maps of views that share a world frame.
 
-    world_to_camera: rotation and translation of each, from one world of theirs.  frame: that world to working units,
-    without a rotation.  columns: each patch's column (row-major), -1 for none.
+    Args:
+        views: v views.
+        world_to_camera: rotation and translation of each view, from their common world frame.
+        world_to_working: from that frame to working units; its rotation must be the identity.
+        columns: per view, the similarity column of each patch (row-major), -1 for none.
     """
     cameras = [_map_camera(view.frame.camera) for view in views]
-    tables = [_table(*one, frame.scale) for one in zip(views, cameras, columns, strict=True)]
-    origin = -frame.t / frame.scale  # of the working frame, in the world
+    tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
+    origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
     lengths = [len(table) for table in tables]
 
     def tensor(values) -> Tensor:
         return torch.from_numpy(np.asarray(values, dtype=np.float32))
 
     sizes = np.array([camera.size[::-1] for camera in cameras])
+    translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(
-        tensor([rotation for rotation, _ in world_to_camera]),
-        tensor([frame.scale * (rotation @ origin + translation) for rotation, translation in world_to_camera]),
+        tensor([R for R, _ in world_to_camera]),
+        tensor(translations),
         tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         tensor([camera.principal_point for camera in cameras]),
         tensor(sizes),
@@ -107,38 +119,45 @@ def make_maps(
     )
 
 
-def look_up(
+def project_points(
     maps: ViewMaps,
     linear: Float[Tensor, "m 3 3"],
-    shift: Float[Tensor, "m 3"],
+    translation: Float[Tensor, "m 3"],
     points: Float[Tensor, "n 3"],
-) -> Seen:
-    """Every point p, moved to linear @ p + shift, as every view sees it.
+) -> Projection:
+    """Transform points by `linear @ x + translation`, project them into every view and read the maps.
 
-    Beyond the image's border the pixel at the border answers. Off the silhouette the way back to the border counts
-    too; where the silhouette reaches the border, the image cut the object off, and nobody knows how far it goes on.
+    A point beyond the image border reads the nearest border pixel. Its silhouette distance is that of the border
+    pixel plus the distance to it. It is 0 if the border pixel lies inside the silhouette: the object is cut off
+    there, and its extent beyond the border is unknown.
+
+    Args:
+        maps: maps of v views.
+        linear: linear parts of m poses in the working frame.
+        translation: translations of m poses, working units.
+        points: n points in working units.
     """
     m, v = len(linear), len(maps)
-    turned = (maps.rotation @ linear[:, None]).reshape(-1, 3)
-    moved = (maps.rotation @ shift[:, None, :, None])[..., 0] + maps.translation
-    in_camera = (turned @ points.T).view(m, v, 3, -1).add_(moved[..., None])
+    camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
+    camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
+    in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
-    pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_NEAREST)
-    x = in_camera[:, :, 0].mul_(pixels_per_unit).add_(maps.centre[:, :1])
-    y = in_camera[:, :, 1].mul_(pixels_per_unit).add_(maps.centre[:, 1:])
+    pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
+    x = in_camera[:, :, 0].mul_(pixels_per_unit).add_(maps.principal_point[:, :1])
+    y = in_camera[:, :, 1].mul_(pixels_per_unit).add_(maps.principal_point[:, 1:])
     column = torch.minimum(x.floor().clamp_min_(0), maps.size[:, :1] - 1)
     row = torch.minimum(y.floor().clamp_min_(0), maps.size[:, 1:] - 1)
-    index = (row * maps.size[:, :1] + column).long().add_(maps.start[:, None])
-    found = maps.table.index_select(0, index.flatten()).view(*index.shape, 4)
-    surface, weight, off, patch = found.unbind(-1)
-    # From the pixel's centre; half a pixel is none.
+    index = (row * maps.size[:, :1] + column).long().add_(maps.first_row[:, None])
+    values = maps.table.index_select(0, index.flatten()).view(*index.shape, 4)
+    surface_depth, weight, distance, patch = values.unbind(-1)
+    # Distance from the pixel's edge, 0 for points within the image.
     beyond = (x - column - 0.5).abs_().sub_(0.5).clamp_min_(0) + (y - row - 0.5).abs_().sub_(0.5).clamp_min_(0)
-    off = torch.where(off > 0, off + beyond, off) / pixels_per_unit
-    return Seen(depth, surface, weight, off, patch.long(), torch.stack([x, y], -1))
+    distance = torch.where(distance > 0, distance + beyond, distance) / pixels_per_unit
+    return Projection(depth, surface_depth, weight, distance, patch.long(), torch.stack([x, y], -1))
 
 
 def _map_camera(camera: Camera) -> Camera:
-    """The camera of an image of about _MAP_PIXELS whose pixels are as high as wide in space."""
+    """The camera resized to about _MAP_PIXELS pixels, with equal focal lengths along both axes."""
     height, width = camera.size
     aspect = (height / camera.focal_length[1]) / (width / camera.focal_length[0])
     rows = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
@@ -156,14 +175,14 @@ def _table(
     table = np.empty((height, width, 4), np.float32)
     table[..., _DEPTH] = depth * scale
     table[..., _WEIGHT] = np.where(depth > 0, mask, 0)
-    table[..., _OFF] = np.mean([_distance(mask < level) for level in _MASK_LEVELS], axis=0)
+    table[..., _SILHOUETTE] = np.mean([_distance(mask < threshold) for threshold in _MASK_THRESHOLDS], axis=0)
     patch = (np.arange(height) * grid[0] // height)[:, None] * grid[1] + np.arange(width) * grid[1] // width
     table[..., _PATCH] = columns[patch]
     return table.reshape(-1, 4)
 
 
 def _distance(outside: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Pixels from each pixel to the nearest one that is not outside."""
+    """Distance in pixels from each pixel to the nearest one that is not outside."""
     if outside.all():
         return np.full(outside.shape, _NO_SILHOUETTE, np.float32)
     return cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)

@@ -1,4 +1,4 @@
-"""Many similarities at once: hypotheses as one torch batch, fitted, compared and thinned out together."""
+"""Batches of similarity transforms: fitted, compared and suppressed together as torch tensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,13 @@ SCALE_RANGE = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """m similarities `y = scale * rotation @ x + translation`, in working units (see `scene.Scene`), float32."""
+    """m similarity transforms `y = scale * rotation @ x + translation` in working units (see `scene.Scene`), float32.
+
+    Attributes:
+        scale: (m,), positive.
+        rotation: (m, 3, 3).
+        translation: (m, 3).
+    """
 
     scale: Float[Tensor, " m"]
     rotation: Float[Tensor, "m 3 3"]
@@ -24,66 +30,94 @@ class Poses:
         return len(self.scale)
 
     def __getitem__(self, index) -> "Poses":
-        """The poses at an index array, slice or mask."""
+        """Select poses by an index array, slice or mask."""
         return Poses(self.scale[index], self.rotation[index], self.translation[index])
 
     @property
     def linear(self) -> Float[Tensor, "m 3 3"]:
-        """scale * rotation."""
+        """The linear parts, scale * rotation."""
         return self.scale[:, None, None] * self.rotation
 
     def apply(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m n 3"]:
-        """Every point under every pose."""
+        """Transform every point by every pose."""
         return points @ self.linear.transpose(1, 2) + self.translation[:, None]
 
     def inverse(self) -> "Poses":
-        """The similarities that undo these."""
-        back = self.rotation.transpose(1, 2)
-        moved = (back @ self.translation[..., None])[..., 0]
-        return Poses(1 / self.scale, back, -moved / self.scale[:, None])
+        """Return the inverse transforms."""
+        rotation = self.rotation.transpose(1, 2)
+        translation = (rotation @ self.translation[..., None])[..., 0]
+        return Poses(1 / self.scale, rotation, -translation / self.scale[:, None])
 
 
-def join(parts: Sequence[Poses]) -> Poses:
-    """One batch of several."""
-    return Poses(*(torch.cat([getattr(p, name) for p in parts]) for name in ("scale", "rotation", "translation")))
+def concatenate(batches: Sequence[Poses]) -> Poses:
+    """Concatenate batches of poses."""
+    return Poses(*(torch.cat([getattr(p, name) for p in batches]) for name in ("scale", "rotation", "translation")))
 
 
 def nearest_rotation(covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
-    """The rotation R that maximises trace(R.T @ covariance), covariance being sum of target @ source.T."""
+    """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
+
+    Args:
+        covariance: sum of target @ source^T over corresponding centred points.
+    """
     left, _, right = torch.linalg.svd(covariance)
     sign = torch.ones_like(covariance[..., 0])
-    # Where the best orthogonal matrix is a mirror, the best rotation flips the direction that counts least.
+    # If the best orthogonal matrix is a reflection, flip the direction of the smallest singular value.
     sign[..., 2] = (torch.linalg.det(left) * torch.linalg.det(right)).sign()
     return (left * sign[:, None]) @ right
 
 
 def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) -> Poses:
-    """Umeyama's least squares for each of m point sets; a set without extent gives scale 0."""
+    """Fit a similarity to each of m sets of n corresponding points by least squares (Umeyama 1991).
+
+    Returns:
+        m poses; the scale is 0 where all source points of a set are equal.
+    """
     source_mean, target_mean = source.mean(1, keepdim=True), target.mean(1, keepdim=True)
     x, y = source - source_mean, target - target_mean
     covariance = y.transpose(1, 2) @ x
     rotation = nearest_rotation(covariance)
     scale = (rotation * covariance).sum((1, 2)) / x.square().sum((1, 2)).clamp_min(1e-12)
-    moved = (rotation @ source_mean.transpose(1, 2))[..., 0]
-    return Poses(scale, rotation, target_mean[:, 0] - scale[:, None] * moved)
+    rotated_mean = (rotation @ source_mean.transpose(1, 2))[..., 0]
+    return Poses(scale, rotation, target_mean[:, 0] - scale[:, None] * rotated_mean)
 
 
-def angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
-    """Angle in degrees between each rotation of one batch and each of the other."""
+def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
+    """Geodesic angle in degrees between each rotation of one batch and each of the other."""
     cosine = (first.flatten(1) @ second.flatten(1).T - 1) / 2
     return torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))
 
 
-def suppress(
-    rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], angle: float, keep: int
+def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula."""
+    angle = vectors.norm(dim=-1, keepdim=True)
+    x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
+    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
+    return torch.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def non_maximum_suppression(
+    rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], min_angle: float, max_count: int
 ) -> Int[Tensor, " kept"]:
-    """Non-maximum suppression: at most `keep` indices, best score first, no two within `angle` degrees."""
+    """Select the best-scored poses whose rotations differ.
+
+    Args:
+        rotation: rotations of the poses.
+        score: scores of the poses, higher is better.
+        min_angle: smallest angle in degrees between any two selected rotations.
+        max_count: largest number of poses to select.
+
+    Returns:
+        Indices of the selected poses, best score first.
+    """
     order = torch.argsort(score, descending=True, stable=True)
-    near = (angles(rotation[order], rotation[order]) < angle).numpy()
+    near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
     kept: list[int] = []
     for candidate in range(len(order)):
         if not near[candidate, kept].any():
             kept.append(candidate)
-            if len(kept) == keep:
+            if len(kept) == max_count:
                 break
     return order[torch.tensor(kept, dtype=torch.long)]

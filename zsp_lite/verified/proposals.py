@@ -1,7 +1,8 @@
-"""Where the search starts: poses that three matches of one view suggest, and the views' own rotations.
+"""Pose proposals: fits to three matches of one target view, and the relative rotations of the views themselves.
 
-Consensus does not decide here, for the errors of matches are shared (a front looks like a back from all around): a
-view proposes several poses, and what all views saw decides between them.
+Unlike in RANSAC, the sample with the largest consensus is not taken as the result, because errors of matches are
+correlated (the front of an object can match its back everywhere). Each view contributes several proposals, and the
+score over all views selects among them (see `verification`).
 """
 
 import numpy as np
@@ -9,36 +10,60 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, fit_poses, join, suppress
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, fit_poses, non_maximum_suppression
 from zsp_lite.verified.scene import Scene
 
-TRIALS = 300
-PER_VIEW = 6
-_INLIER = 0.3
-_APART = 20.0  # degrees
-_POOL = 200
-# One view shows a part of the object, all targets together nearly the whole: their spreads differ by about this.
-_PART = 0.9
+TRIALS = 300  # samples of three matches, per view
+PER_VIEW = 6  # proposals kept per view
+_INLIER_DISTANCE = 0.3  # working units
+_MIN_ANGLE = 20.0  # degrees between the proposals of a view
+_POOL = 200  # best samples of a view that go into non-maximum suppression
+# Scale of the poses from views: one view shows a part of the object, all target views together show nearly the whole,
+# so the spread of the reference's points is about this fraction of the spread of the targets' points.
+_VIEW_SCALE = 0.9
 
 
-def propose(scene: Scene, seed: int | np.random.Generator = 0, trials: int = TRIALS, per_view: int = PER_VIEW) -> Poses:
-    """Each view's best poses by its own matches, then the N view rotations; never none."""
+def propose_poses(
+    scene: Scene, seed: int | np.random.Generator = 0, trials: int = TRIALS, per_view: int = PER_VIEW
+) -> Poses:
+    """Propose poses from the matches of each target view, followed by one pose per view from its rotation.
+
+    Args:
+        scene: scene with N target views.
+        seed: seed or generator of the samples.
+        trials: samples of three matches, per view.
+        per_view: largest number of proposals from the matches of a view.
+
+    Returns:
+        N to N * (per_view + 1) poses.
+    """
     rng = np.random.default_rng(seed)
-    found = [from_matches(source, target, rng, trials, per_view) for source, target in scene.matches]
-    return join([*found, view_rotations(scene)])
+    proposals = [poses_from_matches(source, target, rng, trials, per_view) for source, target in scene.matches]
+    return concatenate([*proposals, poses_from_views(scene)])
 
 
-def from_matches(
+def poses_from_matches(
     source: Float[Tensor, "k 3"],
     target: Float[Tensor, "k 3"],
     seed: int | np.random.Generator = 0,
     trials: int = TRIALS,
-    keep: int = PER_VIEW,
+    max_count: int = PER_VIEW,
 ) -> Poses:
-    """At most `keep` poses, 20 degrees apart, that agree best with matched points in working units.
+    """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees.
 
-    Each trial fits three matches; agreement is the truncated score sum of max(0, 1 - (residual / 0.3)^2) over all.
-    None where there are fewer than three matches, or no fit has a plausible scale.
+    Samples are scored as in MSAC (Torr and Zisserman 2000), by the truncated quadratic
+    sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2) over all matches.
+
+    Args:
+        source: matched points of the reference, in working units.
+        target: matched points of the target view, in working units.
+        seed: seed or generator of the samples.
+        trials: number of samples.
+        max_count: largest number of poses to return.
+
+    Returns:
+        At most `max_count` poses, best score first. None for fewer than three matches, or if no fit has a scale
+        within `SCALE_RANGE`.
     """
     rng = np.random.default_rng(seed)
     if len(source) < 3:
@@ -47,13 +72,13 @@ def from_matches(
     poses = fit_poses(source[sample], target[sample])
     smallest, largest = SCALE_RANGE
     poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
-    residual = (poses.apply(source) - target).square_().sum(dim=2)
-    score = (1 - residual / _INLIER**2).clamp_min_(0).sum(dim=1)
+    squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
+    score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    return poses[best[suppress(poses.rotation[best], score[best], _APART, keep)]]
+    return poses[best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, max_count)]]
 
 
-def view_rotations(scene: Scene) -> Poses:
-    """For each target view the pose in which the reference was seen from just there, centre upon centre."""
+def poses_from_views(scene: Scene) -> Poses:
+    """For each target view, return the pose under which its viewpoint is that of the reference, centroids aligned."""
     rotation = scene.target_maps.rotation.transpose(1, 2).contiguous()
-    return Poses(torch.full((len(rotation),), _PART), rotation, torch.zeros(len(rotation), 3))
+    return Poses(torch.full((len(rotation),), _VIEW_SCALE), rotation, torch.zeros(len(rotation), 3))

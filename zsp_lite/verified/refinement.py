@@ -1,6 +1,7 @@
-"""The score itself climbed by trial: each pose tries random small changes and keeps the best.
+"""Refinement: each pose climbs the score by random search.
 
-The score has steps (silhouettes, pixels), so there is no gradient to follow; but a thousand poses cost milliseconds.
+The score is piecewise constant in places (silhouettes, pixels), so gradients do not help. The search is a simple
+evolution strategy: per round it perturbs every pose with Gaussian steps of shrinking width and keeps the best one.
 """
 
 from collections.abc import Callable
@@ -11,79 +12,134 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
+from zsp_lite.verified.scene import Scene
+from zsp_lite.verified.verification import ScoreWeights, score_terms
+
+# Hypotheses kept from round to round, and the smallest angle between them in degrees.
+MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
+# Of these, the best that are polished.
+_MAX_POLISHED = 3
+# About this many points of the reference and of the targets are scored during the search.
+_SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
+# Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
+_PARENTS = 6
 
 
 @dataclass(frozen=True)
-class Search:
-    """Widths of the changes (degrees, shares of the object's spread, logarithm of the scale) and how they shrink."""
+class SearchSchedule:
+    """Number and widths of the steps of a search.
+
+    Attributes:
+        rounds: number of rounds.
+        samples: steps per round and pose.
+        rotation: standard deviation of each component of the rotation vector, in degrees, in the first round.
+        translation: standard deviation of each component, in working units, in the first round.
+        scale: standard deviation of the logarithm of the scale, in the first round.
+        decay: factor on all three after each round.
+    """
 
     rounds: int
-    tries: int
+    samples: int
     rotation: float
     translation: float
     scale: float
-    shrink: float
+    decay: float
 
 
-COARSE = Search(rounds=3, tries=16, rotation=7.0, translation=0.12, scale=0.08, shrink=0.65)
-FINE = Search(rounds=6, tries=24, rotation=4.7, translation=0.08, scale=0.06, shrink=0.75)
-POLISH = Search(rounds=5, tries=24, rotation=2.0, translation=0.035, scale=0.025, shrink=0.8)
-# The best changes of a round that point the way together; their logarithmic weights are evolution strategies' usual.
-_TOGETHER = 6
+COARSE = SearchSchedule(rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65)
+FINE = SearchSchedule(rounds=6, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
+POLISH = SearchSchedule(rounds=5, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
+
+
+def refine_coarse_to_fine(
+    scene: Scene, poses: Poses, weights: ScoreWeights, seed: int | np.random.Generator = 0
+) -> Poses:
+    """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
+
+    Scores are computed from a subset of the points.
+
+    Args:
+        scene: Scene to score against.
+        poses: Poses to start from.
+        weights: Weights of the score.
+        seed: Seed or generator of the steps.
+
+    Returns:
+        At most six poses. The best three have been polished with nearly all points.
+    """
+    rng = np.random.default_rng(seed)
+    score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
+    for schedule in (COARSE, FINE):
+        poses, reached = refine(poses, score, schedule, rng)
+        poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
+    polished, _ = refine(poses[:_MAX_POLISHED], fine_score, POLISH, rng)
+    return concatenate([polished, poses[_MAX_POLISHED:]])
 
 
 def refine(
-    poses: Poses, score: Callable[[Poses], Float[Tensor, " m"]], search: Search, seed: int | np.random.Generator = 0
+    poses: Poses,
+    score: Callable[[Poses], Float[Tensor, " m"]],
+    schedule: SearchSchedule,
+    seed: int | np.random.Generator = 0,
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """The poses after the search, and their scores: never worse than before.
+    """Improve every pose by random search; scales stay within `SCALE_RANGE`.
 
-    Of the changes that a round tries the best is kept; the weighted mean of the best six is tried in the next round,
-    for what each got right by chance adds up while the rest averages out.
-    Rotations are about the reference's centre, which working units put at the origin.
+    Each round keeps the best step if it raises the score. The weighted mean of the six best steps is a candidate of
+    the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
+    Rotations are about the centroid of the reference's points, which is the origin in working units.
+
+    Args:
+        poses: poses to start from.
+        score: function to maximise.
+        schedule: number and widths of the steps.
+        seed: seed or generator of the steps.
+
+    Returns:
+        The refined poses and their scores, which are at least those of the given poses.
     """
     rng = np.random.default_rng(seed)
-    best, m = score(poses), len(poses)
-    each = torch.arange(m)
-    count = min(_TOGETHER, search.tries)
-    share = np.log(count + 0.5) - np.log(np.arange(1, count + 1))
-    share = torch.tensor(share / share.sum(), dtype=torch.float32)[:, None]
-    rest = None
-    for turn in range(search.rounds):
-        # All poses try the same changes: what becomes of one does not depend on how many others there are.
-        draws = rng.standard_normal((search.tries, 7)).astype(np.float32) * search.shrink**turn
+    best_score, m = score(poses), len(poses)
+    rows = torch.arange(m)
+    parents = min(_PARENTS, schedule.samples)
+    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
+    weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
+    recombined = None
+    for turn in range(schedule.rounds):
+        # All poses get the same steps: the result for one pose does not depend on the number of others.
+        draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**turn
         steps = torch.from_numpy(draws).repeat(m, 1, 1)
-        if rest is not None:
-            steps[:, 0] = rest
-        tried = _moved(poses, steps, search)
-        reached = score(tried).view(m, -1)
-        highest, order = reached.topk(count, dim=1)
-        at = each * search.tries + order[:, 0]
-        better = highest[:, 0] > best
-        mean = (steps[each[:, None], order] * share).sum(dim=1)
-        rest = mean - torch.where(better[:, None], steps[each, order[:, 0]], 0)
+        if recombined is not None:
+            steps[:, 0] = recombined
+        candidates = _perturb(poses, steps, schedule)
+        top_score, top = score(candidates).view(m, -1).topk(parents, dim=1)
+        index = rows * schedule.samples + top[:, 0]
+        improved = top_score[:, 0] > best_score
+        mean = (steps[rows[:, None], top] * weights).sum(dim=1)
+        # Relative to the pose from which the next round starts.
+        recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
         poses = Poses(
-            torch.where(better, tried.scale[at], poses.scale),
-            torch.where(better[:, None, None], tried.rotation[at], poses.rotation),
-            torch.where(better[:, None], tried.translation[at], poses.translation),
+            torch.where(improved, candidates.scale[index], poses.scale),
+            torch.where(improved[:, None, None], candidates.rotation[index], poses.rotation),
+            torch.where(improved[:, None], candidates.translation[index], poses.translation),
         )
-        best = torch.where(better, highest[:, 0], best)
-    return poses, best
+        best_score = torch.where(improved, top_score[:, 0], best_score)
+    return poses, best_score
 
 
-def _moved(poses: Poses, steps: Float[Tensor, "m tries 7"], search: Search) -> Poses:
-    """Each pose changed by each of its steps: three of rotation, three of translation, one of scale."""
-    turn = rotations(torch.deg2rad(search.rotation * steps[..., :3]).flatten(0, 1)).view(*steps.shape[:2], 3, 3)
-    scale = (poses.scale[:, None] * torch.exp(search.scale * steps[..., 6])).clamp(*SCALE_RANGE)
-    translation = poses.translation[:, None] + search.translation * steps[..., 3:6]
-    return Poses(scale.flatten(), (turn @ poses.rotation[:, None]).flatten(0, 1), translation.flatten(0, 1))
+def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: SearchSchedule) -> Poses:
+    """Apply each step to its pose: three components of rotation, three of translation, one of log-scale."""
+    vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
+    rotation = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3) @ poses.rotation[:, None]
+    scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)
+    translation = poses.translation[:, None] + schedule.translation * steps[..., 3:6]
+    return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
 
 
-def rotations(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation by |v| radians about v (Rodrigues)."""
-    angle = vectors.norm(dim=-1, keepdim=True)
-    x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
-    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
-    return torch.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+def _score_function(
+    scene: Scene, weights: ScoreWeights, counts: tuple[int, int]
+) -> Callable[[Poses], Float[Tensor, " m"]]:
+    """A function that scores poses by about `counts` points of the reference and of the targets."""
+    totals = len(scene.reference_points), len(scene.target_points)
+    stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
+    return lambda poses: weights.score(score_terms(scene, poses, stride))

@@ -1,158 +1,196 @@
-"""A pose put to the test of everything that was seen: does it predict what each view shows, and only that?
+r"""The score of a pose: a weighted sum of nine terms that compare it with everything that the views show.
 
-Forward (f_), the reference's points are projected into every target view; in reverse (r_), the targets' points into
-the reference. Four terms each, kept apart, averaged over the points, the targets' by the surface they stand for:
-sim    how alike in features a point is to what the views show where it lies on a surface that they saw
-seen   the share of points that lie on a seen surface
-off    how far points fall outside the silhouettes
-front  how far they float before the surfaces seen there, in space that a view saw to be free
-And one of the pictures as wholes:
-view   how alike the reference and the target views are that are little turned against it, under the pose
-A point behind a seen surface is hidden, and one where the depth is unknown may be anywhere: neither is held against
-the pose.
+    S(T) = \sum_k w_k \phi_k(T)
+
+Four terms project the n reference points into the V target views (`forward_*`), four project the target points into
+the reference view (`reverse_*`, then V = 1), and one compares views as a whole.
+
+Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth d of weight m (the
+soft mask, 0 where the depth is unknown), at distance r from the silhouette. With \delta = z - d (positive behind the
+surface), \sigma = 0.25 and \rho = 0.5, all lengths in working units:
+
+    a_iv = m \exp(-\delta^2 / (2 \sigma^2))             the point lies on the measured surface
+    b_iv = m clip(-(\delta + \sigma) / \rho, 0, 1)      it lies in front of it, in observed free space
+    c_iv = min(r / \rho, 1)                             it lies outside the silhouette
+    s_iv                                                double-centred feature similarity of the point's patch to the
+                                                        foreground patch at the pixel; without one, s_iv = a_iv = 0
+
+A point behind the surface is occluded, and one on a pixel of unknown depth can be anywhere: neither counts against
+the pose. With point weights q_i that sum to 1 (equal for the reference, `surface_weights` for the targets) and
+\kappa = 0.5, the terms of one direction are
+
+    similarity  = \sum_i q_i (\sum_v a_iv s_iv) / (\sum_v a_iv + \kappa)
+    overlap     = \sum_i q_i min(\sum_v a_iv, 1)
+    silhouette  = \sum_i q_i (1/V) \sum_v c_iv
+    free_space  = \sum_i q_i (1/V) \sum_v b_iv
+
+and the ninth, with l_v the feature similarity of target view v to the reference (`scene.view_similarity`) and
+\theta_v the angle by which T rotates the reference's camera against that of view v, is
+
+    viewpoint   = \sum_v (l_v - mean(l)) \exp(-(\theta_v / 45 degrees)^2).
+
+It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
+
+The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
+probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
 """
 
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from zsp_lite.verified.maps import Seen, look_up
-from zsp_lite.verified.poses import Poses, angles
+from zsp_lite.verified.maps import Projection, project_points
+from zsp_lite.verified.poses import Poses, rotation_angles
 from zsp_lite.verified.scene import Scene
 
-# In working units, shares of the object's spread: the width of "on the surface", and where an offence costs in full.
-TOUCH = 0.25
-FULL = 0.5
-SAME_SIDE = 45.0  # degrees of rotation between two cameras at which a view's likeness counts 1/e
-# Weight at which a point's similarity counts half: a glimpse in one view is less than the sight of three.
-_GLIMPSE = 0.5
-# Lookups at a time; what they need then stays in the processor's cache.
+SURFACE_SIGMA = 0.25  # sigma, working units
+MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
+VIEWPOINT_SIGMA = 45.0  # degrees
+_SIMILARITY_PRIOR = 0.5  # kappa
+# Projected points at a time, so that intermediate results stay in the processor's cache.
 _CHUNK = 250_000
 
 
 @dataclass(frozen=True, eq=False)
-class Terms:
-    """The terms of m poses (see above): of sim, seen and view the more the better, of off and front the less."""
+class ScoreTerms:
+    """The terms of m poses as (m,) tensors. A correct pose has high similarity, overlap and viewpoint, low others."""
 
-    f_sim: Float[Tensor, " m"]
-    f_seen: Float[Tensor, " m"]
-    f_off: Float[Tensor, " m"]
-    f_front: Float[Tensor, " m"]
-    r_sim: Float[Tensor, " m"]
-    r_seen: Float[Tensor, " m"]
-    r_off: Float[Tensor, " m"]
-    r_front: Float[Tensor, " m"]
-    view: Float[Tensor, " m"]
+    forward_similarity: Float[Tensor, " m"]
+    forward_overlap: Float[Tensor, " m"]
+    forward_silhouette: Float[Tensor, " m"]
+    forward_free_space: Float[Tensor, " m"]
+    reverse_similarity: Float[Tensor, " m"]
+    reverse_overlap: Float[Tensor, " m"]
+    reverse_silhouette: Float[Tensor, " m"]
+    reverse_free_space: Float[Tensor, " m"]
+    viewpoint: Float[Tensor, " m"]
 
-    def __getitem__(self, index) -> "Terms":
-        """The terms of the poses at an index array, slice or mask."""
-        return Terms(*(getattr(self, name)[index] for name in TERMS))
+    def __getitem__(self, index) -> "ScoreTerms":
+        """Select the terms of some poses by an index array, slice or mask."""
+        return ScoreTerms(*(getattr(self, name)[index] for name in TERM_NAMES))
 
-    def table(self) -> Float[Tensor, "m terms"]:
-        """One column per term, in the order of `TERMS`."""
-        return torch.stack([getattr(self, name) for name in TERMS], dim=1)
+    def matrix(self) -> Float[Tensor, "m terms"]:
+        """Return the terms as a matrix with one column per term, in the order of `TERM_NAMES`."""
+        return torch.stack([getattr(self, name) for name in TERM_NAMES], dim=1)
 
-    def of(self, index: int) -> dict[str, float]:
-        """The terms of one pose by name."""
-        return {name: float(getattr(self, name)[index]) for name in TERMS}
+    def as_dict(self, index: int) -> dict[str, float]:
+        """Return the terms of one pose by name."""
+        return {name: float(getattr(self, name)[index]) for name in TERM_NAMES}
 
 
-TERMS = tuple(field.name for field in fields(Terms))
+TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
 
 
 @dataclass(frozen=True)
-class Weights:
-    """What each term is worth in the score, in nats: e^score is in proportion to a pose's chances among others.
+class ScoreWeights:
+    """The weight of each term, in nats. The defaults were fitted on objects of training categories and rounded."""
 
-    The defaults are a conditional logit, fitted on objects of training categories by `benchmark.tuning` and rounded.
-    """
+    forward_similarity: float = 60.0
+    forward_overlap: float = 5.0
+    forward_silhouette: float = -25.0
+    forward_free_space: float = -20.0
+    reverse_similarity: float = 20.0
+    reverse_overlap: float = 35.0
+    reverse_silhouette: float = -10.0
+    reverse_free_space: float = -30.0
+    viewpoint: float = 20.0
 
-    f_sim: float = 60.0
-    f_seen: float = 5.0
-    f_off: float = -25.0
-    f_front: float = -20.0
-    r_sim: float = 20.0
-    r_seen: float = 35.0
-    r_off: float = -10.0
-    r_front: float = -30.0
-    view: float = 20.0
+    def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
+        """Return the scores of m poses: the weighted sums of their terms, higher is better."""
+        return terms.matrix() @ torch.tensor(astuple(self), dtype=torch.float32)
 
-    def score(self, terms: Terms) -> Float[Tensor, " m"]:
-        """The weighted sum of the terms, the higher the better."""
-        return terms.table() @ torch.tensor(astuple(self), dtype=torch.float32)
+    def without(self, *names: str) -> "ScoreWeights":
+        """Return these weights with those of the named terms set to 0."""
+        return replace(self, **dict.fromkeys(names, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What n points under m poses met in v views, and how it counts: what to draw.
+class PointTerms:
+    """The parts of the terms for each point in each view, before averaging (see the module's docstring).
 
-    seen: what the projections met.  touch: weight with which the point lies on the surface seen there.
-    off, front: from 0, no offence, to 1.  alike: similarity to the patch there, 0 where there is none.
+    Attributes:
+        projection: where the n points fall in the v views under m poses.
+        surface: (m, v, n), a: weight in [0, 1] with which the point lies on the measured surface.
+        silhouette: (m, v, n), c: in [0, 1].
+        free_space: (m, v, n), b: in [0, 1].
+        similarity: (m, v, n), s: feature similarity to the patch at the pixel, 0 without one.
     """
 
-    seen: Seen
-    touch: Float[Tensor, "m v n"]
-    off: Float[Tensor, "m v n"]
-    front: Float[Tensor, "m v n"]
-    alike: Float[Tensor, "m v n"]
+    projection: Projection
+    surface: Float[Tensor, "m v n"]
+    silhouette: Float[Tensor, "m v n"]
+    free_space: Float[Tensor, "m v n"]
+    similarity: Float[Tensor, "m v n"]
 
-    def terms(self, share: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
-        """sim, seen, off and front: averages over views, then over points that count by their shares."""
-        share = share / share.sum()
-        touch = torch.where(self.seen.patch < 0, 0, self.touch)
-        total = touch.sum(dim=1)
-        yield ((touch * self.alike).sum(dim=1) / (total + _GLIMPSE)) @ share
-        yield total.clamp_max(1) @ share
-        yield self.off.mean(dim=1) @ share
-        yield self.front.mean(dim=1) @ share
+    def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
+        """Yield similarity, overlap, silhouette and free space of each pose, averaged over views and points."""
+        q = point_weights / point_weights.sum()
+        surface = torch.where(self.projection.patch < 0, 0, self.surface)
+        total = surface.sum(dim=1)
+        yield ((surface * self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
+        yield total.clamp_max(1) @ q
+        yield self.silhouette.mean(dim=1) @ q
+        yield self.free_space.mean(dim=1) @ q
 
 
-def forward(scene: Scene, poses: Poses, rows: Int[Tensor, " n"] | None = None) -> Evidence:
-    """The reference's points (`rows` of them; default all) in all target views."""
+def forward_terms(scene: Scene, poses: Poses, rows: Int[Tensor, " n"] | None = None) -> PointTerms:
+    """Project the reference points (or those at the indices `rows`) into all target views."""
     rows = torch.arange(len(scene.reference_points)) if rows is None else rows
-    seen = look_up(scene.target_maps, poses.linear, poses.translation, scene.reference_points[rows])
-    return _weigh(scene, seen, rows * scene.similarity.shape[1], 1)
+    projection = project_points(scene.target_maps, poses.linear, poses.translation, scene.reference_points[rows])
+    return _point_terms(scene, projection, rows * scene.similarity.shape[1], 1)
 
 
-def reverse(scene: Scene, poses: Poses, chosen: Int[Tensor, " n"] | None = None) -> Evidence:
-    """The targets' points (the `chosen`; default all) in the reference view."""
-    chosen = torch.arange(len(scene.target_points)) if chosen is None else chosen
-    back = poses.inverse()
-    seen = look_up(scene.reference_maps, back.linear, back.translation, scene.target_points[chosen])
-    return _weigh(scene, seen, scene.target_column[chosen], scene.similarity.shape[1])
+def reverse_terms(scene: Scene, poses: Poses, indices: Int[Tensor, " n"] | None = None) -> PointTerms:
+    """Project the target points (or those at `indices`) into the reference view, by the inverse poses."""
+    indices = torch.arange(len(scene.target_points)) if indices is None else indices
+    inverse = poses.inverse()
+    projection = project_points(scene.reference_maps, inverse.linear, inverse.translation, scene.target_points[indices])
+    return _point_terms(scene, projection, scene.target_column[indices], scene.similarity.shape[1])
 
 
-def verify(scene: Scene, poses: Poses, every: tuple[int, int] = (1, 1)) -> Terms:
-    """The terms of every pose, from every so manieth point of the reference and of the targets."""
-    rows = torch.arange(0, len(scene.reference_points), every[0])
-    chosen = torch.arange(0, len(scene.target_points), every[1])
-    size = max(_CHUNK // (len(rows) * len(scene.target_maps) + len(chosen)), 1)
-    even, shares = torch.ones(len(rows)), scene.target_share[chosen]
-    parts = []
+def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> ScoreTerms:
+    """Compute the terms of every pose.
+
+    Args:
+        scene: the scene to score against.
+        poses: m poses.
+        stride: step through the reference points and the target points; larger is faster and less exact.
+    """
+    rows = torch.arange(0, len(scene.reference_points), stride[0])
+    indices = torch.arange(0, len(scene.target_points), stride[1])
+    size = max(_CHUNK // (len(rows) * len(scene.target_maps) + len(indices)), 1)
+    reference_weights, target_weights = torch.ones(len(rows)), scene.target_weight[indices]
+    chunks = []
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
-        parts.append((*forward(scene, some, rows).terms(even), *reverse(scene, some, chosen).terms(shares)))
-    return Terms(*(torch.cat(term) for term in zip(*parts)), same_side(scene, poses))
+        forward, reverse = forward_terms(scene, some, rows), reverse_terms(scene, some, indices)
+        chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
+    return ScoreTerms(*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses))
 
 
-def same_side(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """The view term: what the method chooses the best view by (sec. 4.2), as evidence for a pose among others.
+def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
+    """Compute the viewpoint term: high if the views from near the reference's viewpoint are the most similar to it.
 
-    Each target view's likeness to the reference, less their mean, counts by how little the pose turns its camera
-    against the reference's, about the line of sight too: features change with it. With one target view it is 0.
+    The angle includes rotation about the line of sight, because features change with it. With one target view the
+    term is 0.
     """
-    away = angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
-    return torch.exp(-((away / SAME_SIDE) ** 2)) @ scene.likeness
+    angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
+    return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
 
 
-def _weigh(scene: Scene, seen: Seen, point: Int[Tensor, " n"], patch_stride: int) -> Evidence:
-    """point: where each point's similarities begin in the table; patch_stride: from there to the next patch's."""
-    behind = seen.depth - seen.surface
-    touch = seen.weight * torch.exp_(behind.square().mul_(-0.5 / TOUCH**2))
-    front = seen.weight * behind.add_(TOUCH).div_(-FULL).clamp_(0, 1)
-    index = (seen.patch.clamp_min(0) * patch_stride).add_(point)
-    alike = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
-    return Evidence(seen, touch, (seen.off / FULL).clamp_max_(1), front, alike.masked_fill_(seen.patch < 0, 0))
+def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
+    """Point terms of a projection.
+
+    offset: index of each point's first entry in the flattened similarity matrix.  patch_stride: step to the next patch.
+    """
+    delta = projection.depth - projection.surface_depth
+    surface = projection.weight * torch.exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2))
+    free_space = projection.weight * delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1)
+    index = (projection.patch.clamp_min(0) * patch_stride).add_(offset)
+    similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
+    similarity = similarity.masked_fill_(projection.patch < 0, 0)
+    silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
+    return PointTerms(projection, surface, silhouette, free_space, similarity)

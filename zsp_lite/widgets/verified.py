@@ -11,10 +11,10 @@ from matplotlib.ticker import MaxNLocator
 
 from zsp_lite.errors import InputError
 from zsp_lite.verified import Solution
-from zsp_lite.verified.poses import angles
-from zsp_lite.verified.verification import TERMS, Weights, forward
+from zsp_lite.verified.poses import rotation_angles
+from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights, forward_terms
 from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.viz.verified import KINDS, contributions, point_kinds
+from zsp_lite.viz.verified import POINT_CLASSES, classify_points, score_contributions
 from zsp_lite.widgets.common import explorer, slider
 
 if TYPE_CHECKING:
@@ -26,24 +26,24 @@ _MOST = 350  # points of either cloud in 3D
 _REACH = 2.2  # of the 3D axes, in spreads of the object
 
 
-def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Weights = Weights()) -> "VBox":
+def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: ScoreWeights = ScoreWeights()) -> "VBox":
     """The hypotheses of `solution`, best first: clouds in 3D, points in a target view, and the score's parts.
 
     targets: all target views, in the order that the solver was given.  weights: those that it scored with.
     Controls: the rank, the target view, and the turn of the 3D picture about its upright axis.
     Raises InputError where the targets are not those of the solution, and without ipywidgets.
     """
-    used = sorted(solution.order)
+    used = sorted(solution.view_order)
     if len(targets) != len(solution.view_angles):
         raise InputError(f"{len(targets)} target views, expected all {len(solution.view_angles)} that were given")
     found, scene = solution.hypotheses, solution.scene
-    evidence = forward(scene, solution.poses)
-    kinds = [point_kinds(evidence, rank) for rank in range(len(found))]
-    pixels = (evidence.seen.pixels * scene.target_maps.zoom[:, None]).numpy()
+    point_terms = forward_terms(scene, solution.poses)
+    classes = [classify_points(point_terms, rank) for rank in range(len(found))]
+    pixels = (point_terms.projection.pixels * scene.target_maps.pixel_scale[:, None]).numpy()
     clouds = [_upright(cloud.numpy()) for cloud in solution.poses.apply(scene.reference_points[:: _step(scene)])]
-    apart = angles(solution.poses.rotation, solution.poses.rotation[:1])[:, 0].numpy()
-    parts = [contributions(one.terms, weights) for one in found]
-    names = [name for name in TERMS if getattr(weights, name)]
+    apart = rotation_angles(solution.poses.rotation, solution.poses.rotation[:1])[:, 0].numpy()
+    parts = [score_contributions(one.terms, weights) for one in found]
+    names = [name for name in TERM_NAMES if getattr(weights, name)]
 
     figure = plt.figure(figsize=(9, 3.4), dpi=85)
     grid = figure.add_gridspec(1, 3, width_ratios=(1.25, 1, 0.9), left=0.01, right=0.98, bottom=0.16, top=0.9)
@@ -54,7 +54,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: We
     picture = image_axis.imshow(targets[used[0]].frame.rgb, extent=(0, size[1], size[0], 0))
     marks = [
         image_axis.scatter([], [], s=14, c=colour, marker=marker, edgecolors="black", linewidths=0.4, label=name)
-        for name, (colour, marker) in KINDS.items()
+        for name, (colour, marker) in POINT_CLASSES.items()
     ]
     image_axis.set(xlim=(0, size[1]), ylim=(size[0], 0))
     image_axis.legend(loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2, fontsize=6.5, frameon=False)
@@ -69,7 +69,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: We
     bar_axis.tick_params(labelsize=8)
 
     def update(rank: int, view: int, turn: int) -> str:
-        index, place = rank - 1, solution.order.index(used[view - 1])
+        index, place = rank - 1, solution.view_order.index(used[view - 1])
         one = found[index]
         cloud._offsets3d = tuple(clouds[index].T)
         space.view_init(elev=15, azim=turn)
@@ -77,8 +77,8 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: We
         picture.set_data(frame.rgb)
         limits = np.array(frame.camera.size[::-1])
         counts = []
-        for kind, mark in enumerate(marks):
-            at = pixels[index, place][kinds[index][place] == kind]
+        for point_class, mark in enumerate(marks):
+            at = pixels[index, place][classes[index][place] == point_class]
             mark.set_offsets(np.clip(at, 0, limits))
             counts.append(len(at))
         image_axis.set_title(f"target {used[view - 1] + 1}", fontsize=9)
@@ -86,7 +86,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: We
             bar.set_width(parts[index][name])
         bar_axis.set_title(f"score {one.score:.1f}", fontsize=9)
         behind = f"{found[0].score - one.score:.1f} nats behind the best, {apart[index]:.0f} degrees from it"
-        told = ", ".join(f"{count} {name}" for count, name in zip(counts, KINDS))
+        told = ", ".join(f"{count} {name}" for count, name in zip(counts, POINT_CLASSES))
         return (
             f"Hypothesis {rank} of {len(found)}: {behind if index else 'the best'}; score {one.score:.1f}, confidence "
             f"{one.confidence:.0%}. Points in target view {used[view - 1] + 1}: {told}."

@@ -1,0 +1,211 @@
+"""The verified solver: all stages from matched views to ranked hypotheses."""
+
+import hashlib
+import time
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from zsp_lite.best_view import ViewPair
+from zsp_lite.pipeline import Hypothesis, PoseEstimate, match_points
+from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, calibration_for, score_margins
+from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
+from zsp_lite.verified.proposals import propose_poses
+from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
+from zsp_lite.verified.scene import Scene, build_scene
+from zsp_lite.verified.soft_icp import FEATURE_WEIGHT, soft_icp
+from zsp_lite.verified.verification import ScoreTerms, ScoreWeights, score_terms
+from zsp_lite.views import View
+
+# Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
+_MAX_REFINED, _MIN_ANGLE_REFINED = 12, 20.0
+# Hypotheses are tied if their scores differ by less than this many nats. On ellipsoids whose features have the same
+# symmetry, seen from all sides, the scores of equally correct poses differ by 0.6 nats in the median and by less than
+# 1 in three of four cases. Of training pairs with a margin below 1, the best hypothesis was correct in 62 %
+# (tools/tuning.py). Ties are not detected if the views show more of the object under one pose than under the other:
+# then scores of equally correct poses differ by several nats.
+TIE_MARGIN = 1.0
+# The estimate is flagged below this fraction of points that lie on an observed surface, in both directions.
+_MIN_OVERLAP = 0.05
+# The estimate is flagged below this similarity term, in both directions. Correct and wrong hypotheses have 0.06 and
+# more, views that share no side of the object 0.01.
+_MIN_SIMILARITY = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Hypotheses of the verified solver, and what they were scored on.
+
+    Attributes:
+        hypotheses: Best score first, at least one, at least 15 degrees apart.
+        view_angles: (N,) angle in degrees between the reference's camera and each target view's under the best one.
+        flags: One line per reason not to trust the best one.
+        timings: Seconds per stage.
+        scene: The scene that poses were scored on.
+        view_order: Index of the target view behind each view of the scene.
+        poses: The hypotheses in the scene's working units.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    view_angles: Float[np.ndarray, " n"]
+    flags: tuple[str, ...]
+    timings: dict[str, float]
+    scene: Scene
+    view_order: tuple[int, ...]
+    poses: Poses
+
+    @property
+    def target_spread(self) -> float:
+        """Standard deviation of the target object's points from all views, in units of the target's scene."""
+        return 1 / self.scene.target_to_working.scale
+
+
+@dataclass(frozen=True)
+class VerifiedSolver:
+    """A `pipeline.Solver` that scores many poses against all target views. The defaults had the highest accuracy.
+
+    Attributes:
+        weights: Weights of the score's terms.
+        calibration: Calibration of the confidences; None for the default one for the number of target views.
+        feature_weight: Weight of the feature similarity in the soft ICP; 0 aligns by shape alone.
+        icp: Whether to run the soft ICP.
+        refinement: Whether to run the refinement.
+    """
+
+    weights: ScoreWeights = ScoreWeights()
+    calibration: Calibration | None = None
+    feature_weight: float = FEATURE_WEIGHT
+    icp: bool = True
+    refinement: bool = True
+
+    def __call__(
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
+    ) -> PoseEstimate:
+        """Estimate the pose of the reference object (see `pipeline.Solver`): the best hypothesis of `solve`."""
+        solution = self.solve(reference, targets, pairs, seed)
+        best = solution.hypotheses[0]
+        matches = pairs[best.view].matches
+        source, target = match_points(reference, targets[best.view], matches)
+        residual = np.linalg.norm(best.sim3.apply(source) - target, axis=1)
+        return PoseEstimate(
+            best.sim3, best.view, matches, residual < threshold * solution.target_spread, -solution.view_angles,
+            reference, tuple(targets), solution.timings, solution.flags, solution.hypotheses,
+        )  # fmt: skip
+
+    def solve(
+        self,
+        reference: View,
+        targets: Sequence[View],
+        pairs: Sequence[ViewPair],
+        seed: int | np.random.Generator = 0,
+    ) -> Solution:
+        """Run all stages: proposals, soft ICP, verification, refinement, ranking.
+
+        The result is equivariant to the order of the target views and to rotations of their world frame.
+
+        Args:
+            reference: Reference view.
+            targets: N >= 1 usable target views (see `views.usable_targets`).
+            pairs: For each target view, its similarities to the reference and their matches.
+            seed: Seed or generator of all random draws.
+
+        Raises:
+            InputError: The reference, or all targets together, have too few foreground patches of known depth.
+        """
+        rng, timings = np.random.default_rng(seed), {}
+        with torch.no_grad():
+            with _timed(timings, "scene"):
+                order = _content_order(targets)
+                scene = build_scene(
+                    reference, [targets[k] for k in order], [pairs[k].similarity for k in order],
+                    [pairs[k].matches for k in order],
+                )  # fmt: skip
+            with _timed(timings, "proposals"):
+                poses = propose_poses(scene, rng)
+            with _timed(timings, "alignment"):
+                if self.icp:
+                    poses = soft_icp(scene, poses, feature_weight=self.feature_weight)
+            with _timed(timings, "verification"):
+                score = self.weights.score(score_terms(scene, poses))
+                poses = poses[non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)]
+            with _timed(timings, "refinement"):
+                if self.refinement:
+                    poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
+            with _timed(timings, "ranking"):
+                terms = score_terms(scene, poses)
+                best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
+                poses, terms = poses[best], terms[best]
+                hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)
+        return Solution(hypotheses, view_angles, reliability_flags(hypotheses, poses), timings, scene, order, poses)
+
+    def _hypotheses(
+        self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
+    ) -> tuple[tuple[Hypothesis, ...], Float[np.ndarray, " n"]]:
+        """Hypotheses of ranked poses, and the view angles of the best one."""
+        score = self.weights.score(terms).double().numpy()
+        angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
+        calibration = self.calibration or calibration_for(len(order))
+        confidence = calibration.confidence(score_margins(score, angle), scene.view_similarity_std)
+        view_angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
+        hypotheses = []
+        for i, view in enumerate(view_angle.argmin(axis=1)):
+            sim3 = scene.to_sim3(poses, i, int(view))
+            hypotheses.append(Hypothesis(sim3, order[view], float(score[i]), terms.as_dict(i), float(confidence[i])))
+        view_angles = np.empty(len(order))
+        view_angles[list(order)] = view_angle[0]
+        return tuple(hypotheses), view_angles
+
+
+def tied_hypotheses(score: Float[Tensor, " m"], rotation: Float[Tensor, "m 3 3"]) -> list[int]:
+    """Select the best hypothesis and those tied with it: within `TIE_MARGIN` nats, more than 30 degrees apart.
+
+    Args:
+        score: Scores of the hypotheses, nats.
+        rotation: Rotations of the hypotheses.
+
+    Returns:
+        Indices, best score first.
+    """
+    modes = non_maximum_suppression(rotation, score, MODE_ANGLE, len(score))
+    return [int(i) for i in modes if score[modes[0]] - score[i] < TIE_MARGIN]
+
+
+def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[str, ...]:
+    """Say why the best hypothesis may be wrong, one line per reason.
+
+    Args:
+        hypotheses: Hypotheses, best first.
+        poses: The same in working units.
+    """
+    terms, flags = hypotheses[0].terms, []
+    tied = tied_hypotheses(torch.tensor([one.score for one in hypotheses]), poses.rotation)
+    if len(tied) > 1:
+        scores = ", ".join(f"{hypotheses[i].score:.1f}" for i in tied)
+        flags.append(
+            f"{len(tied)} poses more than 30 degrees apart explain the views equally well (scores {scores}): "
+            "the object may be symmetric"
+        )
+    if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
+        flags.append("no view confirms the pose: nearly no point lies on an observed surface")
+    if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
+        flags.append("no view confirms the pose: features of points that coincide are not similar")
+    return tuple(flags)
+
+
+def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
+    """The targets sorted by a hash of their content, which neither their order nor the world's axes change."""
+    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+    keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
+    return tuple(sorted(range(len(targets)), key=keys.__getitem__))
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str):
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
