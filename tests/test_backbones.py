@@ -11,15 +11,10 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import nn
 
-from zsp_lite.backbones import load as backbones
-from zsp_lite.backbones.load import (
-    Backbone,
-    PretrainedWeights,
-    available_backbones,
-    load_backbone,
-    prepare_images,
-    verify,
-)
+from zsp_lite.backbones import pretrained
+from zsp_lite.backbones.backbone import Backbone, prepare_images
+from zsp_lite.backbones.load import load_backbone, verify
+from zsp_lite.backbones.pretrained import PretrainedWeights, available_backbones
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import fetch
@@ -55,7 +50,7 @@ def assert_same_features(first, second):
 
 
 def test_features_are_the_models_keys_saliency_and_cls(vit, pictures):
-    model = Backbone(vit, "small", key_block=1, saliency_heads=(0, 3), device="cpu", batch_size=2)
+    model = Backbone(vit, "small", layer=1, saliency_heads=(0, 3), device="cpu", batch_size=2)
     features = model(pictures)
     assert len(features) == 3
     pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
@@ -110,9 +105,9 @@ def test_uniform_attention_is_no_foreground():
 def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
     vits = VisionTransformer(32, 8, 384, 12, 6)
     assert Backbone(vits, "s", device="cpu").saliency_heads == (0, 2, 4, 5)
-    assert Backbone(vits, "s", device="cpu").key_block == 9
+    assert Backbone(vits, "s", device="cpu").layer == 9
     assert Backbone(small_vit(), "x", device="cpu").saliency_heads == (0, 1, 2, 3)
-    assert Backbone(small_vit(), "x", device="cpu").key_block == 2
+    assert Backbone(small_vit(), "x", device="cpu").layer == 2
 
 
 def test_resizing_averages_over_what_it_shrinks():
@@ -145,7 +140,7 @@ def test_bad_images_are_refused_by_number(vit, image):
 @pytest.mark.parametrize(
     "options",
     [
-        {"key_block": 3},
+        {"layer": 3},
         {"saliency_heads": (4,)},
         {"saliency_heads": ()},
         {"precision": "int8"},
@@ -190,17 +185,17 @@ def test_safetensors_bring_their_settings_and_arguments_override_them(vit, pictu
     metadata = {"num_heads": "4", "key_block": "1", "saliency_heads": "0,2"}
     save_file(half, tmp_path / "tiny.safetensors", metadata=metadata)
     loaded = load_backbone(str(tmp_path / "tiny.safetensors"), "cpu")
-    assert (loaded.model.num_heads, loaded.key_block, loaded.saliency_heads) == (4, 1, (0, 2))
-    expected = Backbone(vit, "small", key_block=1, device="cpu")(pictures)
+    assert (loaded.model.num_heads, loaded.layer, loaded.saliency_heads) == (4, 1, (0, 2))
+    expected = Backbone(vit, "small", layer=1, device="cpu")(pictures)
     for a, b in zip(loaded(pictures), expected):
         assert a.keys.dtype == torch.float32
         assert F.cosine_similarity(a.keys, b.keys, dim=-1).min() > 0.999
-    other = load_backbone(tmp_path / "tiny.safetensors", "cpu", key_block=0, saliency_heads=[3])
-    assert (other.key_block, other.saliency_heads) == (0, (3,))
+    other = load_backbone(tmp_path / "tiny.safetensors", "cpu", layer=0, saliency_heads=[3])
+    assert (other.layer, other.saliency_heads) == (0, (3,))
 
 
 def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
-    monkeypatch.setattr(backbones, "TINY", tmp_path / "zsp-tiny.safetensors")
+    monkeypatch.setattr(pretrained, "TINY", tmp_path / "zsp-tiny.safetensors")
     with pytest.raises(InputError, match="zsp-lite train"):
         load_backbone()
     save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "4"})
@@ -246,7 +241,7 @@ def without(weights, key):
         (lambda w: without(w, "blocks.1.norm1.bias"), "blocks.1.norm1.bias: expected .64,., got none"),
         (lambda w: w | {"extra": torch.zeros(1)}, "extra: expected none"),
         (lambda w: w | {"norm.weight": torch.zeros(3)}, "norm.weight"),
-        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight holds"),
+        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight contains"),
         (lambda w: {"fc.weight": torch.zeros(2, 2)}, "DINO layout"),
         (lambda w: [1, 2], "state dict"),
         (lambda w: {"epoch": 3}, "state dict"),
@@ -385,7 +380,7 @@ def test_dino_models_come_from_the_server_into_the_cache(server, vit, pictures, 
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     release = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
-    monkeypatch.setitem(backbones.PRETRAINED, "dino_vits8", release)
+    monkeypatch.setitem(pretrained.PRETRAINED, "dino_vits8", release)
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu", num_heads=4)
     assert loaded.name == "dino_vits8"
@@ -398,7 +393,7 @@ def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, mo
     torch.save(small_vit(num_heads=1).state_dict(), tmp_path / "vit.pth")
     content = (tmp_path / "vit.pth").read_bytes()
     monkeypatch.setitem(
-        backbones.PRETRAINED,
+        pretrained.PRETRAINED,
         "dino_vits16",
         PretrainedWeights("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content)),
     )
@@ -407,7 +402,7 @@ def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, mo
     with pytest.raises(InputError, match="not the released file.*weights fetch dino_vits16"):
         verify("dino_vits16")
     (tmp_path / "vit.pth").unlink()
-    with pytest.raises(InputError, match="not at hand"):
+    with pytest.raises(InputError, match="not downloaded"):
         verify("dino_vits16")
 
 
@@ -420,15 +415,15 @@ def test_without_the_server_one_line_says_what_to_do(server, tmp_path, monkeypat
     message = str(caught.value)
     assert "\n" not in message
     place = tmp_path / "dino_deitsmall8_pretrain.pth"
-    for part in (backbones.PRETRAINED["dino_vits8"].url, str(place), "zsp-tiny"):
+    for part in (pretrained.PRETRAINED["dino_vits8"].url, str(place), "zsp-tiny"):
         assert part in message
 
 
 def test_released_addresses_and_hashes_are_those_that_were_published():
-    release = backbones.PRETRAINED["dino_vits8"]
+    release = pretrained.PRETRAINED["dino_vits8"]
     folder = "https://dl.fbaipublicfiles.com/dino/dino_deitsmall8_pretrain/"
     assert release.url == folder + "dino_deitsmall8_pretrain.pth"
     assert (release.md5_prefix, release.size) == ("230cd5", 86_728_949)
-    assert {name: r.md5_prefix for name, r in backbones.PRETRAINED.items()} == {
+    assert {name: r.md5_prefix for name, r in pretrained.PRETRAINED.items()} == {
         "dino_vits8": "230cd5", "dino_vits16": "cf0f22", "dino_vitb8": "556550", "dino_vitb16": "552daf"
     }  # fmt: skip

@@ -13,7 +13,7 @@ from synthetic_views import CoordinateBackbone
 
 import zsp_lite
 from zsp_lite.alignment import ransac
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.annotations import process_memory
 from zsp_lite.benchmark.profile import (
@@ -198,7 +198,7 @@ def test_every_method_is_a_valid_configuration():
 
 
 def test_a_random_backbone_has_the_shape_of_the_other_and_its_own_weights():
-    like = Backbone(VisionTransformer(32, 8, 12, 2, 3), "small", key_block=1)
+    like = Backbone(VisionTransformer(32, 8, 12, 2, 3), "small", layer=1)
     first, second = random_backbone(like), random_backbone(like)
     shapes = {key: value.shape for key, value in like.model.state_dict().items()}
     assert {key: value.shape for key, value in first.model.state_dict().items()} == shapes

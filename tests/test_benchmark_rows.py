@@ -123,7 +123,7 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
 
 
 def test_a_fingerprint_tells_apart_whatever_changes_the_features(monkeypatch):
-    from zsp_lite.backbones.load import Backbone
+    from zsp_lite.backbones.backbone import Backbone
     from zsp_lite.backbones.vit import VisionTransformer
 
     monkeypatch.setattr("zsp_lite.backbones.precision.bfloat16_is_fast", lambda device_type: True)
@@ -134,9 +134,9 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features(monkeypatch):
         return extractors.fingerprint(Backbone(vit, "same name", device="cpu", **options))
 
     plain = of()
-    assert plain == of(key_block=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
+    assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
     changes = [
-        dict(key_block=1), dict(facet="query"), dict(saliency_heads=[1]), dict(image_size=64), dict(mean=(0, 0, 0)),
+        dict(layer=1), dict(facet="query"), dict(saliency_heads=[1]), dict(image_size=64), dict(mean=(0, 0, 0)),
         dict(std=(1, 1, 1)), dict(precision="bfloat16"),
     ]  # fmt: skip
     assert len({plain, *(of(**change) for change in changes)}) == 1 + len(changes)

@@ -21,7 +21,7 @@ import torch
 from benchmark_folder import SlowBackbone, own_method, small_folder
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import run as run_module
 from zsp_lite.benchmark.cache import FeatureCache
@@ -163,7 +163,7 @@ def test_a_frame_is_described_by_itself_so_that_no_order_matters():
 def test_a_vision_transformers_features_do_not_depend_on_threads():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", key_block=1, device="cpu")
+        backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     root, rows = small_folder(), resolve(["ours"])
     work = work_of_categories(pairs_of_rows(root, rows, 2, 2, categories=["lump"]))["lump"]
     found = []

@@ -16,8 +16,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from transformers import AutoModel
 
 from zsp_lite import ZeroShotPose, load_backbone
+from zsp_lite.backbones.backbone import Backbone, prepare_images
 from zsp_lite.backbones.huggingface import nearest_multiple
-from zsp_lite.backbones.load import Backbone, download, prepare_images, verify
+from zsp_lite.backbones.load import verify
+from zsp_lite.backbones.pretrained import download
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import backbone_digest
 from zsp_lite.cli import main as cli
@@ -169,7 +171,7 @@ def test_the_grid_comes_from_the_patch_size_and_special_tokens_are_not_in_it(kin
     patch = ARCHITECTURES[kind].patch
     backbone = load_backbone(f"hf:{folders[kind]}", "cpu")
     assert (backbone.image_size, backbone.patch_size, backbone.embed_dim) == (224, patch, 32)
-    assert backbone.key_block == 2  # three quarters of the depth, rounded down
+    assert backbone.layer == 2  # three quarters of the depth, rounded down
     features = backbone(pictures)[0]
     assert features.grid == (224 // patch, 224 // patch) == features.saliency.shape
     assert backbone.name == f"hf:{kind}"
@@ -260,7 +262,7 @@ def test_dino_in_hugging_faces_format_is_the_same_backbone(facet, layer, picture
     folder = as_huggingface(vit, tmp_path / "dino")
     theirs = load_backbone(f"hf:{folder}", "cpu", layer=layer, facet=facet, image_size=32)
     ours = Backbone(vit, "dino", layer, device="cpu", facet=facet)
-    assert theirs.key_block == ours.key_block
+    assert theirs.layer == ours.layer
     for a, b in zip(theirs(pictures), ours(pictures), strict=True):
         torch.testing.assert_close(a.keys, b.keys, atol=5e-5, rtol=1e-4)
         torch.testing.assert_close(a.saliency, b.saliency, atol=5e-5, rtol=1e-4)
@@ -373,7 +375,6 @@ def test_without_transformers_the_extra_is_named(folders, monkeypatch):
         ({"layer": "block3"}, "layer is 'block3', expected 'last', 'block0' to 'block2', or a number from -3 to 2"),
         ({"layer": 3}, "layer is 3"),
         ({"layer": "first"}, "layer is 'first'"),
-        ({"layer": 1, "key_block": 1}, "one thing"),
         ({"num_heads": 4}, "num_heads"),
         ({"saliency_heads": (4,)}, "saliency_heads"),
         ({"image_size": 0}, "image_size"),
@@ -392,8 +393,8 @@ def test_settings_out_of_range_are_refused(folders, options, match):
         ("bert", SIZES | {"vocab_size": 99}, "a bert model"),
         ("vit", SIZES | {"num_channels": 1}, "takes 1 channels"),
         ("vit", SIZES | {"patch_size": [8, 16]}, "one square patch_size"),
-        ("yolos", SIZES | {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens besides"),
-        ("blip", {}, "is not a vision transformer that can be read"),
+        ("yolos", SIZES | {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
+        ("blip", {}, "is not a supported vision transformer"),
     ],
 )
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
@@ -427,7 +428,7 @@ def test_pickles_are_not_read(tmp_path):
         ("config.json", b"{", "config.json"),
         ("config.json", b'{"model_type": "no such"}', "config.json"),
         ("preprocessor_config.json", b"{", "preprocessor_config.json is not JSON"),
-        ("preprocessor_config.json", b"[]", "holds a list"),
+        ("preprocessor_config.json", b"[]", "contains a list"),
         ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
     ],
 )
@@ -472,8 +473,8 @@ def test_what_is_in_the_cache_needs_no_hub(offline, pictures):
     "error, match",
     [
         (huggingface_hub.errors.GatedRepoError, "licence.*https://huggingface.co/someone/closed"),
-        (huggingface_hub.errors.RepositoryNotFoundError, "has no such model"),
-        (OSError, "cannot be fetched.*503 Service Unavailable"),
+        (huggingface_hub.errors.RepositoryNotFoundError, "no such public model"),
+        (OSError, "cannot be downloaded.*503 Service Unavailable"),
     ],
 )
 def test_what_the_hub_refuses_is_told_in_one_line(error, match, monkeypatch):
@@ -489,4 +490,4 @@ def test_what_the_hub_refuses_is_told_in_one_line(error, match, monkeypatch):
 
 @pytest.mark.parametrize("name", ["hf:", "hf:a/b/c", "hf:../nowhere", "hf:a b"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
-    refused(name, "folder.* name of the hub's form OWNER/MODEL")
+    refused(name, "folder.* hub name OWNER/MODEL")

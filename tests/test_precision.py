@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from zsp_lite.backbones import precision
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.precision import bfloat16_is_fast, choose_precision, supported_precision
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.training.train import Trainee, TrainingConfig

@@ -13,8 +13,9 @@ import torch.nn.functional as F
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, load_backbone
-from zsp_lite.backbones.load import TINY as SHIPPED
+from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD
+from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.pretrained import TINY as SHIPPED
 from zsp_lite.cli import main as cli
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities

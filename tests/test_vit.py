@@ -61,27 +61,27 @@ def test_forward_equals_an_independent_transformer(model, images, gradients):
         torch.testing.assert_close(model(images), oracle(model, images)[0], atol=2e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("key_block", range(DEPTH))
-def test_extract_gives_keys_cls_attention_and_cls_output(model, images, key_block):
+@pytest.mark.parametrize("layer", range(DEPTH))
+def test_extract_gives_keys_cls_attention_and_cls_output(model, images, layer):
     with torch.no_grad():
-        tokens = model.extract(images, key_block)
+        tokens = model.extract(images, layer)
         output, keys, attentions = oracle(model, images)
-    torch.testing.assert_close(tokens.keys, keys[key_block][:, 1:], atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(tokens.keys, keys[layer][:, 1:], atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(tokens.attention, attentions[-1][:, :, 0, 1:], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(tokens.cls, output[:, 0], atol=2e-5, rtol=1e-4)
     assert tokens.grid == (4, 4)
 
 
-@pytest.mark.parametrize("key_block", range(DEPTH))
-def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, images, key_block):
-    training = model.forward_training(images, key_block)
+@pytest.mark.parametrize("layer", range(DEPTH))
+def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, images, layer):
+    training = model.forward_training(images, layer)
     with torch.no_grad():
-        tokens, output = model.extract(images, key_block), model(images)
+        tokens, output = model.extract(images, layer), model(images)
     torch.testing.assert_close(training.tokens, output, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(training.keys, tokens.keys, atol=2e-5, rtol=1e-4)
     attention = training.cls_logits.softmax(-1)[:, :, 1:]
     torch.testing.assert_close(attention, tokens.attention, atol=1e-5, rtol=1e-4)
-    weight, bias = (x.chunk(3)[1] for x in model.blocks[key_block].attn.qkv.parameters())
+    weight, bias = (x.chunk(3)[1] for x in model.blocks[layer].attn.qkv.parameters())
     keys = F.linear(training.key_input, weight, bias)
     torch.testing.assert_close(keys, training.keys, atol=2e-5, rtol=1e-4)
     loss = training.tokens.square().sum() + training.keys.sum() + training.cls_logits.square().sum()
@@ -151,7 +151,7 @@ def test_sizes_that_do_not_fit_are_refused(arguments):
         VisionTransformer(*arguments)
 
 
-@pytest.mark.parametrize("key_block", [-1, DEPTH])
-def test_a_key_block_that_does_not_exist_is_refused(model, images, key_block):
-    with pytest.raises(InputError, match="key_block"):
-        model.extract(images, key_block)
+@pytest.mark.parametrize("layer", [-1, DEPTH])
+def test_a_layer_that_does_not_exist_is_refused(model, images, layer):
+    with pytest.raises(InputError, match="layer"):
+        model.extract(images, layer)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
-from zsp_lite.backbones.load import TINY, load_backbone
+from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.pretrained import TINY
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.run import random_backbone
 from zsp_lite.data.co3d import Co3D

@@ -60,7 +60,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
     )
     from zsp_lite.alignment import Sim3
     from zsp_lite.backbones import checkpoints, facets, huggingface, vit
-    from zsp_lite.backbones.load import Backbone, load_backbone
+    from zsp_lite.backbones.backbone import Backbone
+    from zsp_lite.backbones.load import load_backbone
     from zsp_lite.data import annotations, cameras, check, co3d, depth, frames, labels, pairs, samples
     from zsp_lite.data.cameras import Camera
     from zsp_lite.data.co3d import Co3D
@@ -79,7 +80,8 @@ _HOMES = {
     "backbones baselines benchmark cli data importers io labelling synthetic training verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",
-    "backbones.load": "Backbone load_backbone",
+    "backbones.backbone": "Backbone",
+    "backbones.load": "load_backbone",
     "data": "annotations cameras check co3d depth frames labels pairs samples",
     "data.cameras": "Camera",
     "data.co3d": "Co3D",

@@ -1,4 +1,4 @@
-"""Checkpoint files of vision transformers in the DINO layout: read them, tell the model by its shapes."""
+"""Checkpoint files of vision transformers in the DINO layout."""
 
 import math
 from pathlib import Path
@@ -12,9 +12,13 @@ from zsp_lite.errors import InputError
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Weights under the plain DINO keys, and the metadata (empty but for safetensors). Runs no code from it.
+    """Read a .safetensors file, or a torch file that contains tensors only. No code from the file is executed.
 
-    Raises InputError where the file is damaged or holds anything but tensors.
+    Returns:
+        Weights with DINO's state-dict keys, and the metadata (empty unless the file is a .safetensors file).
+
+    Raises:
+        InputError: If the file is damaged or contains anything but tensors.
     """
     path = Path(path)
     try:
@@ -23,12 +27,11 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
                 return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        # Damaged files surface as whatever the unpickler stumbled over: a dozen types, none documented. Torch's own
-        # advice is to load the file unsafely.
+        # A damaged file can raise almost any exception. torch's own message recommends unsafe loading: not shown.
         reason = (str(error).splitlines() or [""])[0]
         reason = type(error).__name__ if not reason or reason.startswith("Weights only load failed") else reason
-        raise InputError(f"checkpoint {path}: damaged, or not of tensors alone ({reason[:120]})") from error
-    for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints hold teacher and student
+        raise InputError(f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})") from error
+    for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints contain teacher and student
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
             break
@@ -38,10 +41,36 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
     return {key: x for key, x in plain.items() if not key.startswith("head.")}, {}
 
 
-def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: str = "checkpoint") -> VisionTransformer:
-    """The transformer with these weights; sizes come from their shapes, heads have 64 channels unless told.
+def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[int] | None:
+    """Parse integers separated by commas; None if the metadata does not contain `key`. Raises InputError."""
+    if key not in metadata:
+        return None
+    try:
+        return [int(x) for x in metadata[key].strip("()[] ").split(",") if x.strip()]
+    except ValueError as error:
+        raise InputError(f"checkpoint {path}: metadata {key} {metadata[key]!r} is not integers") from error
 
-    Raises InputError where keys or shapes are not those of the DINO layout, or a weight is not finite.
+
+def metadata_integer(metadata: dict[str, str], key: str, path: Path) -> int | None:
+    """Parse one integer; None if the metadata does not contain `key`. Raises InputError."""
+    values = metadata_integers(metadata, key, path)
+    if values is None:
+        return None
+    if len(values) != 1:
+        raise InputError(f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected one integer")
+    return values[0]
+
+
+def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: str = "checkpoint") -> VisionTransformer:
+    """Build a transformer from weights in the DINO layout; its sizes are read from their shapes.
+
+    Args:
+        weights: State dict of finite floats.
+        num_heads: Default: one head per 64 channels.
+        name: Name for error messages.
+
+    Raises:
+        InputError: If keys or shapes are not in the DINO layout, or a weight is not finite.
     """
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
@@ -51,9 +80,11 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: st
         raise InputError(f"{name}: not a vision transformer in the DINO layout ({error})") from error
     if num_heads is None:
         if dim % 64:
-            raise InputError(f"{name}: {dim} channels do not say how many heads there are; pass num_heads")
+            raise InputError(
+                f"{name}: the number of heads is unknown, {dim} channels are no multiple of 64; pass num_heads"
+            )
         num_heads = dim // 64
-    with torch.device("meta"):  # no time spent on initial values that the checkpoint replaces
+    with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
         model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     expected = {key: tuple(x.shape) for key, x in model.state_dict().items()}
     found = {key: tuple(x.shape) for key, x in weights.items()}
@@ -66,6 +97,6 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: st
         )
     for key, x in weights.items():
         if not x.is_floating_point() or not bool(x.isfinite().all()):
-            raise InputError(f"{name}: {key} holds values that are not finite floats")
+            raise InputError(f"{name}: {key} contains values that are not finite floats")
     model.load_state_dict({key: x.to(torch.float32) for key, x in weights.items()}, strict=True, assign=True)
     return model

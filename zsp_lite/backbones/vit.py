@@ -1,11 +1,12 @@
 """A vision transformer in the layout of the public DINO checkpoints (Caron et al. 2021).
 
-The method needs three things of it (Goodwin et al., section 4.1 and supplement): the *keys* of one block
-as descriptors of the patches, the *attention* of the last block's CLS token as saliency, and the CLS
-output as one global feature. `VisionTransformer.extract` returns these three and does no work beyond them.
+The method uses three outputs (Goodwin et al., section 4.1 and supplement): the *keys* of one block as patch
+descriptors, the *attention* of the last block's CLS token as saliency, and the CLS output token as global feature.
+`VisionTransformer.extract` returns these three and computes nothing else.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -13,31 +14,66 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.facets import Facet
 from zsp_lite.errors import InputError
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """What the method reads from one forward pass over a batch of images; N patches in row-major order."""
+    """Outputs of a forward pass that the method uses; the n patches are in row-major order.
 
-    keys: Float[Tensor, "batch n dim"]  # raw keys of the patches, heads concatenated
-    attention: Float[Tensor, "batch heads n"]  # last block, CLS to patches; softmax over all 1 + N tokens
-    cls: Float[Tensor, "batch dim"]  # normalised CLS output
-    grid: tuple[int, int]  # (rows, columns), rows * columns == N
+    Attributes:
+        keys: Patch descriptors: the keys of one block (or another facet), heads concatenated.
+        attention: Attention of the last block from CLS to the patches; softmax over all 1 + n tokens.
+        cls: CLS output token after the final normalisation.
+        grid: (rows, columns) of the patch grid; rows * columns = n.
+    """
+
+    keys: Float[Tensor, "batch n dim"]
+    attention: Float[Tensor, "batch heads n"]
+    cls: Float[Tensor, "batch dim"]
+    grid: tuple[int, int]
 
 
 @dataclass(frozen=True)
 class TrainingTokens:
-    """Everything a loss may want from one forward pass, with gradients."""
+    """Outputs of a forward pass that training losses use, with gradients.
 
-    tokens: Float[Tensor, "batch tokens dim"]  # normalised output of the last block, CLS first
-    keys: Float[Tensor, "batch n dim"]  # raw keys of the patches at the key block
-    key_input: Float[Tensor, "batch n dim"]  # the normalised patch tokens that those keys are a linear map of
-    cls_logits: Float[Tensor, "batch heads tokens"]  # last block, CLS to all, scaled, no softmax; float32
+    Attributes:
+        tokens: All output tokens after the final normalisation, CLS first.
+        keys: Keys of the patches in one block, heads concatenated.
+        key_input: Normalised patch tokens of that block; the keys are a linear function of them.
+        cls_logits: Scaled attention logits of the last block from CLS to all tokens, float32.
+        grid: (rows, columns) of the patch grid.
+    """
+
+    tokens: Float[Tensor, "batch tokens dim"]
+    keys: Float[Tensor, "batch n dim"]
+    key_input: Float[Tensor, "batch n dim"]
+    cls_logits: Float[Tensor, "batch heads tokens"]
     grid: tuple[int, int]
 
 
+@dataclass(frozen=True)
+class BlockActivations:
+    """Intermediate results of one transformer block, CLS first.
+
+    Attributes:
+        normed: Input after the first normalisation.
+        query, key, value: Linear functions of `normed`, heads concatenated.
+        token: Output of the block, not normalised.
+    """
+
+    normed: Float[Tensor, "batch tokens dim"]
+    query: Float[Tensor, "batch tokens dim"]
+    key: Float[Tensor, "batch tokens dim"]
+    value: Float[Tensor, "batch tokens dim"]
+    token: Float[Tensor, "batch tokens dim"]
+
+
 class Attention(nn.Module):
+    """Multi-head self-attention with one linear layer for queries, keys and values."""
+
     def __init__(self, dim: int, heads: int):
         super().__init__()
         self.heads = heads
@@ -54,11 +90,11 @@ class Attention(nn.Module):
         k: Float[Tensor, "batch n dim"],
         v: Float[Tensor, "batch n dim"],
     ) -> Float[Tensor, "batch m dim"]:
-        """Attend from each query to all keys and project; heads are slices of the last axis."""
+        """Attend from each query to all keys and apply the output projection; heads are slices of the last axis."""
         q, k, v = self.split_heads(q), self.split_heads(k), self.split_heads(v)
         if torch.is_grad_enabled() and q.device.type == "cpu":
-            # Forward and backward in bfloat16: 30 ms this way, softmax included, 74 ms through the fused call
-            # (24 x 257 tokens). Without gradients the fused call wins, and never stores the attention matrix.
+            # Forward and backward pass in bfloat16 (24 x 257 tokens): 30 ms with explicit products, 74 ms with the
+            # fused function. Without gradients the fused function is faster and never stores the attention matrix.
             with torch.autocast("cpu", enabled=False):
                 out = ((q * self.scale) @ k.transpose(-1, -2)).softmax(-1) @ v
         else:
@@ -68,13 +104,15 @@ class Attention(nn.Module):
     def cls_logits(
         self, q: Float[Tensor, "batch m dim"], k: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch heads n"]:
-        """Scaled logits of the first query (the CLS token) against all keys, in float32."""
+        """Return the scaled attention logits of the first query (the CLS token) for all keys, in float32."""
         q, k = self.split_heads(q[:, :1]), self.split_heads(k)
         with torch.autocast(q.device.type, enabled=False):
             return ((q.float() * self.scale) @ k.float().transpose(-1, -2))[:, :, 0]
 
 
 class Mlp(nn.Module):
+    """Two linear layers with a GELU between them."""
+
     def __init__(self, dim: int, hidden: int):
         super().__init__()
         self.fc1 = nn.Linear(dim, hidden)
@@ -85,7 +123,7 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block in three steps, `project`, attention, `finish`: callers can look between."""
+    """Pre-norm transformer block."""
 
     def __init__(self, dim: int, heads: int):
         super().__init__()
@@ -95,25 +133,26 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, 4 * dim)
 
     def project(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Normalised input, queries, keys and values, each (batch, n, dim) with heads concatenated."""
+        """Return normalised input, queries, keys and values, each (batch, n, dim) with heads concatenated."""
         normed = self.norm1(x)
         return normed, *self.attn.qkv(normed).chunk(3, dim=-1)
 
     def finish(
         self, x: Float[Tensor, "batch n dim"], attended: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch n dim"]:
-        """The two residual additions: what attention gathered, then the MLP."""
+        """Add the attention output to the residual stream, then the MLP's output."""
         x = x + attended
         return x + self.mlp(self.norm2(x))
 
-    def forward(self, x: Float[Tensor, "batch n dim"]) -> Float[Tensor, "batch n dim"]:
-        _, q, k, v = self.project(x)
-        return self.finish(x, self.attn(q, k, v))
+    def forward(self, x: Float[Tensor, "batch n dim"]) -> BlockActivations:
+        normed, q, k, v = self.project(x)
+        return BlockActivations(normed, q, k, v, self.finish(x, self.attn(q, k, v)))
 
     def forward_cls(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor]:
-        """The block as seen by CLS: CLS (batch, 1, dim), keys (batch, n, dim), logits (batch, heads, n).
+        """Compute the block's output for the CLS token only, without the patches' queries, attention and MLP.
 
-        One query instead of n: queries, attention, projection and MLP of the patches are never computed.
+        Returns:
+            CLS token (batch, 1, dim), keys (batch, n, dim) and CLS attention logits (batch, heads, n).
         """
         dim = x.shape[-1]
         weight, bias = self.attn.qkv.weight, self.attn.qkv.bias
@@ -124,13 +163,15 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
+    """Linear embedding of non-overlapping patches."""
+
     def __init__(self, patch_size: int, dim: int):
         super().__init__()
         self.patch_size = patch_size
         self.proj = nn.Conv2d(3, dim, kernel_size=patch_size, stride=patch_size)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch n dim"]:
-        # The convolution's windows do not overlap, so it is one matrix product, which a CPU does faster.
+        # The windows of the convolution do not overlap: it is one matrix product, which is faster on a CPU.
         p = self.patch_size
         patches = images.unflatten(3, (-1, p)).unflatten(2, (-1, p)).permute(0, 2, 4, 1, 3, 5)
         return F.linear(patches.flatten(3).flatten(1, 2), self.proj.weight.flatten(1), self.proj.bias)
@@ -139,8 +180,17 @@ class PatchEmbed(nn.Module):
 class VisionTransformer(nn.Module):
     """ViT with the state-dict keys and shapes of a DINO checkpoint (loads one with strict=True).
 
-    image_size is the side in pixels at which the position embedding is stored; other inputs interpolate it.
-    Raises InputError where the sizes do not divide each other.
+    Args:
+        image_size: Side in pixels of the square images for which the position embedding is stored; it is interpolated
+            for other sizes.
+        patch_size: Side of a patch in pixels.
+        embed_dim: Number of channels of a token.
+        depth: Number of blocks.
+        num_heads: Number of attention heads.
+
+    Raises:
+        InputError: If a size is below 1, `image_size` is not a multiple of `patch_size`, or `embed_dim` not one of
+            `num_heads`.
     """
 
     def __init__(
@@ -158,7 +208,7 @@ class VisionTransformer(nn.Module):
                 f"image_size {image_size}, patch_size {patch_size}, depth {depth}"
             )
         if embed_dim % num_heads:
-            raise InputError(f"VisionTransformer: embed_dim {embed_dim} is no multiple of {num_heads} heads")
+            raise InputError(f"VisionTransformer: embed_dim {embed_dim} is not a multiple of num_heads {num_heads}")
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))
@@ -174,19 +224,19 @@ class VisionTransformer(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def position_embedding(self, grid: tuple[int, int]) -> Float[Tensor, "1 tokens dim"]:
-        """The stored embedding, or its bicubic interpolation where the input's patch grid is another."""
+        """Return the stored embedding, or its bicubic interpolation for another patch grid."""
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if grid == (side, side):
             return self.pos_embed
         stored = self.pos_embed[:, 1:].unflatten(1, (side, side)).permute(0, 3, 1, 2)
-        # DINO adds 0.1 against rounding, and interpolate() then samples with that scale, not the exact ratio;
-        # the same here, since released features were computed so.
+        # As in DINO's code, 0.1 is added against rounding, and interpolate() samples with that scale instead of the
+        # exact ratio.
         scale = tuple((cells + 0.1) / side for cells in grid)
         resized = F.interpolate(stored, scale_factor=scale, mode="bicubic", align_corners=False)
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
 
     def embed(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[Tensor, tuple[int, int]]:
-        """Input of the first block (batch, 1 + n, dim) and the patch grid."""
+        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows, columns)."""
         p = self.patch_size
         if images.ndim != 4 or images.shape[1] != 3 or any(side < p or side % p for side in images.shape[2:]):
             raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}")
@@ -196,40 +246,57 @@ class VisionTransformer(nn.Module):
         return x + self.position_embedding(grid), grid
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch tokens dim"]:
-        """Normalised output tokens, CLS first."""
+        """Return the normalised output tokens, CLS first."""
         x, _ = self.embed(images)
-        for block in self.blocks:
-            x = block(x)
-        return self.norm(x)
+        for activations in self.run_blocks(x):
+            pass
+        return self.norm(activations.token)
 
-    def extract(self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9) -> Tokens:
-        """Keys of block `key_block` (0-based), last CLS attention and CLS output, in one forward."""
-        key_block = self._checked(key_block)
+    def run_blocks(self, x: Float[Tensor, "batch tokens dim"], count: int | None = None) -> Iterator[BlockActivations]:
+        """Run the first `count` blocks (default: all) one after the other and yield the activations of each."""
+        for block in self.blocks[:count]:
+            activations = block(x)
+            x = activations.token
+            yield activations
+
+    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
+        """Compute patch descriptors, CLS attention and CLS output in one forward pass.
+
+        Args:
+            images: Normalised RGB images; height and width are multiples of the patch size.
+            layer: Block that describes the patches, counted from 0. The paper writes "the 9th ViT layer"; its published
+                code uses block 9 counted from 0.
+            facet: Activation of that block used as descriptor (`Facet`).
+
+        Raises:
+            InputError: If the block does not exist or the image size does not fit.
+        """
+        self._check_layer(layer)
         x, grid = self.embed(images)
-        for index, block in enumerate(self.blocks[:-1]):
-            _, q, k, v = block.project(x)
-            if index == key_block:
-                keys = k[:, 1:]
-            x = block.finish(x, block.attn(q, k, v))
-        cls, last_keys, logits = self.blocks[-1].forward_cls(x)
-        if key_block == self.depth - 1:
-            keys = last_keys[:, 1:]
-        return Tokens(keys, logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
+        for index, activations in enumerate(self.run_blocks(x, self.depth - 1)):
+            x = activations.token
+            if index == layer:
+                descriptors = getattr(activations, facet)
+        block = self.blocks[-1]
+        if facet == "key":  # no other activation of the patches is needed in the last block
+            cls, last_descriptors, logits = block.forward_cls(x)
+        else:
+            activations = block(x)
+            cls, last_descriptors = activations.token[:, :1], getattr(activations, facet)
+            logits = block.attn.cls_logits(activations.query, activations.key)
+        if layer == self.depth - 1:
+            descriptors = last_descriptors
+        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
 
-    def forward_training(self, images: Float[Tensor, "batch 3 height width"], key_block: int = 9) -> TrainingTokens:
-        """All output tokens, keys of block `key_block` and the last block's CLS logits, with gradients."""
-        key_block = self._checked(key_block)
+    def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9) -> TrainingTokens:
+        """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
+        self._check_layer(layer)
         x, grid = self.embed(images)
-        for index, block in enumerate(self.blocks):
-            normed, q, k, v = block.project(x)
-            if index == key_block:
-                keys, key_input = k[:, 1:], normed[:, 1:]
-            if index == self.depth - 1:
-                logits = block.attn.cls_logits(q, k)
-            x = block.finish(x, block.attn(q, k, v))
-        return TrainingTokens(self.norm(x), keys, key_input, logits, grid)
+        activations = list(self.run_blocks(x))
+        chosen, last = activations[layer], activations[-1]
+        logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
+        return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits, grid)
 
-    def _checked(self, key_block: int) -> int:
-        if not 0 <= key_block < self.depth:
-            raise InputError(f"key_block: expected 0 to {self.depth - 1}, got {key_block}")
-        return key_block
+    def _check_layer(self, layer: int) -> None:
+        if not 0 <= layer < self.depth:
+            raise InputError(f"layer: expected 0 to {self.depth - 1}, got {layer}")

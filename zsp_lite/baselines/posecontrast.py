@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from zsp_lite.backbones.backbone import prepare_images
 from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.backbones.load import prepare_images
 from zsp_lite.baselines.resnet import TINY, ResNet, Shape, load_weights
 from zsp_lite.baselines.swav import normalised
 from zsp_lite.data.frames import Frame

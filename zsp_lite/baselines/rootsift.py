@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from zsp_lite.backbones.load import Image, prepare_images
+from zsp_lite.backbones.backbone import Image, prepare_images
 from zsp_lite.features import FeatureMap
 
 _CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations in each cell

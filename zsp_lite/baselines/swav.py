@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Image, prepare_images
 from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, Image, prepare_images
 from zsp_lite.baselines.resnet import TINY, ResNet, Shape, load_weights
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast_tiny
 from zsp_lite.baselines.rootsift import RootSift
@@ -50,7 +50,7 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
         torch.manual_seed(seed)
         fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
     same = dict(facet=like.facet, image_size=like.image_size, mean=like.mean, std=like.std)
-    return Backbone(fresh, f"random like {like.name}", like.key_block, like.saliency_heads, like.device, **same)
+    return Backbone(fresh, f"random like {like.name}", like.layer, like.saliency_heads, like.device, **same)
 
 
 def fingerprint(extractor: Any) -> str:

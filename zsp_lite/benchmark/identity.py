@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]+")
 
@@ -24,7 +24,7 @@ def digest_of(value: Any) -> str:
 def backbone_digest(backbone: Backbone) -> str:
     """A hash of a backbone's weights and of what it does with them; neither its device nor its batches count."""
     chosen = (
-        backbone.key_block, backbone.facet, backbone.saliency_heads, backbone.image_size, backbone.mean, backbone.std,
+        backbone.layer, backbone.facet, backbone.saliency_heads, backbone.image_size, backbone.mean, backbone.std,
         backbone.precision,
     )  # fmt: skip
     digest = hashlib.sha256(repr(chosen).encode())

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 
 from zsp_lite.alignment import ransac, umeyama_batch
-from zsp_lite.backbones.load import Backbone
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.annotations import annotation_benchmark
 from zsp_lite.data.cameras import Camera

@@ -12,7 +12,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.backbones.load import Backbone, BackboneConfig, load_backbone
+from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.execution import default_threads, execute, open_crew
 from zsp_lite.benchmark.extractors import Extractor, fingerprint, make_extractors, random_backbone
 from zsp_lite.benchmark.identity import digest_of

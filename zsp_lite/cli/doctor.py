@@ -136,7 +136,7 @@ def _open3d() -> Check:
 
 def _backbones() -> Iterator[Check]:
     try:
-        from zsp_lite.backbones.load import available_backbones
+        from zsp_lite.backbones.pretrained import available_backbones
     except (ImportError, OSError) as error:
         yield Check("backbones", BAD, f"cannot be looked at: {_one_line(error)}", "mend what stands above first")
         return

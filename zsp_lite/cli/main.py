@@ -175,7 +175,7 @@ def weights() -> None:
 @weights.command("list", epilog=examples("weights list"))
 def list_weights() -> None:
     """List every backbone with its file, or the command that downloads it."""
-    from zsp_lite.backbones.load import available_backbones
+    from zsp_lite.backbones.pretrained import available_backbones
 
     for name, path in available_backbones().items():
         print(f"{name:12} {path or f'not downloaded: zsp-lite weights fetch {name}'}")
@@ -185,7 +185,7 @@ def list_weights() -> None:
 @click.argument("name")
 def fetch(name: str) -> None:
     """Download a backbone: NAME as `weights list` prints it, or hf:NAME."""
-    from zsp_lite.backbones.load import download
+    from zsp_lite.backbones.pretrained import download
 
     print(f"Available: {download(name)}")
 

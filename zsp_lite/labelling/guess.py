@@ -13,7 +13,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
 
 if TYPE_CHECKING:
-    from zsp_lite.backbones.load import Backbone
+    from zsp_lite.backbones.backbone import Backbone
 
 
 def guess_alignment(

@@ -23,8 +23,10 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from zsp_lite.backbones.load import IMAGENET_MEAN, IMAGENET_STD, TINY, load_backbone
+from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.precision import Precision, autocast, choose_precision
+from zsp_lite.backbones.pretrained import TINY
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
@@ -487,10 +489,8 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     images = (F.interpolate(rgb.float() / 255, (224, 224), mode="bilinear") - MEAN) / STD
     dim = config.embed_dim
     x, _ = backbone.embed(images)
-    for block in backbone.blocks:
-        _, q, k, v = block.project(x)
-        x = block.finish(x, block.attn(q, k, v))
-        block.attn.qkv.bias[dim : 2 * dim] -= k[:, 1:].mean((0, 1))
+    for block, activations in zip(backbone.blocks, backbone.run_blocks(x), strict=True):
+        block.attn.qkv.bias[dim : 2 * dim] -= activations.key[:, 1:].mean((0, 1))
     _rescale_input(backbone, (MEAN, STD), (IMAGENET_MEAN, IMAGENET_STD))
     metadata = dict(name=Path(path).stem, patch_size=8, image_size=224, num_heads=config.num_heads)
     metadata |= dict(key_block=config.key_block, saliency_heads=",".join(map(str, range(config.num_heads))))

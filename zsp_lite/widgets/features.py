@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from zsp_lite.backbones.backbone import Backbone, normalize, prepare_images
 from zsp_lite.backbones.facets import FACETS
-from zsp_lite.backbones.load import Backbone, load_backbone, prepare_images
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.errors import InputError
@@ -43,14 +44,12 @@ def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, s
     model = backbone.model
     if not isinstance(model, VisionTransformer):
         raise InputError(f"{backbone.name}: not in DINO's layout, expected zsp-tiny, a DINO model or a checkpoint file")
-    mean, std = (torch.tensor(x).view(3, 1, 1) for x in (backbone.mean, backbone.std))
+    batch = normalize(prepare_images(images, backbone.image_size), backbone.mean, backbone.std)
     found = {}
     with torch.no_grad():
-        x, _ = model.embed(((prepare_images(images, backbone.image_size) - mean) / std).to(backbone.device))
-        for layer, block in enumerate(model.blocks):
-            _, q, k, v = block.project(x)
-            x = block.finish(x, block.attn(q, k, v))
-            found |= {(layer, facet): values.cpu() for facet, values in zip(FACETS, (k, q, v, x), strict=True)}
+        x, _ = model.embed(batch.to(backbone.device))
+        for layer, activations in enumerate(model.run_blocks(x)):
+            found |= {(layer, facet): getattr(activations, facet).cpu() for facet in FACETS}
     return found
 
 

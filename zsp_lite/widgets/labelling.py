@@ -27,7 +27,7 @@ from zsp_lite.widgets.common import load_ipywidgets
 if TYPE_CHECKING:
     from ipywidgets import VBox
 
-    from zsp_lite.backbones.load import Backbone
+    from zsp_lite.backbones.backbone import Backbone
 
 _NEXT = -1  # in the menu of keypoints: the one to be picked next
 _SIGNS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}

@@ -1,0 +1,174 @@
+"""A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from zsp_lite.backbones.facets import Facet, block_index, check_facet
+from zsp_lite.backbones.huggingface import HuggingFaceViT, nearest_multiple
+from zsp_lite.backbones.precision import Precision, autocast, supported_precision
+from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+
+Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Backbone:
+    """Vision transformer as feature extractor of the method (section 4.1).
+
+    Args:
+        model: Network with `extract(images, layer, facet)`.
+        name: Name used in tables and reports.
+        layer: Block that describes the patches (see `block_index`). Default: block 9 counted from 0, or the last block
+            of a shallower network. The paper writes "the 9th ViT layer"; its published code counts from 0.
+        saliency_heads: Heads of the last block whose CLS attention is averaged into the saliency. Default: heads 0, 2,
+            4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads for other sizes.
+        device: Default: the GPU if there is one, else the CPU.
+        precision: "bfloat16" runs the network in bfloat16 where the device computes it faster than float32; elsewhere
+            float32 is used and a warning is logged.
+        batch_size: Number of images in one forward pass.
+        facet: Activation of the block used as descriptor; the paper's is "key".
+        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default: the
+            model's.
+        mean, std: Normalisation of RGB values in [0, 1].
+
+    Attributes:
+        layer: Index of the block, counted from 0.
+        patch_size, embed_dim: Those of the model.
+        precision: The precision in use.
+
+    The other arguments are attributes of the same name.
+
+    Raises:
+        InputError: If an argument is out of range or the device is not available.
+    """
+
+    def __init__(
+        self,
+        model: VisionTransformer | HuggingFaceViT,
+        name: str,
+        layer: int | str | None = None,
+        saliency_heads: Sequence[int] | None = None,
+        device: str | torch.device | None = None,
+        precision: Precision = "float32",
+        batch_size: int = 8,
+        facet: Facet = "key",
+        image_size: int | None = None,
+        mean: Sequence[float] = IMAGENET_MEAN,
+        std: Sequence[float] = IMAGENET_STD,
+    ):
+        if precision not in ("float32", "bfloat16"):
+            raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
+        if batch_size < 1:
+            raise InputError(f"batch_size: expected at least 1, got {batch_size}")
+        if saliency_heads is None:
+            dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
+            saliency_heads = (0, 2, 4, 5) if dino_small else range(model.num_heads)
+        saliency_heads = tuple(int(head) for head in saliency_heads)
+        if not saliency_heads or not set(saliency_heads) <= set(range(model.num_heads)):
+            raise InputError(
+                f"{name}: saliency_heads are {saliency_heads}, expected some of 0 to {model.num_heads - 1}"
+            )
+        self.name, self.saliency_heads = name, saliency_heads
+        self.layer = block_index(min(9, model.depth - 1) if layer is None else layer, model.depth, name)
+        self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
+        self.batch_size = batch_size
+        self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
+        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
+        self.device = _device(device)
+        self.precision = supported_precision(precision, self.device.type)
+        self.model = model.to(self.device).eval().requires_grad_(False)
+
+    def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
+        """Compute the features of images.
+
+        Images are resized to a square without keeping their aspect ratio, as in the paper.
+
+        Args:
+            images: RGB images (H, W, 3) of any sizes, uint8 or float in [0, 1].
+
+        Returns:
+            One FeatureMap per image, float32, on the backbone's device. The saliency is the CLS attention averaged over
+            the saliency heads, min-max normalised to [0, 1].
+
+        Raises:
+            InputError: For other image types, shapes or values.
+        """
+        features = []
+        for first in range(0, len(images), self.batch_size):
+            batch = prepare_images(images[first : first + self.batch_size], self.image_size, first)
+            features += self._extract(batch.to(self.device))
+        return features
+
+    def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
+        with torch.inference_mode(), autocast(self.device.type, self.precision):
+            tokens = self.model.extract(normalize(batch, self.mean, self.std), self.layer, self.facet)
+            saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
+            low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
+            saliency = (saliency - low) / (high - low).clamp_min(1e-12)
+            grids = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
+        # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
+        # batch in memory.
+        return [FeatureMap(*(x.to(torch.float32, copy=True) for x in one)) for one in zip(*grids)]
+
+
+def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:
+    """Stack images into a batch of squares with values in [0, 1].
+
+    Args:
+        images: RGB images (H, W, 3), uint8 or float in [0, 1].
+        size: Side of the squares in pixels; images are resized bilinearly with anti-aliasing.
+        first: Index of the first image in error messages.
+
+    Raises:
+        InputError: For other image types, shapes or values.
+    """
+    prepared = []
+    for index, image in enumerate(images, first):
+        try:
+            # Copied, because torch does not accept read-only arrays and negative strides.
+            image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"image {index}: not an array of numbers ({type(image).__name__})") from error
+        if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+            raise InputError(f"image {index}: expected shape (H, W, 3), got {tuple(image.shape)}")
+        if image.dtype == torch.uint8:
+            image = image.to(torch.float32) / 255
+        elif image.is_floating_point():
+            image = image.to(torch.float32)
+            if not bool(((image >= 0) & (image <= 1)).all()):  # false for NaN too
+                low, high = image.min().item(), image.max().item()
+                raise InputError(f"image {index}: expected floats in [0, 1], got {low:g} to {high:g}")
+        else:
+            raise InputError(f"image {index}: expected uint8 or float in [0, 1], got {image.dtype}")
+        image = image.permute(2, 0, 1)[None]
+        if image.shape[2:] != (size, size):
+            image = F.interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=True)
+        prepared.append(image)
+    return torch.cat(prepared)
+
+
+def normalize(
+    images: Float[Tensor, "b 3 h w"], mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
+) -> Float[Tensor, "b 3 h w"]:
+    """Subtract the mean and divide by the standard deviation, per channel."""
+    mean, std = (images.new_tensor(x).view(3, 1, 1) for x in (mean, std))
+    return (images - mean) / std
+
+
+def _device(device: str | torch.device | None) -> torch.device:
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error
