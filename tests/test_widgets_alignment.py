@@ -1,4 +1,4 @@
-"""The RANSAC and outlier widgets: their sentences say what the library finds at the sliders' values."""
+"""The captions of the widgets on alignment agree with the library at the values of the sliders."""
 
 import numpy as np
 import pytest
@@ -35,53 +35,53 @@ def build(points, truth=TURN):
     return ransac_settings(images, tuple(pixels), points, truth)
 
 
-def test_the_sentence_is_what_ransac_finds():
+def test_the_caption_agrees_with_ransac():
     points = matched_points()
     widget = build(points)
-    for trials, threshold, draw in ((1000, 0.2, 0), (5, 0.1, 3), (100, 0.9, 7)):
+    for trials, threshold, seed in ((1000, 0.2, 0), (5, 0.1, 3), (100, 0.9, 7)):
         widget.controls["trials"].value = trials
         widget.controls["threshold"].value = threshold
-        widget.controls["draw"].value = draw
-        sim3, inliers = ransac(*points, threshold, trials, seed=draw, scale_range=(0.2, 5))
-        assert f"{inliers.sum()} of 40 matches are inliers; scale {sim3.scale:.2f}" in widget.sentence.value
-        assert f"{rotation_error(sim3.R, TURN):.0f}° from the truth" in widget.sentence.value
+        widget.controls["seed"].value = seed
+        sim3, inliers = ransac(*points, threshold, trials, seed=seed, scale_range=(0.2, 5))
+        assert f"{inliers.sum()} of 40 matches are inliers; scale {sim3.scale:.2f}" in widget.caption.value
+        assert f"rotation error {rotation_error(sim3.R, TURN):.0f}°" in widget.caption.value
 
 
 def test_every_control_redraws_the_inliers():
     widget = build(matched_points(outliers=20, noise=0.1))
-    for name, position in {"threshold": 0.04, "trials": 1, "draw": 4}.items():
+    for name, position in {"threshold": 0.04, "trials": 1, "seed": 4}.items():
         before = widget.picture.value
         widget.controls[name].value = position
         assert widget.picture.value != before, name
 
 
-def test_without_a_truth_it_claims_no_error():
-    assert "truth" not in build(matched_points(), truth=None).sentence.value
+def test_without_ground_truth_there_is_no_error():
+    assert "error" not in build(matched_points(), truth=None).caption.value
 
 
-def test_points_on_a_line_give_a_sentence_instead_of_a_traceback():
+def test_points_on_a_line_give_a_caption_instead_of_a_traceback():
     line = np.outer(np.arange(8.0), [1, 2, 3])
-    assert build((line, line)).sentence.value.startswith("No fit: ")
+    assert build((line, line)).caption.value.startswith("No fit: ")
 
 
-def test_three_matches_are_too_few():
+def test_three_matches_are_an_input_error():
     with pytest.raises(InputError, match="at least four"):
         build(tuple(part[:3] for part in matched_points()))
 
 
-def test_the_outlier_sentence_is_what_least_squares_finds():
+def test_the_caption_agrees_with_least_squares():
     source = np.random.default_rng(2).normal(size=(9, 3))
     widget = one_outlier(source, source)
-    assert "turns by 0.0°" in widget.sentence.value
+    assert "rotation changes by 0.0°" in widget.caption.value
     widget.controls["distance"].value = 3.0
     target = source.copy()
     target[-1, 0] += 3.0
     fit = umeyama(source, target)
-    assert f"turns by {rotation_error(fit.R, np.eye(3)):.1f}°" in widget.sentence.value
-    assert f"to {fit.scale:.2f}" in widget.sentence.value
+    assert f"rotation changes by {rotation_error(fit.R, np.eye(3)):.1f}°" in widget.caption.value
+    assert f"to {fit.scale:.2f}" in widget.caption.value
 
 
-def test_moving_the_outlier_moves_the_picture():
+def test_moving_the_outlier_redraws_the_figure():
     source = np.random.default_rng(2).normal(size=(9, 3))
     widget = one_outlier(source, source)
     before = widget.picture.value

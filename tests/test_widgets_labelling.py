@@ -1,8 +1,7 @@
-"""The labelling widget without a browser: clicks arrive as its messages, and all it does is on disk at once."""
+"""The labelling widget without a browser: clicks are sent as messages, and every change is on disk at once."""
 
 import json
 import re
-import time
 
 import numpy as np
 import pytest
@@ -20,15 +19,15 @@ pytest.importorskip("anywidget", reason="the labelling widget needs anywidget: p
 
 from zsp_lite.widgets import cloud_view  # noqa: E402
 from zsp_lite.widgets.cloud_view import ViewBox, point_under, subsample  # noqa: E402
+from zsp_lite.widgets.examples import label_poses as label_example  # noqa: E402
 from zsp_lite.widgets.labelling import label_poses  # noqa: E402
-from zsp_lite.widgets.latency import LIMIT, build_example, measure  # noqa: E402
 
 TURN = Rotation.random(random_state=4).as_matrix()
 
 
 @pytest.fixture
 def root(tmp_path):
-    """The cloud of a is that of the best, turned, larger and elsewhere; b is another one."""
+    """Three sequences: the cloud of a is that of best after a similarity transform, the cloud of b is shifted."""
     sequences = [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")]
     points = np.random.default_rng(0).normal(size=(9000, 3)) * (1, 0.6, 0.4)
     colours = np.full(points.shape, 90, np.uint8)
@@ -44,23 +43,23 @@ def labelling(root):
 
 
 def click(box, which, point):
-    """What the browser sends when the canvas is clicked where `point` is drawn, from a side where it is in front."""
+    """Send the message of a click on `point`, from a viewpoint where the point is in front."""
     canvas = box.views[which]
-    away = -canvas._box.place(point)
-    away /= np.linalg.norm(away)
-    right = np.cross(away, np.roll(away, 1))
+    forward = -canvas._box.to_view(point)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.roll(forward, 1))
     right /= np.linalg.norm(right)
-    view = np.array([right, np.cross(away, right), away])
-    at = (view @ canvas._box.place(point))[:2].tolist()
-    message = {"kind": "click", "at": at, "view": view.ravel().tolist(), "reach": 0.05}
-    canvas.widget._handle_custom_msg(message, [])
+    view = np.array([right, np.cross(forward, right), forward])
+    at = (view @ canvas._box.to_view(point))[:2].tolist()
+    content = {"kind": "click", "at": at, "view": view.ravel().tolist(), "reach": 0.05}
+    canvas.widget._handle_custom_msg(content, [])
 
 
 def corners(labelling, sequence, n=5):
-    """Points far out on a cloud, the same ones on best and a."""
+    """Extreme points of a cloud, corresponding ones on best and a."""
     best = labelling.cloud("best")[0]
     directions = np.random.default_rng(1).normal(size=(60, 3))
-    indices = dict.fromkeys((best @ directions.T).argmax(axis=0))  # each once
+    indices = dict.fromkeys((best @ directions.T).argmax(axis=0))
     return labelling.cloud(sequence)[0][list(indices)[:n]]
 
 
@@ -69,7 +68,7 @@ def click_all(box, labelling, which, sequence, n=5):
         click(box, which, point)
 
 
-def said(box):
+def message(box):
     return re.sub("<[^>]*>", "", box.message.value)
 
 
@@ -79,9 +78,9 @@ def table(box, name):
     return [[re.sub("<[^>]*>", "", cell) for cell in re.findall("<td.*?</td>", row)] for row in rows]
 
 
-def test_clicks_make_keypoints_and_an_accepted_label(labelling):
+def test_clicks_give_keypoints_and_an_accepted_label(labelling):
     box = label_poses(labelling)
-    assert box.controls["sequence"].value == "best" and "4 more at least" in said(box)
+    assert box.controls["sequence"].value == "best" and "at least 4 more" in message(box)
     box.name.value = "left arm"
     click_all(box, labelling, "reference", "best")
     assert labelling.names[0] == "left arm" and len(labelling.names) == 5
@@ -90,30 +89,30 @@ def test_clicks_make_keypoints_and_an_accepted_label(labelling):
     assert box.controls["sequence"].value == "a"
     click_all(box, labelling, "sequence", "a")
     np.testing.assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
-    assert box.controls["overlay"].value and "residual 0.0 %" in said(box)
+    assert box.controls["overlay"].value and "residual 0.0 %" in message(box)
     assert [row[3] for row in table(box, "keypoints")] == ["0.0 %"] * 5
     box.buttons["accept"].click()
     assert rotation_error(read_labels(labelling.root, "chair")["a"].trans[:3, :3], TURN) < 0.01
-    assert said(box) == "Written: class_labels/chair/a.json. Now b."
+    assert message(box) == "Written: class_labels/chair/a.json. Now b."
     assert [row[1:] for row in table(box, "progress")] == [
         ["best", "● reference", "5", ""], ["a", "✓ accepted", "5", "0.0 %"], ["b", "○ open", "0", ""],
     ]  # fmt: skip
 
 
-def test_a_restart_goes_on_where_it_stopped(root, labelling):
+def test_a_new_widget_continues_an_earlier_session(root, labelling):
     box = label_poses(labelling)
     click_all(box, labelling, "reference", "best")
     box.buttons["next"].click()
     click_all(box, labelling, "sequence", "a", 2)
     again = Labelling(root, "chair")
     box = label_poses(again)
-    assert said(box) == "What was picked before is here again." and box.controls["sequence"].value == "a"
+    assert message(box) == "The earlier keypoints are loaded." and box.controls["sequence"].value == "a"
     assert len(box.views["sequence"].widget.marks) == 2 and len(box.views["reference"].widget.marks) == 5
-    box.buttons["undo"].click()  # what came before the restart can be taken back pick by pick
+    box.buttons["undo"].click()  # earlier picks can be undone one by one
     assert len(Labelling(root, "chair").picks("a")) == 1
 
 
-def test_undo_takes_back_picks_moves_and_redo_itself(labelling):
+def test_undo_reverts_picks_moves_and_redo(labelling):
     box = label_poses(labelling)
     click_all(box, labelling, "reference", "best")
     box.controls["keypoint"].value = 1
@@ -128,7 +127,7 @@ def test_undo_takes_back_picks_moves_and_redo_itself(labelling):
     box.controls["keypoint"].value = 2
     click(box, "sequence", corners(labelling, "a", 9)[8])
     assert not np.array_equal(labelling.picks("a")[2], before[2]) and box.controls["keypoint"].value == -1
-    assert said(box) == "Keypoint 3, keypoint 3, moved on a."
+    assert message(box) == "Keypoint 3, keypoint 3, moved on a."
     box.buttons["undo"].click()
     np.testing.assert_array_equal(labelling.picks("a"), before)
     box.buttons["redo"].click()
@@ -137,18 +136,18 @@ def test_undo_takes_back_picks_moves_and_redo_itself(labelling):
     np.testing.assert_array_equal(labelling.picks("a"), before)
 
 
-def test_the_guess_is_put_on_the_cloud_and_single_picks_are_corrected(labelling, monkeypatch):
+def test_a_guess_gives_keypoints_which_can_be_corrected(labelling, monkeypatch):
     monkeypatch.setattr(
         "zsp_lite.labelling.guess.guess_alignment",
         lambda *_: (Sim3(1.3, TURN, np.full(3, 2.0) + 0.001), 0.8),
     )
     box = label_poses(labelling, backbone=object())
     box.buttons["guess"].click()
-    assert said(box) == "Not done: a guess needs 4 keypoints on the reference, and another sequence chosen"
+    assert message(box) == "Not done: a guess needs 4 keypoints on the reference, and another sequence chosen"
     click_all(box, labelling, "reference", "best")
     box.buttons["next"].click()
     box.buttons["guess"].click()
-    assert "80% sure" in said(box) and box.controls["overlay"].value
+    assert "confidence 80%" in message(box) and box.controls["overlay"].value
     np.testing.assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
     box.controls["keypoint"].value = 3
     assert [mark["chosen"] for mark in box.views["sequence"].widget.marks] == [False, False, False, True, False]
@@ -159,20 +158,20 @@ def test_the_guess_is_put_on_the_cloud_and_single_picks_are_corrected(labelling,
     assert len(labelling.picks("a")) == 0
 
 
-def test_skip_and_next_go_round_the_open_ones(labelling):
+def test_skip_and_next_go_through_the_open_sequences(labelling):
     box = label_poses(labelling)
     box.buttons["next"].click()
-    assert box.controls["sequence"].value == "best" and "on the reference first" in said(box)
+    assert box.controls["sequence"].value == "best" and "on the reference first" in message(box)
     click_all(box, labelling, "reference", "best", 4)
     box.buttons["skip"].click()
-    assert "cannot be skipped" in said(box)
+    assert "cannot be skipped" in message(box)
     box.buttons["next"].click()
     box.buttons["next"].click()
     assert box.controls["sequence"].value == "b"
     box.buttons["skip"].click()
-    assert said(box) == "b is left out. Now a." and table(box, "progress")[2][2] == "– skipped"
+    assert message(box) == "b is skipped. Now a." and table(box, "progress")[2][2] == "– skipped"
     box.buttons["skip"].click()
-    assert said(box) == "a is left out. No sequence is open any more."
+    assert message(box) == "a is skipped. No sequence is open."
 
 
 def test_the_slider_chooses_a_point_by_keyboard(labelling):
@@ -180,38 +179,38 @@ def test_the_slider_chooses_a_point_by_keyboard(labelling):
     box.controls["point"].value = 1234
     cursor = np.array(box.views["reference"].widget.cursor)
     box.buttons["pick"].click()
-    np.testing.assert_allclose(box.views["reference"]._box.place(labelling.picks("best")[0]), cursor)
+    np.testing.assert_allclose(box.views["reference"]._box.to_view(labelling.picks("best")[0]), cursor)
 
 
-def test_what_is_refused_is_one_line_in_the_widget(labelling):
+def test_errors_are_one_line_in_the_widget(labelling):
     box = label_poses(labelling)
     box.views["reference"].widget._handle_custom_msg(
         {"kind": "click", "at": [5.0, 5.0], "view": np.eye(3).ravel().tolist(), "reach": 0.05}, []
     )
-    assert said(box) == "No point of the cloud is there." and len(labelling.names) == 0
+    assert message(box) == "There is no point of the cloud." and len(labelling.names) == 0
     click_all(box, labelling, "reference", "best", 3)
     box.controls["sequence"].value = "a"
     click(box, "sequence", corners(labelling, "a")[0])
-    assert said(box) == "Not done: the reference has 3 keypoints, expected 4 first"
+    assert message(box) == "Not done: the reference has 3 keypoints, expected 4 first"
     box.controls["sequence"].value = "best"
     click(box, "reference", corners(labelling, "best")[3])
     box.buttons["next"].click()
     click(box, "sequence", corners(labelling, "a")[0])
     click(box, "sequence", corners(labelling, "a")[0])
-    assert said(box) == "Not done: keypoint 1, keypoint 1, is at this very point already"
+    assert message(box) == "Not done: keypoint 1, keypoint 1, is at this point already"
     labelling.put("a", np.outer(np.arange(4), (1, 2, 3)))
     box.controls["overlay"].value = True
-    assert "collinear" in said(box) and not box.controls["overlay"].value
+    assert "collinear" in message(box) and not box.controls["overlay"].value
     assert table(box, "progress")[1][4] == "see above"
     box.buttons["accept"].click()
-    assert "collinear" in said(box) and read_labels(labelling.root, "chair") == {}
+    assert "collinear" in message(box) and read_labels(labelling.root, "chair") == {}
     box.controls["sequence"].value = "best"
     click(box, "reference", corners(labelling, "best")[4])
-    assert "in use on a; clear those first" in said(box) and len(labelling.names) == 4
+    assert "in use on a; clear those first" in message(box) and len(labelling.names) == 4
 
 
-@pytest.mark.parametrize("content", ["broken", "one place"])
-def test_a_cloud_that_cannot_be_shown_is_said_and_the_others_go_on(root, content):
+@pytest.mark.parametrize("content", ["broken", "one point"])
+def test_a_cloud_that_cannot_be_shown_is_an_error_and_others_still_work(root, content):
     labelling = Labelling(root, "chair")
     box = label_poses(labelling)
     click_all(box, labelling, "reference", "best", 4)
@@ -220,13 +219,13 @@ def test_a_cloud_that_cannot_be_shown_is_said_and_the_others_go_on(root, content
     else:
         labelling._clouds["a"] = np.ones((9, 3)), np.zeros((9, 3), np.uint8)
     box.buttons["next"].click()
-    assert said(box).startswith("Not done: ") and box.controls["sequence"].value == "a"
+    assert message(box).startswith("Not done: ") and box.controls["sequence"].value == "a"
     assert box.views["sequence"].widget.points == b""
     box.buttons["next"].click()
-    assert said(box) == "Now b." and len(box.views["sequence"].widget.points) > 0
+    assert message(box) == "Now b." and len(box.views["sequence"].widget.points) > 0
 
 
-def test_a_label_without_picks_can_be_looked_at(root):
+def test_an_imported_label_without_keypoints_can_be_shown(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "best", "best"))
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "best"))
     box = label_poses(Labelling(root, "chair"))
@@ -240,12 +239,12 @@ def test_a_label_without_picks_can_be_looked_at(root):
     assert json.loads((root / "class_labels/chair/b.json").read_text())["seq"] == "b"
 
 
-def test_it_answers_quickly():
-    taken = measure(build_example("label_poses"), 3, clock=time.process_time)
-    assert taken.keys() == {"sequence", "keypoint", "overlay", "point"} and max(taken.values()) < LIMIT
+def test_the_example_has_two_sequences_with_keypoints():
+    box = label_example()
+    assert [row[3] for row in table(box, "progress")[:2]] == ["4", "4"]
 
 
-def test_the_front_is_picked_and_the_nearest_of_it():
+def test_a_click_selects_the_nearest_of_the_front_points():
     points = np.array([(0, 0, -1.0), (0.02, 0, -0.95), (0.01, 0, 0.9), (0.5, 0, 0)])
     assert point_under(points, np.eye(3), np.array([0.011, 0]), 0.05) == 1
     behind = np.diag([-1.0, 1, -1])
@@ -253,7 +252,7 @@ def test_the_front_is_picked_and_the_nearest_of_it():
     assert point_under(points, np.eye(3), np.array([-0.4, 0]), 0.05) is None
 
 
-def test_thinning_is_deterministic_and_neighbours_follow_each_other():
+def test_subsampling_is_deterministic_and_keeps_neighbours_together():
     points = np.random.default_rng(3).uniform(size=(9000, 3))
     kept = subsample(points)
     assert len(kept) == 6000 == len(np.unique(kept))
@@ -263,20 +262,20 @@ def test_thinning_is_deterministic_and_neighbours_follow_each_other():
     assert len(subsample(points[:5])) == 5
 
 
-def test_strays_do_not_shrink_the_object_and_odd_clouds_are_named():
+def test_outliers_do_not_change_the_scale_and_bad_clouds_are_input_errors():
     points = np.random.default_rng(3).uniform(size=(1000, 3))
     points[0] = 1000
     assert ViewBox.around(points).radius < 1
     for bad, message in (
         (np.zeros((0, 3)), "empty"),
         (np.full((4, 3), np.nan), "not finite"),
-        (np.ones((4, 3)), "single"),
+        (np.ones((4, 3)), "no extent"),
     ):
         with pytest.raises(InputError, match=message):
             ViewBox.around(bad)
 
 
-def test_without_anywidget_it_says_what_to_install(labelling, monkeypatch):
+def test_without_anywidget_the_error_has_the_command_that_installs_it(labelling, monkeypatch):
     cloud_view._cloud_widget.cache_clear()
     monkeypatch.setitem(__import__("sys").modules, "anywidget", None)
     with pytest.raises(InputError, match="pip install anywidget"):

@@ -1,21 +1,21 @@
-"""The widget that turns a box into a mask."""
+"""The widget that segments the object in a box."""
 
-from zsp_lite.widgets.masks import example_box_to_mask
+from zsp_lite.widgets.examples import box_to_mask
 
 
 def test_the_mask_follows_the_box():
-    widget = example_box_to_mask()
-    first, said = widget.picture.value, widget.sentence.value
-    assert "IoU" in said
+    widget = box_to_mask()
+    first, text = widget.picture.value, widget.caption.value
+    assert "IoU" in text
     widget.controls["right"].value -= 40
-    assert widget.picture.value != first and widget.sentence.value != said
+    assert widget.picture.value != first and widget.caption.value != text
     widget.controls["right"].value += 40
-    assert widget.sentence.value == said
+    assert widget.caption.value == text
 
 
-def test_an_empty_box_is_said_in_the_widget():
-    widget = example_box_to_mask()
+def test_an_empty_box_is_reported_in_the_caption():
+    widget = box_to_mask()
     bottom = widget.controls["bottom"].value
     widget.controls["bottom"].value = 4
-    assert "the box is empty" in widget.sentence.value
+    assert "the box is empty" in widget.caption.value
     widget.controls["bottom"].value = bottom

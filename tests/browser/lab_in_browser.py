@@ -213,7 +213,7 @@ def _pick_outermost(page, cloud: str, first: int = 0) -> None:
     canvas = page.locator(f".zsp-cloud-{cloud} canvas")
     canvas.scroll_into_view_if_needed()
     page.wait_for_function("name => +document.querySelector(`.zsp-cloud-${name} canvas`).dataset.points > 0", arg=cloud)
-    places = canvas.evaluate("c => [...Array(+c.dataset.points).keys()].map(i => c.place(i))")
+    places = canvas.evaluate("c => [...Array(+c.dataset.points).keys()].map(i => c.pointOnCanvas(i))")
     across, down = (lambda place: place[0]), (lambda place: place[1])
     ends = [min(places, key=across), max(places, key=across), min(places, key=down), max(places, key=down)]
     for number, (x, y) in list(enumerate(ends, 1))[first:]:

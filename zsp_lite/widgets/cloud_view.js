@@ -1,9 +1,9 @@
-// A point cloud on a plain canvas: drag turns it, the wheel zooms, shift and drag moves it, a click is sent to Python.
-// No WebGL and no network. Lengths are view units: the cloud fills the ball of radius 1; depth grows away from the eye.
+// A point cloud on a plain canvas: drag rotates, the wheel zooms, shift and drag pans, a click is sent to Python.
+// No WebGL and no network. Lengths are in view units: the cloud fills the unit ball; depth increases away from the viewer.
 
-const FILL = 0.46; // of the canvas' side, for one view unit
-const SPOT = 0.034; // side of a point, in view units
-const SLACK = 4; // pixels that the hand may tremble within a click
+const FILL = 0.46; // length of a view unit, as a fraction of the side of the canvas
+const SPOT = 0.034; // diameter of a point, in view units
+const SLACK = 4; // largest movement within a click, in pixels
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
@@ -11,8 +11,8 @@ const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const times = (a, b) =>
   [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
 
-// The view after a drag by dx, dy radians: about the screen's upright axis, then about its level one.
-function turned(view, dx, dy) {
+// Rotate the view by dx radians about the vertical axis of the screen, then by dy about the horizontal one.
+function rotated(view, dx, dy) {
   const [c, s, d, t] = [Math.cos(dx), Math.sin(dx), Math.cos(dy), Math.sin(dy)];
   return times(times([1, 0, 0, 0, d, -t, 0, t, d], [c, 0, -s, 0, 1, 0, s, 0, c]), view);
 }
@@ -29,14 +29,14 @@ function render({ model, el }) {
   const pen = canvas.getContext("2d");
   let points, colours, crosses, view, zoom, pan, side, unit, scheduled = false, held = null;
 
-  const place = (p) => {
+  const project = (p) => {
     const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
     return [side / 2 + pan[0] + at[0] * unit, side / 2 + pan[1] + at[1] * unit, at[2]];
   };
-  // For whoever drives a browser: where a drawn point is on the canvas, in CSS pixels, and how many there are.
-  canvas.place = (index) => place(points.subarray(3 * index, 3 * index + 3)).slice(0, 2);
+  // For browser tests: the position of a point on the canvas in CSS pixels, and the number of points.
+  canvas.pointOnCanvas = (index) => project(points.subarray(3 * index, 3 * index + 3)).slice(0, 2);
 
-  function take() {
+  function updatePoints() {
     points = floats(model.get("points"));
     colours = bytes(model.get("colours"));
     crosses = bytes(model.get("crosses"));
@@ -44,7 +44,7 @@ function render({ model, el }) {
     schedule();
   }
 
-  function aim() {
+  function resetView() {
     view = model.get("view");
     [zoom, pan] = [1, [0, 0]];
     schedule();
@@ -67,20 +67,20 @@ function render({ model, el }) {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     for (const mark of model.get("marks")) drawMark(mark, depth, n, ratio);
     const cursor = model.get("cursor");
-    if (cursor.length) drawCursor(place(cursor));
+    if (cursor.length) drawCursor(project(cursor));
     canvas.dataset.marks = model.get("marks").length;
     canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
-  // The points, nearest in front, paler with depth; gives the depth of every pixel.
+  // Draw the points with hidden ones removed, paler with depth; return the depth of every pixel.
   function spots(n, ratio) {
     const depth = new Float32Array(n * n).fill(Infinity);
     const picture = pen.createImageData(n, n);
     const pixels = new Uint32Array(picture.data.buffer).fill(0xffffffff);
     const reach = Math.max(1, Math.round((SPOT * unit * ratio) / 2));
     for (let i = 0; i < points.length; i += 3) {
-      const [x, y, z] = place(points.subarray(i, i + 3));
+      const [x, y, z] = project(points.subarray(i, i + 3));
       const [column, row] = [Math.round(x * ratio), Math.round(y * ratio)];
       const pale = clamp(0.15 + 0.3 * z, 0, 0.45);
       const [r, g, b] = [0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]));
@@ -99,9 +99,9 @@ function render({ model, el }) {
     return depth;
   }
 
-  // A number in a disc beside the point that it names; broken outline where the cloud hides the point.
+  // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
   function drawMark({ at, label, chosen }, depth, n, ratio) {
-    const [x, y, z] = place(at);
+    const [x, y, z] = project(at);
     const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
     const hidden = z > depth[pixel] + 0.12;
     const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
@@ -144,7 +144,7 @@ function render({ model, el }) {
     }
   }
 
-  function settle() {
+  function sendView() {
     model.set("view", view);
     model.save_changes();
   }
@@ -168,20 +168,20 @@ function render({ model, el }) {
     if (!held.moved && Math.hypot(dx, dy) < SLACK) return;
     held = { x: event.offsetX, y: event.offsetY, moved: true };
     if (event.shiftKey) pan = [pan[0] + dx, pan[1] + dy];
-    else view = turned(view, (2.4 * dx) / side, (2.4 * dy) / side);
+    else view = rotated(view, (2.4 * dx) / side, (2.4 * dy) / side);
     schedule();
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!held) return;
     const still = !held.moved;
     held = null;
-    if (!still) return settle();
+    if (!still) return sendView();
     const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
     model.send({ kind: "click", at, view, reach: 9 / unit });
   });
   canvas.addEventListener("pointercancel", () => (held = null));
   canvas.addEventListener("dblclick", (event) => event.preventDefault());
-  // Only after the cloud was touched: else it would catch the page as it is scrolled past.
+  // Zoom only if the canvas has the focus, so that the page still scrolls.
   canvas.addEventListener("wheel", (event) => {
     if (document.activeElement !== canvas) return;
     event.preventDefault();
@@ -190,8 +190,8 @@ function render({ model, el }) {
   canvas.addEventListener("keydown", (event) => {
     const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (turn) {
-      view = turned(view, 0.12 * turn[0], 0.12 * turn[1]);
-      settle();
+      view = rotated(view, 0.12 * turn[0], 0.12 * turn[1]);
+      sendView();
     } else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2, side / 2, side / 2);
     else return;
     event.preventDefault();
@@ -199,12 +199,12 @@ function render({ model, el }) {
     schedule();
   });
 
-  model.on("change:points change:colours change:crosses", take);
+  model.on("change:points change:colours change:crosses", updatePoints);
   model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
-  model.on("change:aimed", aim);
+  model.on("change:view_resets", resetView);
   model.on("change:marks change:cursor change:alt change:side", schedule);
-  take();
-  aim();
+  updatePoints();
+  resetView();
 }
 
 export default { render };

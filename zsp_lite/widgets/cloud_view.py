@@ -1,6 +1,6 @@
-"""A point cloud that can be turned by hand and clicked on, in any Jupyter: a plain canvas, no WebGL, no network.
+"""A point cloud that the user can rotate and click, on a plain canvas without WebGL or network.
 
-The browser draws and says where was clicked (`cloud_view.js`); which point that is, is found here, on the full cloud.
+The browser draws the points and sends clicks (`cloud_view.js`). Python finds the clicked point in the full cloud.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from zsp_lite.errors import InputError
 if TYPE_CHECKING:
     from anywidget import AnyWidget
 
-SHOWN = 6000  # points drawn: more are slow in the browser, and nothing more is seen
-_FRONT = 0.15  # what lies deeper than this behind the nearest point under the pointer belongs to the back; view units
+MAX_POINTS = 6000  # points drawn; more are slow in the browser
+_DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
 
 _STYLE = """
 .zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }
@@ -28,35 +28,36 @@ _STYLE = """
 
 @dataclass(frozen=True, eq=False)
 class ViewBox:
-    """Where a cloud's view units are in its world: the cloud fills the ball of radius 1 about `centre`."""
+    """Map from world to view units: the ball of `radius` around `centre` becomes the unit ball."""
 
     centre: Float[np.ndarray, "3"]
     radius: float
 
     @classmethod
     def around(cls, points: Real[np.ndarray, "n 3"]) -> "ViewBox":
-        """The box of a cloud; strays (the outermost percent along each axis) count for nothing.
+        """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers.
 
-        Raises InputError on an empty cloud, values that are not finite, and a cloud that is a single place.
+        Raises:
+            InputError: If the cloud is empty, not finite, or a single point.
         """
         points = np.asarray(points, dtype=np.float64)
         if len(points) == 0 or not np.isfinite(points).all():
-            raise InputError(f"point cloud of shape {points.shape} is empty or not finite, expected points to show")
+            raise InputError(f"point cloud of shape {points.shape} is empty or not finite, expected finite points")
         low, high = np.percentile(points, [1, 99], axis=0)
         radius = float(np.linalg.norm(high - low)) / 2
         if radius < 1e-12:
-            raise InputError(f"point cloud of {len(points)} points is a single place, expected an object")
+            raise InputError(f"point cloud of {len(points)} equal points has no extent, expected an object")
         return cls((low + high) / 2, radius)
 
-    def place(self, points: Real[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """World points in view units."""
+    def to_view(self, points: Real[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Map world points to view units."""
         return (np.asarray(points, dtype=np.float64) - self.centre) / self.radius
 
 
-def subsample(points: Real[np.ndarray, "n 3"], most: int = SHOWN) -> Int[np.ndarray, " m"]:
-    """Indices of at most `most` points, always the same ones, ordered so that neighbours follow each other.
+def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
+    """Return the indices of at most `most` points; the same points give the same indices.
 
-    The order is that of Morton's curve: a slider that runs along it walks over the object.
+    The indices follow the Morton (Z-order) curve, so that neighbours on a slider are neighbours on the object.
     """
     points = np.asarray(points, dtype=np.float64)
     kept = np.arange(len(points))
@@ -71,93 +72,117 @@ def subsample(points: Real[np.ndarray, "n 3"], most: int = SHOWN) -> Int[np.ndar
 def point_under(
     points: Float[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"], at: Real[np.ndarray, "2"], reach: float
 ) -> int | None:
-    """Which of the points (in view units) was clicked on: of those within `reach` on the screen and not far behind the
-    foremost of them, the nearest. None where there is none.
+    """Return the index of the clicked point, or None.
 
-    view: rows are the screen's directions right, down and away.  at: (right, down) from the middle, in view units.
+    Of the points within `reach` of the click on the screen, those far behind the front one are ignored; the nearest of
+    the others is returned.
+
+    Args:
+        points: Points in view units.
+        view: World-to-screen rotation; its rows are the directions right, down and forward.
+        at: Click (right, down) relative to the centre of the canvas, in view units.
+        reach: Largest distance on the screen, in view units.
     """
-    seen = points @ view.T
-    distance = np.hypot(*(seen[:, :2] - at).T)
+    on_screen = points @ view.T
+    distance = np.hypot(*(on_screen[:, :2] - at).T)
     near = np.flatnonzero(distance <= reach)
     if not len(near):
         return None
-    near = near[seen[near, 2] <= seen[near, 2].min() + _FRONT]
+    near = near[on_screen[near, 2] <= on_screen[near, 2].min() + _DEPTH_TOLERANCE]
     return int(near[distance[near].argmin()])
 
 
 class CloudView:
-    """One canvas. `widget` is what is shown; `on_pick` is called with the world point that was clicked on, or None."""
+    """A canvas with one point cloud; `widget` is its Jupyter widget."""
 
     def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any], side: int = 400):
-        """name: a CSS class, for style sheets and browser tests.  side: of the canvas, in CSS pixels."""
+        """Create an empty canvas.
+
+        Args:
+            name: CSS class of the canvas.
+            on_pick: Called after a click with the clicked world point, or None if there is no point.
+            side: Width and height in CSS pixels.
+        """
         self.widget = _cloud_widget()(side=side)
         self.widget.add_class(name)
         self.widget.on_msg(self._receive)
         self.on_pick = on_pick
         self._cloud: np.ndarray = np.zeros((0, 3))
-        self._placed: np.ndarray = self._cloud
+        self._in_view: np.ndarray = self._cloud
         self._box: ViewBox | None = None
 
     def show(
         self, points: Real[np.ndarray, "n 3"], colours: UInt8[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"] | None,
         alt: str, overlay: tuple[Real[np.ndarray, "m 3"], tuple[int, int, int], tuple[int, int, int]] | None = None,
     ) -> None:  # fmt: skip
-        """Show a cloud in its colours; with `overlay`, another one too.
+        """Show a point cloud, optionally with a second one.
 
-        view: as in `point_under`, None to leave it.  overlay: the other cloud (drawn with crosses), its colour, and the
-        one of the cloud itself (drawn with discs). Raises InputError as `ViewBox.around`.
+        Args:
+            points: World points.
+            colours: Their colours.
+            view: World-to-screen rotation, see `point_under`; None keeps the present one.
+            alt: Description for screen readers.
+            overlay: World points of a second cloud (drawn as crosses), its colour, and the colour of the first cloud
+                (drawn as discs).
+
+        Raises:
+            InputError: As for `ViewBox.around`.
         """
         self._box = box = ViewBox.around(points)
-        self._cloud, self._placed = np.asarray(points, dtype=np.float64), box.place(points)
-        kept = subsample(points, SHOWN if overlay is None else SHOWN // 2)
-        drawn, paint = self._placed[kept], colours[kept]
+        self._cloud, self._in_view = np.asarray(points, dtype=np.float64), box.to_view(points)
+        kept = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
+        drawn, drawn_colours = self._in_view[kept], colours[kept]
         crosses = np.zeros(len(kept), np.uint8)
         if overlay is not None:
-            other = box.place(overlay[0])[subsample(overlay[0], SHOWN // 2)]
-            paint = np.repeat(np.array([overlay[2], overlay[1]], np.uint8), [len(kept), len(other)], axis=0)
+            other = box.to_view(overlay[0])[subsample(overlay[0], MAX_POINTS // 2)]
+            drawn_colours = np.repeat(np.array([overlay[2], overlay[1]], np.uint8), [len(kept), len(other)], axis=0)
             drawn, crosses = np.concatenate([drawn, other]), np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
         with self.widget.hold_sync():
             self.widget.points = drawn.astype(np.float32).tobytes()
-            self.widget.colours = np.ascontiguousarray(paint, dtype=np.uint8).tobytes()
+            self.widget.colours = np.ascontiguousarray(drawn_colours, dtype=np.uint8).tobytes()
             self.widget.crosses = crosses.tobytes()
             self.widget.alt = alt
             if view is not None:
                 self.widget.view = np.asarray(view, dtype=np.float64).ravel().tolist()
-                self.widget.aimed += 1
+                self.widget.view_resets += 1
 
     def clear(self, alt: str) -> None:
-        """Show nothing, with the reason in `alt`."""
-        self._box, self._cloud, self._placed = None, np.zeros((0, 3)), np.zeros((0, 3))
+        """Show an empty canvas; `alt` gives the reason."""
+        self._box, self._cloud, self._in_view = None, np.zeros((0, 3)), np.zeros((0, 3))
         with self.widget.hold_sync():
             self.widget.points = self.widget.colours = self.widget.crosses = b""
             self.widget.marks, self.widget.cursor, self.widget.alt = [], [], alt
 
     def mark(self, points: Real[np.ndarray, "k 3"], chosen: int | None = None) -> None:
-        """Numbers 1, 2, ... beside world points; the one with index `chosen` stands out."""
+        """Draw the numbers 1, 2, ... beside world points; the number with index `chosen` is highlighted."""
         if self._box is not None:
             self.widget.marks = [
                 {"at": at, "label": str(index + 1), "chosen": index == chosen}
-                for index, at in enumerate(self._box.place(points).tolist())
+                for index, at in enumerate(self._box.to_view(points).tolist())
             ]
 
     def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
-        """A cross-hair on a world point, none with None."""
-        self.widget.cursor = [] if point is None or self._box is None else self._box.place(point).tolist()
+        """Draw a cross-hair at a world point; None removes it."""
+        self.widget.cursor = [] if point is None or self._box is None else self._box.to_view(point).tolist()
 
     def _receive(self, _, content: dict, buffers: list) -> None:
         if content.get("kind") == "click" and self._box is not None:
             view, at = np.array(content["view"]).reshape(3, 3), np.array(content["at"])
-            found = point_under(self._placed, view, at, content["reach"])
+            found = point_under(self._in_view, view, at, content["reach"])
             self.on_pick(None if found is None else self._cloud[found])
 
 
 def load_anywidget() -> Any:
-    """The module anywidget.  Raises InputError saying how to install it where it lacks."""
+    """Return the module anywidget.
+
+    Raises:
+        InputError: If it is not installed, with the command that installs it.
+    """
     try:
         import anywidget
     except ImportError as error:
         raise InputError(
-            "clicks on a point cloud need anywidget, which is not installed; pip install anywidget "
+            "clickable point clouds need anywidget, which is not installed; pip install anywidget "
             "(or 'zsp-lite[notebooks]')"
         ) from error
     return anywidget
@@ -169,7 +194,7 @@ def _cloud_widget() -> "type[AnyWidget]":
     from traitlets import Bytes, Float, Int, List, Unicode
 
     class CloudCanvas(anywidget.AnyWidget):
-        """What the browser knows of a cloud; see `cloud_view.js`."""
+        """State shared with the browser, see `cloud_view.js`."""
 
         _esm = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
         _css = _STYLE
@@ -179,7 +204,7 @@ def _cloud_widget() -> "type[AnyWidget]":
         marks = List().tag(sync=True)
         cursor = List(Float()).tag(sync=True)  # [] or a point
         view = List(Float(), [1.0, 0, 0, 0, 1, 0, 0, 0, 1]).tag(sync=True)
-        aimed = Int().tag(sync=True)  # counts up when the view is to be taken anew
+        view_resets = Int().tag(sync=True)  # increases when the browser must take over `view`
         side = Int(400).tag(sync=True)
         alt = Unicode().tag(sync=True)
 

@@ -1,21 +1,21 @@
-"""What all widgets are made of: controls, a picture of a matplotlib figure, and a sentence that says what it shows.
+"""Controls and interactive figures, the building blocks of all widgets.
 
-Rules for a widget:
+How to write a widget:
 
-- One function that takes data already computed (views, matrices, errors), draws once, and returns `explorer(...)`.
-- Moving a control calls its `update`, which only changes what stands in the figure (`set_data`, `set_offsets`,
-  `set_text`, `set_visible`): artists are made once. Heavy numbers are computed before, not on a slider's move.
-- `update` returns one sentence with the figures that the picture shows: for readers who cannot see it, or its colours.
-- An answer takes 150 ms at the median (`python -m zsp_lite.widgets` measures). Keep figures below about 9 by 4 inches.
-- The picture is PNG in an image widget, which every frontend shows; plotly and ipympl are not needed. Where a patch or
-  a point is chosen, sliders choose it: they work by keyboard too.
-- In the notebook a static figure stands beside it (`show`), which has all that must be seen.
-- For each widget its module has a function `example_NAME()` that builds it on `example_pair()` or other sample data,
-  and `zsp_lite.widgets.WIDGETS` has a line for it.
+- Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure once, and returns
+  `interactive_figure(...)`.
+- Its `update` callback is called when a control moves. It only changes existing artists (`set_data`, `set_offsets`,
+  `set_text`, `set_visible`). Expensive results are computed before, not in `update`.
+- `update` returns a caption with the numbers that the figure shows, also for readers who cannot see it or its colours.
+- The latency of a control should be at most 150 ms (`python -m zsp_lite.widgets` measures it). Keep figures below about
+  9 by 4 inches.
+- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen by sliders, which
+  work by keyboard.
+- The notebook shows a static figure as well (`show`), because widgets need a running kernel.
+- Add an example on sample data to `zsp_lite.widgets.examples`.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -34,14 +34,15 @@ from zsp_lite.errors import InputError
 if TYPE_CHECKING:
     from ipywidgets import ValueWidget, VBox
 
-    from zsp_lite.synthetic.ground_truth import GroundTruthPair
-    from zsp_lite.views import View
-
 _LABEL = {"description_width": "initial"}
 
 
 def load_ipywidgets() -> Any:
-    """The module ipywidgets.  Raises InputError saying how to install it where it lacks."""
+    """Return the module ipywidgets.
+
+    Raises:
+        InputError: If it is not installed, with the command that installs it.
+    """
     try:
         import ipywidgets
     except ImportError as error:
@@ -52,70 +53,87 @@ def load_ipywidgets() -> Any:
 
 
 def slider(label: str, low: float, high: float, value: float, step: float = 1) -> "ValueWidget":
-    """A slider from `low` to `high`: of whole numbers where all four are, of decimals otherwise."""
+    """Return a slider from `low` to `high`, with integer values if all four numbers are integers."""
     widgets = load_ipywidgets()
-    whole = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
-    kind = widgets.IntSlider if whole else widgets.FloatSlider
-    form = {} if whole else {"readout_format": f".{max(0, -int(np.floor(np.log10(step))))}f"}
+    integer = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
+    kind = widgets.IntSlider if integer else widgets.FloatSlider
+    form = {} if integer else {"readout_format": f".{max(0, -int(np.floor(np.log10(step))))}f"}
     return kind(value, min=low, max=high, step=step, description=label, style=_LABEL, layout={"width": "22em"}, **form)
 
 
+def patch_slider(label: str, cells: int, value: int) -> "ValueWidget":
+    """Return a slider over the rows or columns of a patch grid, counted from 0."""
+    return slider(label, 0, cells - 1, value)
+
+
 def choice(label: str, options: list[str], value: str | None = None) -> "ValueWidget":
-    """A menu of one of `options`, at first `value` or else the first."""
+    """Return a menu; the initial value is the first option by default."""
     widgets = load_ipywidgets()
     return widgets.Dropdown(options=options, value=value or options[0], description=label, style=_LABEL)
 
 
-def explorer(figure: Figure, controls: Mapping[str, "ValueWidget"], update: Callable[..., str], alt: str) -> "VBox":
-    """The widget: controls over a picture of `figure` over a sentence.
+def interactive_figure(
+    figure: Figure, controls: Mapping[str, "ValueWidget"], update: Callable[..., str], alt: str
+) -> "VBox":
+    """Return a widget of controls above a figure above a caption.
 
-    update: called with each control's value by the control's name; changes the figure and returns the sentence.
-    alt: what the picture is of, in a sentence that holds for all positions of the controls.
+    Args:
+        figure: Figure with all its artists.
+        controls: Controls by the name of the argument of `update`.
+        update: Called with the value of each control; changes the figure and returns the caption.
+        alt: Description of the figure for screen readers, valid for all values of the controls.
 
-    The result's `redraw()` does what a control's move does; `controls` and `figure` are the ones given, `picture` and
-    `sentence` the widgets that it changes. Raises InputError without ipywidgets.
+    Returns:
+        Widget with the attributes `controls`, `figure`, `picture` and `caption` (the image and text widgets), and
+        `redraw()`.
+
+    Raises:
+        InputError: If ipywidgets is not installed.
     """
     widgets = load_ipywidgets()
-    plt.close(figure)  # else the notebook would show it a second time
+    plt.close(figure)  # otherwise the notebook shows it a second time
     canvas = FigureCanvasAgg(figure)
     picture = widgets.Image(format="png", layout={"max_width": "100%", "object_fit": "contain"})
-    # Image widgets have no alternative text, and JupyterLab fails on those with a tooltip: text for screen readers.
+    # Image widgets have no alternative text, and JupyterLab fails on images with a tooltip.
     described = widgets.HTML(f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>')
-    sentence = widgets.HTML()
-    # A layout engine would arrange everything again at each move, and make the picture jump.
+    caption = widgets.HTML()
+    # The layout is computed once and then fixed, so that the figure does not move between updates.
     update(**{name: control.value for name, control in controls.items()})
-    for _ in range(2):  # the first one settles the layout of images with colour bars only roughly
+    for _ in range(2):  # the layout of images with colour bars is exact only after the second pass
         canvas.draw()
     figure.set_layout_engine("none")
 
     def redraw(change=None) -> None:
         text = update(**{name: control.value for name, control in controls.items()})
         picture.value = png(figure)
-        sentence.value = text
+        caption.value = text
 
     for control in controls.values():
         control.observe(redraw, names="value")
     redraw()
     row = widgets.HBox(list(controls.values()), layout={"flex_flow": "row wrap"})
-    box = widgets.VBox([row, described, picture, sentence])
-    box.redraw, box.controls, box.figure, box.picture, box.sentence = redraw, dict(controls), figure, picture, sentence
+    box = widgets.VBox([row, described, picture, caption])
+    box.redraw, box.controls, box.figure, box.picture, box.caption = redraw, dict(controls), figure, picture, caption
     return box
 
 
-def patch_slider(label: str, cells: int, value: int) -> "ValueWidget":
-    """A slider over the rows or columns of a patch grid, counted from 0 as in the code."""
-    return slider(label, 0, cells - 1, value)
-
-
-def patch_box(
-    axis: Axes, grid: tuple[int, int], size: tuple[int, int], label: str, before: bool = False
+def patch_outline(
+    axis: Axes, grid: tuple[int, int], size: tuple[int, int], label: str, label_left: bool = False
 ) -> Callable[[int, int], None]:
-    """A frame around one patch of a (rows, cols) grid over an image of (H, W) pixels; call the result to move it.
+    """Draw a labelled outline around one patch of an image, white on black so that it is visible on any image.
 
-    White on black, so that it is seen on any picture; its label stands on the right, or on the left (`before`).
+    Args:
+        axis: Axes of the image.
+        grid: Patches (rows, columns).
+        size: Image (height, width) in pixels.
+        label: Text beside the patch.
+        label_left: Place the label on the left where there is room, otherwise on the right.
+
+    Returns:
+        Function that moves the outline to the patch (row, col).
     """
     height, width = size[0] / grid[0], size[1] / grid[1]
-    frames = [
+    outlines = [
         axis.add_patch(Rectangle((0, 0), width, height, fill=False, edgecolor=colour, linewidth=line, zorder=8))
         for colour, line in (("black", 4.5), ("white", 2))
     ]
@@ -123,21 +141,27 @@ def patch_box(
                      path_effects=[Stroke(linewidth=3, foreground="white"), Normal()])  # fmt: skip
 
     def move(row: int, col: int) -> None:
-        for frame in frames:
-            frame.set_xy((col * width, row * height))
-        right = col < 4 or (not before and col < grid[1] - 4)
+        for outline in outlines:
+            outline.set_xy((col * width, row * height))
+        right = col < 4 or (not label_left and col < grid[1] - 4)
         text.set(x=(col + (1.5 if right else -0.5)) * width, y=(row + 0.5) * height, ha="left" if right else "right")
 
     return move
 
 
-def patch_map(
+def patch_heatmap(
     axis: Axes, grid: tuple[int, int], size: tuple[int, int], limits: tuple[float, float] = (0, 1), alpha: float = 0.65,
     label: str | None = None,
 ) -> AxesImage:  # fmt: skip
-    """An empty map over the patches of an image of (H, W) pixels; fill it with `set_data` (masked patches are clear).
+    """Draw an empty heat map over the patches of an image; fill it with `set_data` (NaN and masked are transparent).
 
-    label: of the colour bar below it, none without.
+    Args:
+        axis: Axes of the image.
+        grid: Patches (rows, columns).
+        size: Image (height, width) in pixels.
+        limits: Values at the ends of the colour map.
+        alpha: Opacity.
+        label: Label of a colour bar below the image; no colour bar by default.
     """
     drawn = axis.imshow(
         np.zeros(grid), cmap="viridis", alpha=alpha, extent=(0, size[1], size[0], 0), vmin=limits[0], vmax=limits[1],
@@ -151,7 +175,7 @@ def patch_map(
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG, quickly (hardly compressed)."""
+    """Return a figure as PNG with the fastest compression."""
     canvas = figure.canvas
     canvas.draw()
     pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
@@ -159,31 +183,8 @@ def png(figure: Figure) -> bytes:
 
 
 def show(figure: Figure, alt: str) -> None:
-    """Show a static figure in a notebook with a text for those who cannot see it, kept in the file."""
+    """Show a static figure in a notebook, with an alternative text that is stored in the notebook."""
     from IPython.display import display
 
     plt.close(figure)
     display(figure, metadata={form: {"alt": alt} for form in ("image/png", "image/jpeg")})
-
-
-@cache
-def example_truth() -> "GroundTruthPair":
-    """The true correspondences of a sample pair; for trying widgets out."""
-    from zsp_lite.data.co3d import Co3D
-    from zsp_lite.data.samples import sample_data
-    from zsp_lite.demo import demo_pairs
-    from zsp_lite.synthetic.ground_truth import ground_truth_pair
-
-    dataset = Co3D(sample_data())
-    return ground_truth_pair(dataset, demo_pairs(dataset)[-1])
-
-
-@cache
-def example_pair() -> tuple["View", "View"]:
-    """The views of `example_truth`: different objects of one category from about the same side."""
-    from zsp_lite.backbones.load import load_backbone
-    from zsp_lite.views import extract_views
-
-    truth = example_truth()
-    first, second = extract_views(load_backbone("zsp-tiny", "cpu"), [truth.reference, truth.target])
-    return first, second

@@ -1,6 +1,5 @@
-"""A box around an object and the mask that GrabCut makes of it."""
+"""Widget on masks: a bounding box and the mask that GrabCut segments in it."""
 
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
-from zsp_lite.widgets.common import explorer, slider
+from zsp_lite.widgets.common import interactive_figure, slider
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
@@ -18,9 +17,11 @@ if TYPE_CHECKING:
 
 
 def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
-    """Sliders move the sides of a box (top, left, height, width) over a picture; the mask follows.
+    """Show the mask that GrabCut segments in a bounding box; choose the sides of the box.
 
-    Where the frame has a mask, the sentence says how far both overlap. Raises InputError without ipywidgets.
+    Args:
+        frame: Frame; if it has a mask, the caption gives the overlap (IoU) with it.
+        box: Initial box (top, left, height, width) in pixels.
     """
     height, width = frame.camera.size
     top, left, box_height, box_width = box
@@ -42,11 +43,11 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
             return str(problem)
         dark[~mask] = (0, 0, 0, 0.65)
         shade.set_data(dark)
-        said = f"mask of {mask.sum():,} pixels"
+        text = f"mask of {mask.sum():,} pixels"
         if frame.mask is not None:
             true = frame.mask > 0.5
-            said += f", overlap (IoU) with the true one {(mask & true).sum() / (mask | true).sum():.2f}"
-        return said
+            text += f", IoU with the true mask {(mask & true).sum() / (mask | true).sum():.2f}"
+        return text
 
     controls = {
         "top": slider("top", 0, height - 4, top),
@@ -54,18 +55,5 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
         "bottom": slider("bottom", 4, height, top + box_height),
         "right": slider("right", 4, width, left + box_width),
     }
-    alt = "A picture with a dashed box; what GrabCut takes for background is darkened."
-    return explorer(figure, controls, update, alt)
-
-
-@cache
-def example_box_to_mask() -> "VBox":
-    """`box_to_mask` on a sample frame."""
-    from zsp_lite.data.co3d import Co3D
-    from zsp_lite.data.frames import mask_to_bbox
-    from zsp_lite.data.samples import sample_data
-
-    dataset = Co3D(sample_data())
-    category = dataset.categories()[0]
-    frame = dataset.load(dataset.frames(category, dataset.sequences(category)[0].sequence_name)[0])
-    return box_to_mask(frame, mask_to_bbox(frame.mask))
+    alt = "An image with a dashed box; the background found by GrabCut is darkened."
+    return interactive_figure(figure, controls, update, alt)

@@ -1,4 +1,4 @@
-"""Widgets on matching: one cycle from patch to patch, and the matches that each way of choosing them gives."""
+"""Widgets on matching: the cycle of one patch, and the matches of every matcher."""
 
 from functools import cache
 from typing import TYPE_CHECKING
@@ -11,18 +11,16 @@ from matplotlib.patheffects import Normal, Stroke
 from torch import Tensor
 
 from zsp_lite.matchers import MATCHERS
-from zsp_lite.matching import match, nearest_neighbours, similarity
+from zsp_lite.matching import match, nearest_neighbours
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
     choice,
-    example_pair,
-    example_truth,
-    explorer,
+    interactive_figure,
     load_ipywidgets,
-    patch_box,
-    patch_map,
+    patch_heatmap,
+    patch_outline,
     patch_slider,
     slider,
 )
@@ -32,9 +30,15 @@ if TYPE_CHECKING:
 
 
 def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
-    """Choose a patch u of the reference; see its nearest neighbour v in the target, v's own u', and d(u, u') (eq. 2).
+    """Show the cycle of a reference patch (eq. 2).
 
-    sim: `similarity` of the two views' features.
+    v is the nearest neighbour of the patch u in the target, u' the nearest neighbour of v in the reference, and
+    d(u, u') the cyclical distance.
+
+    Args:
+        reference: Reference view.
+        target: Target view.
+        sim: Similarities between the patches of both (`matching.similarity`).
     """
     grid, grid2 = reference.features.grid, target.features.grid
     forth, back = (x.numpy() for x in nearest_neighbours(sim))
@@ -43,22 +47,15 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
     size, size2 = crops[0].shape[:2], crops[1].shape[:2]
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images(crops, titles, size=3.7)
-    maps = [patch_map(axis, g, s, alpha=0.55) for axis, g, s in zip(axes, (grid, grid2), (size, size2))]
-    boxes = [patch_box(axes[0], grid, size, "u", before=True), patch_box(axes[1], grid2, size2, "v")]
-    # u' is a circle: where the cycle closes, it lies inside u's frame.
-    look = {"markersize": 11, "color": "white", "markeredgecolor": "black", "linestyle": "none", "zorder": 10}
-    returned = axes[0].plot([], [], "o", **look)[0]
-    outline = [Stroke(linewidth=4, foreground="black"), Normal()]
-    way = {
-        "coordsA": axes[0].transData,
-        "coordsB": axes[1].transData,
-        "linewidth": 2,
-        "zorder": 9,
-        "path_effects": outline,
-    }
+    maps = [patch_heatmap(axis, g, s, alpha=0.55) for axis, g, s in zip(axes, (grid, grid2), (size, size2))]
+    outlines = [patch_outline(axes[0], grid, size, "u", label_left=True), patch_outline(axes[1], grid2, size2, "v")]
+    # u' is a circle, inside the outline of u where the cycle closes.
+    style = {"markersize": 11, "color": "white", "markeredgecolor": "black", "linestyle": "none", "zorder": 10}
+    returned = axes[0].plot([], [], "o", **style)[0]
+    line = {"coordsA": axes[0].transData, "coordsB": axes[1].transData, "color": "white", "linewidth": 2, "zorder": 9}
+    line["path_effects"] = [Stroke(linewidth=4, foreground="black"), Normal()]
     arrows = [
-        figure.add_artist(ConnectionPatch((0, 0), (0, 0), color="white", **way)),
-        figure.add_artist(ConnectionPatch((0, 0), (0, 0), color="white", linestyle="--", **way)),
+        figure.add_artist(ConnectionPatch((0, 0), (0, 0), linestyle=style, **line)) for style in ("solid", "dashed")
     ]
 
     def update(row: int, col: int) -> str:
@@ -67,14 +64,14 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
         (v_row, v_col), (w_row, w_col) = divmod(v, grid2[1]), divmod(w, grid[1])
         maps[0].set_data(values[:, v].reshape(grid))
         maps[1].set_data(values[u].reshape(grid2))
-        boxes[0](row, col)
-        boxes[1](v_row, v_col)
+        outlines[0](row, col)
+        outlines[1](v_row, v_col)
         ends = plots.patch_centres(np.array([(row, col), (w_row, w_col)]), grid, size)
-        there = plots.patch_centres(np.array([(v_row, v_col)]), grid2, size2)[0]
+        v_centre = plots.patch_centres(np.array([(v_row, v_col)]), grid2, size2)[0]
         returned.set_data(*ends[1:].T)
         for arrow, end in zip(arrows, ends):
-            arrow.xy1, arrow.xy2 = end, there
-        off = [
+            arrow.xy1, arrow.xy2 = end, v_centre
+        background = [
             name
             for name, on in (
                 ("u", reference.foreground[row, col]), ("v", target.foreground[v_row, v_col]),
@@ -85,27 +82,32 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
         return (
             f"u ({row}, {col}) → v ({v_row}, {v_col}), cosine {values[u, v]:.2f} → u' ({w_row}, {w_col}), cosine "
             f"{values[w, v]:.2f}: d(u, u') = {distance:.1f} patches"
-            + (f"; {', '.join(off)} off the foreground, so the map has no value here." if off else ".")
+            + (f"; {', '.join(background)} not on the foreground, so the distance is infinite." if background else ".")
         )
 
     row, col = np.unravel_index(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax(), grid)
     controls = {
         "row": patch_slider("row of u", grid[0], int(row)), "col": patch_slider("column of u", grid[1], int(col)),
     }  # fmt: skip
-    alt = "A solid line from a framed patch u to its nearest neighbour v, a dashed line from v back to a circle, u'."
-    return explorer(figure, controls, update, alt)
+    alt = "A solid line from the outlined patch u to its nearest neighbour v, a dashed line from v to the circle u'."
+    return interactive_figure(figure, controls, update, alt)
 
 
 def matches(
     reference: View,
     target: View,
     sim: Float[Tensor, "n1 n2"],
-    partners: Int[np.ndarray, "h w 2"],
-    found: Bool[np.ndarray, "h w"],
+    cells: Int[np.ndarray, "h w 2"],
+    valid: Bool[np.ndarray, "h w"],
 ) -> "VBox":
-    """Choose how matches are made, how many, and whether k-means spreads them; see which of them are right.
+    """Show which matches are correct; choose the matcher, the number of matches and k-means.
 
-    partners, found: as `synthetic.ground_truth.ground_truth_matches` gives them.
+    Args:
+        reference: Reference view.
+        target: Target view.
+        sim: Similarities between the patches of both (`matching.similarity`).
+        cells: True matches of the reference patches, from `ground_truth_matches`.
+        valid: Reference patches with a true match.
     """
     grid = reference.features.grid
     height, width = reference.frame.rgb.shape[:2]
@@ -114,9 +116,9 @@ def matches(
     picture = np.concatenate([reference.frame.rgb, side, target.frame.rgb], axis=1)
     figure, (axis,) = plots.show_images([picture], ["reference and target"], size=7.4)
     styles = {
-        "right": {"colors": plots.BLUE, "linewidths": 1.6, "linestyles": "-"},
+        "correct": {"colors": plots.BLUE, "linewidths": 1.6, "linestyles": "-"},
         "wrong": {"colors": plots.ORANGE, "linewidths": 1.2, "linestyles": "--"},
-        "truth not known": {"colors": "0.35", "linewidths": 0.8, "linestyles": ":"},
+        "no ground truth": {"colors": "0.35", "linewidths": 0.8, "linestyles": ":"},
     }
     border = [Stroke(linewidth=2.6, foreground="white"), Normal()]
     lines = {
@@ -127,48 +129,36 @@ def matches(
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, fontsize=9, frameon=False)
 
     @cache
-    def chosen(way: str, k: int, kmeans: bool):
+    def compute(matcher: str, k: int, kmeans: bool):
         return match(
-            reference.features, target.features, k, kmeans, sim=sim, matcher=way,
+            reference.features, target.features, k, kmeans, sim=sim, matcher=matcher,
             ref_foreground=reference.foreground, target_foreground=target.foreground,
         )  # fmt: skip
 
-    def update(way: str, k: int, kmeans: bool) -> str:
-        made = chosen(way, k, kmeans)
-        known = found[tuple(made.reference.T)]
-        right = correct_matches(made.target, partners[tuple(made.reference.T)]) & known
+    def update(matcher: str, k: int, kmeans: bool) -> str:
+        found = compute(matcher, k, kmeans)
+        known = valid[tuple(found.reference.T)]
+        correct = correct_matches(found.target, cells[tuple(found.reference.T)]) & known
         ends = np.stack(
             [
-                plots.patch_centres(made.reference, grid, (height, width)),
-                plots.patch_centres(made.target, target.features.grid, target.frame.rgb.shape[:2]) + (width + gap, 0),
+                plots.patch_centres(found.reference, grid, (height, width)),
+                plots.patch_centres(found.target, target.features.grid, target.frame.rgb.shape[:2]) + (width + gap, 0),
             ],
             axis=1,
         )
-        for kind, which in zip(lines, (right, known & ~right, ~known)):
+        for kind, which in zip(lines, (correct, known & ~correct, ~known)):
             lines[kind].set_segments(ends[which])
         dots.set_data(*ends.reshape(-1, 2).T)
-        apart = np.linalg.norm(made.reference[:, None] - made.reference, axis=-1) + np.diag(np.full(len(made), np.inf))
-        spread = apart.min(axis=1).mean() if len(made) > 1 else 0.0
-        wrong, unknown = (known & ~right).sum(), (~known).sum()
+        distances = np.linalg.norm(found.reference[:, None] - found.reference, axis=-1)
+        np.fill_diagonal(distances, np.inf)
+        spacing = distances.min(axis=1).mean() if len(found) > 1 else 0.0
         return (
-            f"{way}: {len(made)} matches, {right.sum()} right, {wrong} wrong, {unknown} without a known truth; "
-            f"{spread:.1f} patches from a match to the nearest other."
+            f"{matcher}: {len(found)} matches, {correct.sum()} correct, {(known & ~correct).sum()} wrong, "
+            f"{(~known).sum()} without ground truth; mean distance to the nearest match {spacing:.1f} patches."
         )
 
     controls = {
-        "way": choice("way", ["cyclical", *MATCHERS]), "k": slider("K", 5, 100, 50, 5),
-        "kmeans": load_ipywidgets().Checkbox(value=True, description="k-means of the best 2K", indent=False),
+        "matcher": choice("matcher", ["cyclical", *MATCHERS]), "k": slider("K", 5, 100, 50, 5),
+        "kmeans": load_ipywidgets().Checkbox(value=True, description="k-means on the best 2K", indent=False),
     }  # fmt: skip
-    return explorer(figure, controls, update, "Two objects and lines between matched patches.")
-
-
-def example_cycle() -> "VBox":
-    """`cycle` on a sample pair."""
-    views = example_pair()
-    return cycle(*views, similarity(*(view.features for view in views)))
-
-
-def example_matches() -> "VBox":
-    """`matches` on a sample pair."""
-    views, truth = example_pair(), example_truth()
-    return matches(*views, similarity(*(view.features for view in views)), truth.cells, truth.valid)
+    return interactive_figure(figure, controls, update, "Two objects and lines between matched patches.")

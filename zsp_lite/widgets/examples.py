@@ -1,0 +1,193 @@
+"""Every widget on sample data, for tests and for measuring the latency."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.backbones.load import load_backbone
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import mask_to_bbox
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.pairs import Pair
+from zsp_lite.data.samples import sample_data
+from zsp_lite.demo import demo_pairs
+from zsp_lite.labelling.session import Labelling
+from zsp_lite.matching import match, similarity
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose, match_points
+from zsp_lite.synthetic.ground_truth import GroundTruthPair, ground_truth_pair
+from zsp_lite.verified import Solution, VerifiedSolver
+from zsp_lite.views import View, extract_views
+from zsp_lite.viz.plots import patch_centres
+from zsp_lite.widgets import alignment as alignment_widgets
+from zsp_lite.widgets import features, labelling, masks, matching, metrics, verified, views
+
+if TYPE_CHECKING:
+    from ipywidgets import VBox
+
+GRID = (28, 28)  # patches of zsp-tiny
+
+
+@cache
+def sample_pair() -> GroundTruthPair:
+    """Load a sample pair with its ground-truth matches."""
+    dataset = Co3D(sample_data())
+    return ground_truth_pair(dataset, demo_pairs(dataset)[-1])
+
+
+@cache
+def sample_views() -> tuple[View, View]:
+    """Return the views of `sample_pair`."""
+    reference, target = extract_views(_backbone(), [sample_pair().reference, sample_pair().target])
+    return reference, target
+
+
+@cache
+def sample_solution() -> tuple[Solution, tuple[View, ...]]:
+    """Solve a sample pair of toy trucks with three target views; returns the solution and the views."""
+    dataset = Co3D(sample_data())
+    reference, targets, pairs = _matched(dataset, demo_pairs(dataset, n_targets=3)[-1])
+    return VerifiedSolver().solve(reference, targets, pairs), tuple(targets)
+
+
+def attention() -> "VBox":
+    """`features.attention` on a sample object."""
+    image, backbone = sample_pair().reference.rgb, _backbone()
+    facets = features.all_facets(backbone, [image])
+    queries, keys = (
+        torch.cat([facets[layer, facet] for layer in range(backbone.model.depth)]) for facet in ("query", "key")
+    )
+    return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
+
+
+def facets() -> "VBox":
+    """`features.facets` on a sample pair."""
+    pair = sample_pair()
+    tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
+    maps = {name: tuple(values[:, 1:].unflatten(1, GRID)) for name, values in tokens.items()}
+    return features.facets(pair.reference.rgb, pair.target.rgb, maps, pair.cells, pair.valid)
+
+
+def context() -> "VBox":
+    """`features.context` on a sample pair."""
+    pair, keys = sample_pair(), tuple(view.features.keys for view in sample_views())
+    return features.context(pair.reference.rgb, pair.target.rgb, keys, pair.cells, pair.valid)
+
+
+def saliency() -> "VBox":
+    """`features.saliency` on a sample object."""
+    return features.saliency(sample_views()[0])
+
+
+def cycle() -> "VBox":
+    """`matching.cycle` on a sample pair."""
+    return matching.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
+
+
+def matches() -> "VBox":
+    """`matching.matches` on a sample pair."""
+    sim = similarity(*(view.features for view in sample_views()))
+    return matching.matches(*sample_views(), sim, sample_pair().cells, sample_pair().valid)
+
+
+def best_view() -> "VBox":
+    """`views.best_view` on a sample object and four views of another."""
+    dataset = Co3D(sample_data())
+    pair = replace(demo_pairs(dataset)[0], target_frames=(0, 6, 12, 18))
+    reference, targets, pairs = _matched(dataset, pair)
+    labels = read_labels(dataset.root, pair.category)
+    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
+    cameras = [view.frame.camera for view in targets]
+    poses = np.stack([relative_pose(first, reference.frame.camera, second, camera) for camera in cameras])
+    centre = second.trans @ np.linalg.inv(first.trans) @ np.append(reference.frame.camera.centre, 1)
+    positions = views.viewpoints_from_above(cameras, centre[None, :3])
+    return views.best_view(reference, targets, pairs, positions, rotation_error(np.eye(3), poses[:, :3, :3]))
+
+
+def ransac_settings() -> "VBox":
+    """`alignment.ransac_settings` on a sample pair."""
+    pair = sample_views()
+    found = match(pair[0].features, pair[1].features)
+    images = tuple(view.frame.rgb for view in pair)
+    pixels = tuple(
+        patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
+        for cells, view in zip((found.reference, found.target), pair)
+    )
+    return alignment_widgets.ransac_settings(images, pixels, match_points(*pair, found))
+
+
+def one_outlier() -> "VBox":
+    """`alignment.one_outlier` on random points."""
+    points = np.random.default_rng(0).normal(size=(12, 3))
+    return alignment_widgets.one_outlier(points, points)
+
+
+def measured_accuracy() -> "VBox":
+    """`metrics.measured_accuracy`, which needs no data."""
+    return metrics.measured_accuracy()
+
+
+def symmetry_rotation() -> "VBox":
+    """`metrics.symmetry_rotation` on a plane and a cross."""
+    x = np.linspace(-1, 1, 400)
+    plane = np.column_stack([x, 0.1 * x, 0 * x])
+    return metrics.symmetry_rotation({"plane": plane, "cross": np.vstack([plane, plane[:, [1, 0, 2]] * [-1, 1, 1]])})
+
+
+def ranked_hypotheses() -> "VBox":
+    """`verified.ranked_hypotheses` on a sample pair."""
+    return verified.ranked_hypotheses(*sample_solution())
+
+
+def box_to_mask() -> "VBox":
+    """`masks.box_to_mask` on a sample frame."""
+    dataset = Co3D(sample_data())
+    category = dataset.categories()[0]
+    frame = dataset.load(dataset.frames(category, dataset.sequences(category)[0].sequence_name)[0])
+    return masks.box_to_mask(frame, mask_to_bbox(frame.mask))
+
+
+def label_poses() -> "VBox":
+    """`labelling.label_poses` on a temporary copy of a sample category, with four keypoints on two objects."""
+    folder = TemporaryDirectory(prefix="zsp-lite-")
+    category = Co3D(sample_data()).categories()[0]
+    shutil.copytree(sample_data() / category, Path(folder.name) / category)
+    session = Labelling(folder.name, category)
+    for sequence in session.sequences[:2]:
+        points = session.cloud(sequence)[0]
+        for point in points[:: len(points) // 4][:4]:
+            session.pick(sequence, point)
+    box = labelling.label_poses(session)
+    box.controls["sequence"].value = session.sequences[1]
+    box.folder = folder  # deleted with the widget
+    return box
+
+
+WIDGETS: dict[str, Callable[[], "VBox"]] = {
+    build.__name__: build
+    for build in (
+        attention, facets, context, saliency, cycle, matches, best_view, ransac_settings, one_outlier,
+        measured_accuracy, symmetry_rotation, ranked_hypotheses, box_to_mask, label_poses,
+    )
+}  # fmt: skip
+
+
+@cache
+def _backbone() -> Backbone:
+    return load_backbone("zsp-tiny", "cpu")
+
+
+def _matched(dataset: Co3D, pair: Pair):
+    """Load a pair and match its reference with every target view."""
+    method, (reference, targets) = ZeroShotPose(_backbone()), dataset.load_pair(pair)
+    reference, *targets = method.views([reference, *targets])
+    sims = method.similarities(reference, targets)
+    return reference, targets, [method.match_pair(reference, *one) for one in zip(targets, sims)]
