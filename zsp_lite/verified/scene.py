@@ -18,6 +18,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
+from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.maps import ViewMaps, build_maps
 from zsp_lite.verified.poses import Poses
 from zsp_lite.views import View
@@ -111,28 +112,21 @@ def build_scene(
     )
     target_to_working, valid = _normalisation(clouds, valid, "target views")
 
-    rows = np.flatnonzero(source_valid)
-    foregrounds = [np.flatnonzero(np.asarray(target.foreground.cpu()).ravel()) for target in targets]
-    columns, blocks, width, view_similarities = [], [], 0, []
-    for target, patches, similarity in zip(targets, foregrounds, similarities, strict=True):
-        column = np.full(target.foreground.numel(), -1)
-        column[patches] = width + np.arange(len(patches))
-        width += len(patches)
-        columns.append(column)
-        similarity = similarity.cpu().float()[:, torch.from_numpy(patches)]
-        blocks.append(double_centre(similarity[torch.from_numpy(rows)]))
-        view_similarities.append(view_similarity(similarity[reference.foreground.cpu().ravel()]))
-    row = np.full(source_valid.shape, -1)
-    row[rows] = np.arange(len(rows))
+    foregrounds = [np.asarray(target.foreground.cpu()).ravel() for target in targets]
+    starts = np.cumsum([0, *(foreground.sum() for foreground in foregrounds)])
+    columns = [_number(foreground, start) for foreground, start in zip(foregrounds, starts)]
+    to_foreground = [
+        similarity.cpu().float()[:, torch.from_numpy(foreground)]
+        for similarity, foreground in zip(similarities, foregrounds, strict=True)
+    ]
+    reference_foreground = reference.foreground.cpu().ravel()
+    view_similarities = torch.stack([view_similarity(similarity[reference_foreground]) for similarity in to_foreground])
+    centred = [double_centre(similarity[torch.from_numpy(source_valid)]) for similarity in to_foreground]
 
-    pairs = []
-    for match, cloud, known in zip(matches, clouds, (target.patch_points[1].ravel() for target in targets)):
-        u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
-        v = np.ravel_multi_index(tuple(match.target.T), targets[0].features.grid)
-        both = reference.patch_points[1].ravel()[u] & known[v]
-        pairs.append((
-            _tensor(reference_to_working.apply(source[u[both]])), _tensor(target_to_working.apply(cloud[v[both]])),
-        ))  # fmt: skip
+    matched = []
+    for target, cloud, match in zip(targets, clouds, matches):
+        u, v = _matched_patches(reference, target, match)
+        matched.append((_tensor(reference_to_working.apply(source[u])), _tensor(target_to_working.apply(cloud[v]))))
     target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
     return Scene(
         reference_points=_tensor(reference_to_working.apply(source[source_valid])),
@@ -140,14 +134,16 @@ def build_scene(
         target_view=torch.from_numpy(np.repeat(np.arange(len(targets)), [chosen.sum() for chosen in valid])),
         target_column=torch.from_numpy(np.concatenate([column[chosen] for column, chosen in zip(columns, valid)])),
         target_weight=surface_weights(_tensor(target_points)),
-        similarity=torch.cat(blocks, dim=1).contiguous(),
-        reference_maps=build_maps([reference], [(np.eye(3), np.zeros(3))], reference_to_working, [row]),
+        similarity=torch.cat(centred, dim=1).contiguous(),
+        reference_maps=build_maps(
+            [reference], [(np.eye(3), np.zeros(3))], reference_to_working, [_number(source_valid)]
+        ),
         target_maps=build_maps(targets, to_camera, target_to_working, columns),
         reference_to_working=reference_to_working,
         target_to_working=target_to_working,
         target_cameras=tuple(target.frame.camera for target in targets),
-        matches=tuple(pairs),
-        view_similarity=torch.stack(view_similarities) - torch.stack(view_similarities).mean(),
+        matches=tuple(matched),
+        view_similarity=view_similarities - view_similarities.mean(),
     )
 
 
@@ -201,6 +197,21 @@ def _patch_cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.nd
     return points.reshape(-1, 3), (known & np.asarray(view.foreground.cpu())).ravel()
 
 
+def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:
+    """Consecutive numbers from `start` for the selected entries, -1 for the others."""
+    return np.where(selected, start + np.cumsum(selected) - 1, -1)
+
+
+def _matched_patches(
+    reference: View, target: View, matches: Matches
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Flat indices of the matched patches of both views, for the matches with known depth on both sides."""
+    u = np.ravel_multi_index(tuple(matches.reference.T), reference.features.grid)
+    v = np.ravel_multi_index(tuple(matches.target.T), target.features.grid)
+    known = reference.patch_points[1].ravel()[u] & target.patch_points[1].ravel()[v]
+    return u[known], v[known]
+
+
 def _normalisation(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], valid: Sequence[Bool[np.ndarray, " _"]], name: str
 ) -> tuple[Sim3, list[Bool[np.ndarray, " _"]]]:
@@ -208,12 +219,11 @@ def _normalisation(
     points = np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)])
     if len(points) < MIN_POINTS:
         raise InputError(f"{name}: {len(points)} foreground patches of known depth, expected at least {MIN_POINTS}")
-    median = np.median(points, axis=0)
-    limit = _OUTLIER_DISTANCE * np.median(np.linalg.norm(points - median, axis=1))
-    kept = [chosen & (np.linalg.norm(cloud - median, axis=1) <= limit) for cloud, chosen in zip(clouds, valid)]
-    points = np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, kept)])
-    mean = points.mean(axis=0)
-    spread = np.sqrt(np.square(points - mean).sum(axis=1).mean() / 3)
+    near = near_median(points, _OUTLIER_DISTANCE)
+    points, kept = points[near], [chosen.copy() for chosen in valid]
+    for chosen, part in zip(kept, np.split(near, np.cumsum([chosen.sum() for chosen in valid])[:-1])):
+        chosen[chosen] = part
+    mean, spread = points.mean(axis=0), standard_deviation(points)
     if not spread > 0:
         raise InputError(f"{name}: all {len(points)} foreground points are equal, expected an object with extent")
     return Sim3(1 / spread, np.eye(3), -mean / spread), kept

@@ -1,7 +1,7 @@
-"""Pictures of every stage, as primitives that are put on top of each other.
+"""Plots of every stage of the method, as primitives to combine.
 
-First `show_images` draws images side by side; then add to its axes: `overlay_map`, `mark`, `draw_points`,
-`draw_axes`. `draw_matches` draws two images and the lines between them. Colours are safe for colour-blind readers.
+`show_images` shows images side by side; `overlay_map`, `mark`, `draw_points` and `draw_axes` add to its axes.
+`draw_matches` shows two images and lines between them. Colours are distinguishable with colour-vision deficiencies.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from matplotlib.patheffects import Normal, Stroke
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
-# Okabe and Ito's palette: distinguishable with any of the common colour-vision deficiencies.
+# The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 CHOSEN = ORANGE
 _AXIS_COLOURS = {"x": VERMILLION, "y": GREEN, "z": BLUE}
@@ -31,10 +31,19 @@ def show_images(
     columns: int | None = None,
     size: float = 2.4,
 ) -> tuple[Figure, list[Axes]]:
-    """Images (H, W, 3) or (H, W) side by side, `columns` to a row, each `size` inches wide, without ticks.
+    """Show images in a grid, without ticks. Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
 
-    Pixel (x, y) of an image is (x, y) of its axes: the picture covers [0, W] x [0, H]. Raises InputError on
-    no image, and where there is not one title to an image.
+    Args:
+        images: Images (H, W, 3) or (H, W).
+        titles: One title per image.
+        columns: Images per row; default all in one row.
+        size: Width of an image in inches.
+
+    Returns:
+        The figure, and one axis per image.
+
+    Raises:
+        InputError: No image, or the numbers of titles and images differ.
     """
     if len(images) == 0:
         raise InputError("images is empty, expected at least one (H, W, 3) array")
@@ -64,10 +73,15 @@ def overlay_map(
     limits: tuple[float, float] | None = None,
     label: str | None = None,
 ) -> None:
-    """A map on the patch grid (saliency, cyclical distances) over the image of `axis`, stretched to its size.
+    """Draw a map on the patch grid (saliency, cyclical distances) over the image of an axis.
 
-    Patches whose value is not finite (off the foreground) stay clear. `limits` are the values at the ends of
-    the colour map; `label` adds a colour bar with that text.
+    Args:
+        axis: Axis of an image from `show_images`.
+        values: One value per patch; patches whose value is not finite (background) are transparent.
+        alpha: Opacity of the map.
+        cmap: Name of the colour map.
+        limits: Values at the ends of the colour map; default the smallest and the largest finite value.
+        label: Label of a colour bar; None for no colour bar.
     """
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
@@ -89,7 +103,7 @@ def overlay_map(
 
 
 def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
-    """Frame the image of `axis` and write `text` into its corner: the marked one differs by more than its colour."""
+    """Draw a coloured frame around the image of an axis and write `text` in its corner."""
     axis.add_patch(
         Rectangle((0, 0), 1, 1, transform=axis.transAxes, fill=False, edgecolor=colour, linewidth=5, zorder=10)
     )
@@ -99,7 +113,13 @@ def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
 def patch_centres(
     cells: Integer[np.ndarray, "n 2"], grid: tuple[int, int], size: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixels (x, y) of the centres of patches (row, col) of a (rows, cols) grid over an image of size (H, W)."""
+    """Return the pixels (x, y) of patch centres.
+
+    Args:
+        cells: Patches (row, col).
+        grid: Size (rows, cols) of the patch grid.
+        size: Size (H, W) of the image.
+    """
     scale = np.array([size[1] / grid[1], size[0] / grid[0]])
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
@@ -113,39 +133,50 @@ def draw_matches(
     titles: tuple[str, str] = ("reference", "target"),
     size: float = 3.4,
 ) -> Figure:
-    """Two images and a line for each match between pixels (x, y); outliers are thin, dashed and grey.
+    """Show two images with a line for each match. Outliers are thin, dashed and grey.
 
-    Inliers take their colour from their height in the reference, so that a line can be followed across.
-    `inliers` None draws all of them so. Raises InputError where the lengths differ.
+    The colour of an inlier depends on its row in the reference, so that lines can be told apart.
+
+    Args:
+        reference: Image (H, W, 3).
+        target: Image (H, W, 3).
+        reference_pixels: Pixels (x, y) of the matches in the reference.
+        target_pixels: Pixels (x, y) of the matches in the target.
+        inliers: Which matches are inliers; None for all.
+        titles: Titles of the images.
+        size: Width of an image in inches.
+
+    Raises:
+        InputError: The numbers of pixels and flags differ.
     """
     reference_pixels, target_pixels = np.asarray(reference_pixels, float), np.asarray(target_pixels, float)
     inliers = np.ones(len(reference_pixels), bool) if inliers is None else np.asarray(inliers, bool)
     if not len(reference_pixels) == len(target_pixels) == len(inliers):
         raise InputError(
-            f"matches come as {len(reference_pixels)} reference pixels, {len(target_pixels)} target pixels, "
-            f"{len(inliers)} inlier flags, expected as many of each"
+            f"{len(reference_pixels)} reference pixels, {len(target_pixels)} target pixels and {len(inliers)} inlier "
+            "flags, expected equal numbers"
         )
     figure, (left, right) = show_images([reference, target], list(titles), size=size)
-    # cividis without its brightest end, which would vanish on light images.
-    colours = plt.get_cmap("cividis")(0.05 + 0.9 * reference_pixels[:, 1] / np.shape(reference)[0])
+    # plasma without its brightest end, which is not visible on light images.
+    colours = plt.get_cmap("plasma")(0.85 * reference_pixels[:, 1] / np.shape(reference)[0])
     for a, b, good, colour in sorted(
         zip(reference_pixels, target_pixels, inliers, colours), key=lambda match: match[2]
     ):
-        look = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
-        if good:  # the white border keeps it visible on dark images too
-            look = {
+        style = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
+        if good:  # with a white outline, to be visible on dark images
+            style = {
                 "color": colour,
                 "linewidth": 1.8,
                 "path_effects": [Stroke(linewidth=3, foreground="white"), Normal()],
             }
-        figure.add_artist(ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, zorder=5, **look))
+        figure.add_artist(ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, zorder=5, **style))
         for axis, pixel in ((left, a), (right, b)):
             axis.plot(
                 *pixel,
                 marker="o" if good else "x",
                 markersize=5 if good else 4,
-                color=look["color"],
-                markeredgecolor="white" if good else look["color"],
+                color=style["color"],
+                markeredgecolor="white" if good else style["color"],
                 markeredgewidth=0.7,
             )
     return figure
@@ -155,10 +186,20 @@ def pca_colours(
     maps: Sequence[Real[np.ndarray, "rows cols d"]],
     foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None,
 ) -> list[Float[np.ndarray, "rows cols 3"]]:
-    """Feature maps as colours: their first three principal components, the same ones for all maps, in [0, 1].
+    """Map features to colours by their first three principal components, which all maps share.
 
-    Like colours mean like features, across images too. The components and their range are those of the
-    `foreground` where it is given; all else is white. Raises InputError where fewer than three patches are left.
+    Each component is scaled to its range from the 2nd to the 98th percentile, which is robust to outliers. Similar
+    colours mean similar features, also between images.
+
+    Args:
+        maps: Feature maps.
+        foreground: Per map, the patches to fit the components to; other patches are white. Default all.
+
+    Returns:
+        Per map, an RGB image in [0, 1] with one pixel per patch.
+
+    Raises:
+        InputError: Fewer than three foreground patches or feature dimensions.
     """
     features = [np.asarray(features, dtype=np.float64) for features in maps]
     if foreground is None:
@@ -183,9 +224,14 @@ def draw_points(
     colours: np.ndarray | str = BLUE,
     size: float = 5.0,
 ) -> None:
-    """Camera-frame points over the image of `axis`, as `camera` sees them; those behind it are left out.
+    """Project points into the image of an axis and draw them, far ones first; points behind the camera are left out.
 
-    Far points are drawn first, so that near ones cover them. `colours` is one colour or an (n, 3) array in [0, 1].
+    Args:
+        axis: Axis of the camera's image.
+        camera: Camera of the image.
+        points: Points in the camera's frame.
+        colours: One colour, or (N, 3) in [0, 1].
+        size: Marker size in points squared.
     """
     points = np.asarray(points, dtype=np.float64)
     order = np.argsort(-points[:, 2])
@@ -203,10 +249,14 @@ def draw_axes(
     origin: Real[np.ndarray, "3"],
     length: float,
 ) -> None:
-    """A frame's x, y and z axes, `length` long from `origin`, over the image of `axis`.
+    """Draw the x, y and z axis of a coordinate frame. Axes with an end behind the camera are left out.
 
-    `to_camera` maps (n, 3) points of that frame to the camera's (a `Sim3.apply`, say). Axes with an end
-    behind the camera are left out.
+    Args:
+        axis: Axis of the camera's image.
+        camera: Camera of the image.
+        to_camera: Maps (n, 3) points of the frame to the camera's frame, for example `Sim3.apply`.
+        origin: Origin of the axes in the frame.
+        length: Length of the axes, in units of the frame.
     """
     ends = np.asarray(to_camera(np.asarray(origin) + length * np.vstack([np.zeros(3), np.eye(3)])))
     pixels, depth = camera.project(camera.to_world(ends))
@@ -242,9 +292,12 @@ def draw_axes(
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """A colour for each point from its place along the cloud's longest axis (viridis), in [0, 1].
+    """Colour points by their position along the first principal axis of the cloud.
 
-    Drawn over another object's image, the gradient shows which way round the cloud was placed.
+    Drawn over the image of another object, the gradient shows the orientation of the cloud.
+
+    Returns:
+        (N, 3) colours of viridis in [0, 1].
     """
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)

@@ -235,7 +235,7 @@ def _matches_figure(result: DemoResult) -> Figure:
 def _scene_html(result: DemoResult, scene_id: str) -> Markup:
     first, second = _chosen_views(result)
     scene = aligned_clouds(result.estimate.sim3.apply(object_cloud(first)), object_cloud(second))
-    scene.update_layout(height=340)
+    scene.update_layout(height=370)
     config = {"displayModeBar": False, "responsive": True}
     return Markup(scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config))
 

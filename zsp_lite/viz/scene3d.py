@@ -52,14 +52,18 @@ def aligned_clouds(
         f"{axis}axis": {"title": {"text": _AXIS_LABELS[axis]}, "range": limits, "nticks": 5}
         for axis, limits in axis_ranges(np.concatenate(drawn)).items()
     }
-    eye = {"x": 0.75, "y": -0.6, "z": -1.6}
+    camera = {
+        "up": {"x": 0, "y": -1, "z": 0},
+        "eye": {"x": 1.0, "y": -0.7, "z": -1.8},
+        "center": {"x": 0, "y": 0.12, "z": 0},
+    }
     figure = go.Figure(traces)
     figure.update_layout(
         title=title,
         height=440,
         margin={"l": 0, "r": 0, "t": 40 if title else 0, "b": 10},
         legend={"itemsizing": "constant", "orientation": "h", "x": 0, "y": 0, "bgcolor": "rgba(255,255,255,0.8)"},
-        scene={**axes, "aspectmode": "cube", "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": eye}},
+        scene={**axes, "aspectmode": "cube", "camera": camera},
     )
     return figure
 
