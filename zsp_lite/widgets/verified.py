@@ -51,7 +51,10 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Sc
     names = [name for name in TERM_NAMES if getattr(weights, name)]
 
     figure = plt.figure(figsize=(9, 3.4), dpi=85)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.25, 1, 0.9), left=0.01, right=0.98, bottom=0.16, top=0.9)
+    # The third column is empty: room for the labels of the bars.
+    grid = figure.add_gridspec(
+        1, 4, width_ratios=(1.15, 1, 0.42, 0.75), left=0.01, right=0.98, bottom=0.16, top=0.9, wspace=0.03
+    )
     space, cloud = _clouds(figure, grid[0], solution, clouds[0])
     image_axis = figure.add_subplot(grid[1])
     image_axis.set_axis_off()
@@ -62,9 +65,11 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Sc
         for name, (colour, marker) in POINT_CLASSES.items()
     ]
     image_axis.set(xlim=(0, size[1]), ylim=(size[0], 0))
-    image_axis.legend(loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2, fontsize=6.5, frameon=False)
-    bar_axis = figure.add_subplot(grid[2])
-    bars = bar_axis.barh(names, np.zeros(len(names)), color=BLUE, edgecolor="black")
+    image_axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=2, fontsize=6.5, frameon=False)
+    bar_axis = figure.add_subplot(grid[3])
+    bars = bar_axis.barh(
+        [name.replace("_", " ") for name in names], np.zeros(len(names)), color=BLUE, edgecolor="black"
+    )
     bar_axis.invert_yaxis()
     bar_axis.axvline(0, color="black", linewidth=0.8)
     bar_axis.xaxis.set_major_locator(MaxNLocator(4, integer=True))
