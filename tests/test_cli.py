@@ -1,4 +1,4 @@
-"""The command line: help for everything, one line for bad input, never a traceback."""
+"""The command line: help with examples for every command, one line for bad input, no tracebacks."""
 
 import json
 import subprocess
@@ -114,7 +114,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_category_that_is_not_there_is_named_with_those_that_are(capsys, ellipsoids):
+def test_an_unknown_category_is_reported_with_the_known_ones(capsys, ellipsoids):
     assert cli.main(["benchmark", "--data", str(ellipsoids.root), "--categories", "ellipsoid,cube"]) == 2
     assert "cube" in (line := assert_one_line(capsys)) and "ellipsoid" in line
 
@@ -127,7 +127,7 @@ def test_a_category_that_is_not_there_is_named_with_those_that_are(capsys, ellip
         (KeyboardInterrupt(), 130),
     ],
 )
-def test_what_goes_wrong_inside_a_command_is_one_line(error, code, monkeypatch, capsys):
+def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys):
     def fail(data):
         raise error
 
@@ -136,7 +136,7 @@ def test_what_goes_wrong_inside_a_command_is_one_line(error, code, monkeypatch, 
     assert_one_line(capsys)
 
 
-def test_the_doctor_names_each_thing_and_says_what_is_missing(capsys, ellipsoids):
+def test_the_doctor_lists_every_check_and_what_is_missing(capsys, ellipsoids):
     code = cli.main(["doctor", "--data", str(ellipsoids.root)])
     text = capsys.readouterr().out
     for name in ("Python", "torch", "open3d loads", "backbone zsp-tiny", "data: --data", "Jupyter"):
@@ -162,7 +162,7 @@ def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellip
 
 
 def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypatch, capsys):
-    """What the command line asks for is what the summary names, and what another folder is needed for."""
+    """The summary names the options, and a run with other options needs another folder."""
     monkeypatch.setenv("COLUMNS", "200")
     ask = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "1", "--targets", "1", "--methods", "ours-bv"]
     ask += ["--out", str(tmp_path)]
@@ -175,7 +175,7 @@ def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypat
     assert str(tmp_path) in assert_one_line(capsys)
 
 
-def test_the_demo_takes_layer_facet_and_size_too(ellipsoids, tmp_path, capsys, monkeypatch):
+def test_layer_facet_and_size_reach_the_backbone_of_the_demo(ellipsoids, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     loaded = []
 
@@ -193,7 +193,7 @@ def test_the_demo_takes_layer_facet_and_size_too(ellipsoids, tmp_path, capsys, m
     assert loaded == [BackboneConfig("zsp-tiny", "block3", "value", 96), "dino_vits8"]
 
 
-def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):
+def test_synth_writes_a_co3d_folder(tmp_path):
     arguments = ["--category", "mouse", "--sequences", "1", "--frames", "2", "--seed", "3", "--out", str(tmp_path)]
     assert cli.main(["synth", *arguments]) == 0
     dataset = Co3D(tmp_path)
@@ -201,7 +201,7 @@ def test_synth_writes_a_folder_that_the_reader_reads(tmp_path):
     assert len(dataset.frames("mouse", sequence.sequence_name)) == 2
 
 
-def test_the_weights_list_has_every_name(capsys):
+def test_weights_list_has_every_backbone(capsys):
     assert cli.main(["weights", "list"]) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
@@ -214,7 +214,7 @@ def assert_one_line(capsys) -> str:
     return captured.err
 
 
-def test_the_list_names_every_row_and_group(capsys):
+def test_benchmark_list_has_every_method_and_group(capsys):
     from zsp_lite.benchmark.run import GROUPS, METHODS
 
     assert cli.main(["benchmark", "--list"]) == 0

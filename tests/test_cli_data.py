@@ -1,14 +1,18 @@
-"""The commands that look after data: what they print, what they write, and one line for what is wrong."""
+"""The commands for data: their output, the files they write, and one line for bad input."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
+from test_importers import METRES, write_lists
 
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.frames import Frame, write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.synthetic.export import make_sequence
 
 
 @pytest.fixture
@@ -18,16 +22,16 @@ def root(tmp_path):
     return folder
 
 
-def test_a_whole_folder_passes_the_check_and_a_broken_one_does_not(root, capsys):
+def test_a_complete_folder_passes_the_check_and_a_broken_one_does_not(root, capsys):
     assert main(["data", "check", str(root)]) == 0
-    said = capsys.readouterr().out
-    assert "chair" in said and "No problems" in said
+    text = capsys.readouterr().out
+    assert "chair" in text and "No problems" in text
     (root / "chair/a/images/frame000001.jpg").unlink()
     assert main(["data", "check", str(root)]) == 1
     assert "chair: chair/a/images/frame000001.jpg is missing" in capsys.readouterr().out
 
 
-def test_labels_are_brought_and_carried(root, tmp_path, capsys):
+def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
     for name in "ab":
         write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
     assert main(["data", "labels", str(tmp_path / "clone"), "--root", str(root)]) == 0
@@ -41,16 +45,8 @@ def test_labels_are_brought_and_carried(root, tmp_path, capsys):
 
 def test_a_capture_is_imported(root, tmp_path, capsys):
     source = tmp_path / "scan"
-    from test_importers import METRES, write_lists
-
-    from zsp_lite.synthetic.export import make_sequence
-
     source.mkdir()
     exact = make_sequence("teapot", 0, 4, 3, 64)[1]
-    from dataclasses import replace
-
-    from zsp_lite.data.frames import Frame, write_mask
-
     frames = []
     for number, view in enumerate(exact.views):
         camera = replace(view.camera, t=view.camera.t * METRES)
@@ -64,7 +60,7 @@ def test_a_capture_is_imported(root, tmp_path, capsys):
     assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 4
 
 
-def test_the_labelling_lists_and_draws_its_candidates(root, tmp_path, capsys):
+def test_label_lists_the_progress_and_draws_a_contact_sheet(root, tmp_path, capsys):
     assert main(["label", str(root), "chair", "--list"]) == 0
     assert capsys.readouterr().out.split()[:2] == ["a", "reference"]
     sheet = tmp_path / "sheets/chair.png"
@@ -74,7 +70,7 @@ def test_the_labelling_lists_and_draws_its_candidates(root, tmp_path, capsys):
     assert "expected the name of a .png file" in capsys.readouterr().err
 
 
-def test_labelling_without_a_desktop_is_one_line(root, monkeypatch, capsys):
+def test_label_without_a_desktop_is_one_line(root, monkeypatch, capsys):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -105,7 +101,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
     assert code == 2 and message in error and len(error.strip().splitlines()) == 1
 
 
-def test_picks_on_disk_are_readable_json(root):
+def test_keypoints_on_disk_are_json(root):
     from zsp_lite.labelling import Labelling
 
     labelling = Labelling(root, "chair")

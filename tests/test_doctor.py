@@ -1,4 +1,4 @@
-"""The doctor sees what is missing and names the command that mends it."""
+"""The doctor finds what is missing and names the command that fixes it."""
 
 import subprocess
 import sys
@@ -23,8 +23,8 @@ from zsp_lite.data import samples
         (None, "2.13.0", BAD),
     ],
 )
-def test_a_package_is_held_against_its_range_and_its_pin(installed, pinned, state):
-    check = doctor.compare(Requirement("torch>=2.4"), installed, pinned)
+def test_a_version_is_compared_with_the_permitted_range_and_the_pin(installed, pinned, state):
+    check = doctor.check_version(Requirement("torch>=2.4"), installed, pinned)
     assert check.state == state
     assert bool(check.fix) == (state != OK)
 
@@ -56,12 +56,12 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
             assert pins[requirement.name.lower()] in requirement.specifier, requirement
 
 
-def test_one_missing_essential_is_enough_to_be_unhealthy():
-    fine, extra, broken = Check("a", OK, ""), Check("b", NOTE, "", "do"), Check("c", BAD, "", "do")
-    assert doctor.ok([fine, extra]) and not doctor.ok([fine, broken])
+def test_one_missing_requirement_fails():
+    installed, optional, missing = (Check("a", state, "") for state in (OK, NOTE, BAD))
+    assert doctor.ok([installed, optional]) and not doctor.ok([installed, missing])
 
 
-def test_data_is_looked_for_in_the_given_folder_then_the_variable_then_the_samples(monkeypatch, tmp_path):
+def test_data_folders_are_the_option_then_the_variable_then_the_samples(monkeypatch, tmp_path):
     monkeypatch.setenv(samples.DATA_VARIABLE, "/from/variable")
     names = [name for name, _ in samples.data_folders(tmp_path)]
     assert names == ["--data", samples.DATA_VARIABLE, "data_samples"]
@@ -69,36 +69,36 @@ def test_data_is_looked_for_in_the_given_folder_then_the_variable_then_the_sampl
     assert [name for name, _ in samples.data_folders()] == ["data_samples"]
 
 
-def test_categories_found_are_named(ellipsoids):
+def test_the_categories_of_a_data_folder_are_listed(ellipsoids):
     found = {check.name: check for check in doctor.run_checks(ellipsoids.root)}
     assert found["data: --data"].state == OK and "ellipsoid" in found["data: --data"].found
 
 
-def test_a_folder_that_is_not_there_is_bad_where_it_was_asked_for(tmp_path, monkeypatch):
+def test_a_missing_data_folder_fails_if_the_user_has_set_it(tmp_path, monkeypatch):
     monkeypatch.setenv(samples.DATA_VARIABLE, str(tmp_path / "nowhere"))
     found = {check.name: check for check in doctor.run_checks()}
     assert found[f"data: {samples.DATA_VARIABLE}"].state == BAD
     assert all(check.fix for check in found.values() if check.state != OK)
 
 
-def test_an_extra_is_named_with_what_it_gives_and_how_to_get_it(monkeypatch):
+def test_an_extra_is_listed_with_its_purpose_and_the_command_that_installs_it(monkeypatch):
     versions = {"transformers": "5.0", "huggingface_hub": "1.0", "dask": "2025.1", "distributed": None}
     monkeypatch.setattr(doctor, "_version", versions.get)
     found = {check.name: check for check in doctor._extras()}
-    there, missing = found["extra transformers"], found["extra cluster"]
-    assert there.state == OK and "transformers 5.0" in there.found and "hf:NAME" in there.found
+    installed, missing = found["extra transformers"], found["extra cluster"]
+    assert installed.state == OK and "transformers 5.0" in installed.found and "hf:NAME" in installed.found
     assert missing.state == NOTE and "distributed not installed" in missing.found and "Dask" in missing.found
     assert missing.fix.endswith("install 'zsp-lite[cluster]'")
 
 
-def test_an_extra_that_is_too_old_will_not_do(monkeypatch):
+def test_an_outdated_extra_is_reported(monkeypatch):
     monkeypatch.setattr(doctor, "_version", lambda module: "4.0")
-    monkeypatch.setattr(doctor, "_requirements_of_extras", lambda: {"transformers": SpecifierSet(">=4.56")})
+    monkeypatch.setattr(doctor, "_extra_specifiers", lambda: {"transformers": SpecifierSet(">=4.56")})
     old = next(doctor._extras())
     assert old.state == NOTE and "transformers 4.0, expected >=4.56" in old.found and old.fix
 
 
-def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
+def test_the_extras_of_the_doctor_are_those_of_the_package():
     import tomllib
 
     project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
@@ -107,9 +107,9 @@ def test_every_extra_that_the_doctor_knows_is_one_of_the_package():
         assert names == {module.replace("_", "-") for module in modules}
 
 
-def test_open3d_says_nothing_in_a_notebook():
-    """It looks for IPython's shell by the name of its class, and would start a web server there."""
+def test_open3d_prints_nothing_in_a_notebook():
+    """Open3D detects IPython's shell by the name of its class, and would start a web server."""
     notebook = "import builtins; builtins.get_ipython = type('ZMQInteractiveShell', (), {})\n"
     code = notebook + "from zsp_lite.io.open3d import load_open3d; load_open3d()"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout == ""
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert finished.stdout == ""
