@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -39,3 +40,13 @@ def test_type_checkers_see_the_same_names_as_the_interpreter():
     (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     homes = {alias.name: node.module for node in block.body for alias in node.names}
     assert homes == {name: f"zsp_lite.{home}".rstrip(".") for name, home in zsp_lite._HOME_OF.items()}
+
+
+def test_every_data_file_of_the_package_is_installed():
+    """Weights, templates, scripts of widgets, and `py.typed`, by which type checkers read the annotations."""
+    package = Path(zsp_lite.__file__).parent
+    settings = tomllib.loads((package.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    patterns = settings["tool"]["setuptools"]["package-data"]["zsp_lite"]
+    installed = {path for pattern in patterns for path in package.glob(pattern)}
+    files = {path for path in package.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    assert package / "py.typed" in files and files == installed

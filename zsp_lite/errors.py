@@ -2,8 +2,6 @@
 
 import numbers
 
-import numpy as np
-
 
 class InputError(ValueError):
     """Bad input: one line that names the argument or file, what was given and what was expected.
@@ -29,5 +27,7 @@ def check_seed(name: str, value: object) -> None:
     Raises:
         InputError: The value is neither.
     """
+    import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
+
     if not isinstance(value, np.random.Generator):
         check_integer(name, value, 0)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from zsp_lite.backbones.facets import FACETS
+
 if TYPE_CHECKING:
     from zsp_lite.backbones.load import BackboneConfig
 
@@ -88,7 +90,8 @@ def backbone_options(command: Command) -> Command:
             "code uses block9.",
         ),
         click.option(
-            "--facet", metavar="F", default="key", help="Facet of that block: key (the paper's), query, value, token."
+            "--facet", type=click.Choice(FACETS), default="key",
+            help="Activation of that block used as descriptor; the paper uses the keys.",
         ),
         click.option(
             "--image-size", type=COUNT, metavar="PX", show_default="the checkpoint's, usually 224",
