@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+import yaml
 
 from zsp_lite.cli.main import cli
 
@@ -94,6 +95,15 @@ def test_every_make_target_that_is_named_exists(page):
     for command in commands:
         if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
             assert set(words) <= targets, command
+
+
+def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
+    jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
+    assert runs == {"test": ["make test"], "avx2": ["make test"], "browser": ["make browser"]}
+    assert jobs["avx2"]["env"] == {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
+    assert {"test", "browser"} <= set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    assert (REPOSITORY / ".ci" / "run").read_text().endswith("exec make test\n")
 
 
 def parse(words: list[str]) -> None:

@@ -60,7 +60,7 @@ def write_report(path: str | Path, results: Sequence[DemoResult], data: str, dat
         path: file to write; missing folders are created.
         results: one result per pair.
         data: folder of the data.
-        data_note: a sentence about the data.
+        data_note: a remark on the data, printed after the folder.
         backbone: name of the backbone.
 
     Returns:
@@ -182,8 +182,9 @@ def stage_figures(result: DemoResult, scene_id: str) -> list[StageFigure]:
         ),
         StageFigure(
             "The pose in the target sequence",
-            "The estimate, propagated to other frames through the known cameras (sec. 5.6). Colours run along the "
-            "longest axis of the reference object.",
+            "The estimate, propagated to other frames through the known cameras (sec. 5.6). Points: the reference "
+            "object, coloured along its longest axis. Arrows: the axes of the reference camera (x right, y down, z "
+            "forward).",
             _data_uri(_sequence_figure(result)),
             f"The aligned reference cloud drawn over {len(result.sequence)} frames of the target sequence.",
             wide=True,

@@ -54,8 +54,8 @@ def aligned_clouds(
     }
     camera = {
         "up": {"x": 0, "y": -1, "z": 0},
-        "eye": {"x": 1.0, "y": -0.7, "z": -1.8},
-        "center": {"x": 0, "y": 0.12, "z": 0},
+        "eye": {"x": 1.15, "y": -0.74, "z": -1.9},
+        "center": {"x": 0.15, "y": 0.12, "z": 0.1},
     }
     figure = go.Figure(traces)
     figure.update_layout(
