@@ -165,3 +165,9 @@ def test_a_camera_that_cannot_be_is_refused(changes, message):
 def test_an_unknown_intrinsics_format_is_refused():
     with pytest.raises(InputError, match="'pixels'"):
         view().to_pytorch3d("pixels")
+
+
+def test_the_repr_has_five_lines_with_the_intrinsics_and_the_pose():
+    camera = Camera(np.eye(3), np.array([0.0, 0, 2]), np.full(2, 500.0), np.array([320.0, 240]), SIZE)
+    lines = repr(camera).splitlines()
+    assert len(lines) == 5 and "size=(480, 640), focal_length=[500. 500.]" in lines[0] and "t=[0. 0. 2.]" in lines[1]

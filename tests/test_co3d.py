@@ -43,6 +43,13 @@ def first(root):
     return Co3D(root).frame("chair", "b_2", 0)
 
 
+def test_the_repr_names_the_categories_and_what_is_in_memory(root):
+    dataset = Co3D(root)
+    assert repr(dataset) == f"Co3D({str(root)!r}, categories: 1\n     chair)"
+    dataset.frames("chair", "a_1")
+    assert repr(dataset).splitlines()[2] == "     in memory: chair, 2 sequences, 8 frames)"
+
+
 def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(root):
     reference, targets = Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (3, 0)))
     assert reference.name == "a_1/2" and [target.name for target in targets] == ["b_2/3", "b_2/0"]
@@ -248,11 +255,11 @@ def test_paths_that_leave_the_folder_are_refused(root, path):
     path = str(root / "secret.jpg") if path == "ABSOLUTE" else path
     for part in ("image", "depth", "mask"):
         edit_json(frames_file(inside), lambda frames, part=part: frames[0][part].update(path=path))
-        with pytest.raises(InputError, match="leaves the data folder"):
+        with pytest.raises(InputError, match="leads out of the data folder"):
             Co3D(inside).load(first(inside))
     items = inside / "chair" / "sequence_annotations.jgz"
     edit_json(items, lambda items: items[0]["point_cloud"].update(path=path))
-    with pytest.raises(InputError, match="leaves the data folder"):
+    with pytest.raises(InputError, match="leads out of the data folder"):
         Co3D(inside).point_cloud("chair", "b_2")
 
 

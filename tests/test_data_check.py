@@ -67,7 +67,7 @@ def test_labels_of_nothing_and_of_two_references_are_named(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "q"))
     (check,) = check_folder(root)
     assert check.labelled == 3 and check.usable == 2
-    assert any("z.json is of a sequence that the annotations lack" in line for line in check.problems)
+    assert any("z.json is of a sequence that is not in the annotations" in line for line in check.problems)
     assert any("references a, q, expected one" in line for line in check.problems)
 
 

@@ -204,3 +204,15 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
         write_atomic(tmp_path / "file", b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert (tmp_path / "file").read_bytes() == b"old"
+
+
+def test_the_repr_is_one_line_with_the_size_and_what_is_known():
+    assert repr(frame(name="a/0")) == "Frame('a/0', 24 x 32 pixels, no depth, no mask)"
+    half = np.zeros(SIZE, np.float32)
+    half[:12] = 1
+    assert repr(frame(depth=half, mask=half)).endswith("depth known at 50% of the pixels, mask above 0.5 at 50%)")
+
+
+def test_a_notebook_shows_the_picture_and_the_escaped_repr():
+    shown = frame(name="<a>")._repr_html_()
+    assert shown.startswith('<img src="data:image/jpeg;base64,') and "&lt;a&gt;" in shown

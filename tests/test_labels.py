@@ -49,7 +49,7 @@ def test_the_relative_pose_is_the_papers_composition_from_left_to_right():
 
 
 def test_labels_of_different_references_have_no_relative_pose():
-    with pytest.raises(InputError, match="expected one reference sequence"):
+    with pytest.raises(InputError, match="expected the same reference sequence"):
         relative_pose(random_label(0), random_camera(0), random_label(1, "b", "other"), random_camera(1))
 
 
@@ -79,8 +79,8 @@ def test_a_category_without_labels_has_none(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "rigid motion of unit scale"),
-        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "rigid motion of unit scale"),
+        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "expected a rigid transform"),
+        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rigid transform"),
         ({"trans": [[1.0, 0], [0, 1]]}, "trans"),
         ({"seq": "b"}, "of sequence 'b', expected 'a'"),
         ({"seq": None}, "seq"),

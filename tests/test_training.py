@@ -454,7 +454,7 @@ def test_a_run_that_diverges_says_so(folder, renders, tmp_path):
 def test_shards_that_are_damaged_or_of_another_renderer_are_refused(tmp_path):
     path = tmp_path / "shard.npz"
     path.write_bytes(b"cut off")
-    with pytest.raises(InputError, match="shard.npz are damaged or something else"):
+    with pytest.raises(InputError, match="shard.npz cannot be read"):
         load_render_set([path])
     np.savez(path, rgb=np.zeros((1, 6, 9, 9, 3)), surface=np.zeros((1, 6, 3, 3, 3)), geometry=np.zeros((1, 6, 3, 3, 4)))
     with pytest.raises(InputError, match="rgb has shape .1, 6, 9, 9, 3., expected .1, 8, 192, 192, 3.; remove it"):

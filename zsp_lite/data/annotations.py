@@ -1,7 +1,7 @@
-"""CO3D's annotation files, v1 and v2, as typed records, decoded only as far as asked for.
+"""Records of CO3D's annotation files (v1 and v2), read with msgspec.
 
-A category's frame annotations can hold 86,000 frames and 100 MB of JSON. Opening the file finds where each
-frame's entry lies and whose it is; an entry is decoded and validated when it is asked for.
+The frame annotations of a category can hold 86,000 frames in 100 MB of JSON. `read_frame_index` decodes the sequence
+name and number of each frame only; `FrameIndex.frame` decodes and validates a whole entry.
 """
 
 import gzip
@@ -36,11 +36,11 @@ class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class MaskAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    mass: float | None = None  # sum of the probabilities, pixels
+    mass: float | None = None  # sum of the mask's probabilities over all pixels
 
 
 class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """PyTorch3D camera: row vectors, +x left, +y up; intrinsics in the units of `intrinsics_format` (absent in v1)."""
+    """PyTorch3D camera (see `Camera.from_pytorch3d`); v1 files have no `intrinsics_format`."""
 
     R: tuple[Triple, Triple, Triple]
     T: Triple
@@ -50,7 +50,7 @@ class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class FrameAnnotation(msgspec.Struct, frozen=True):
-    """One frame: its 0-based number in its sequence, its time (s), its files and its camera; `meta` is v2's."""
+    """Files and camera of a frame. `frame_number` starts at 0, `frame_timestamp` is in seconds, only v2 has `meta`."""
 
     sequence_name: str
     frame_number: int
@@ -63,7 +63,7 @@ class FrameAnnotation(msgspec.Struct, frozen=True):
 
 
 class FrameKey(msgspec.Struct, frozen=True, gc=False):
-    """What names a frame within its category."""
+    """Identifier of a frame within its category."""
 
     sequence_name: str
     frame_number: int
@@ -90,23 +90,31 @@ class SequenceAnnotation(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """A category's frame entries, still JSON, in file order, and each sequence's entries by frame number."""
+    """Frame annotations of a category.
+
+    Attributes:
+        path: The annotation file.
+        entries: JSON of each frame, in file order.
+        keys: Identifier of each frame, in file order.
+        by_sequence: Positions of each sequence's frames in `entries`, sorted by frame number.
+    """
 
     path: Path
     entries: list[msgspec.Raw]
     keys: list[FrameKey]
-    of_sequence: dict[str, list[int]]
+    by_sequence: dict[str, list[int]]
 
     def positions(self, sequence: str) -> list[int]:
-        """Where the sequence's frames stand in the file. Raises InputError on an unknown sequence."""
-        if sequence not in self.of_sequence:
+        """Return the positions of a sequence's frames in `entries`. InputError if the sequence is unknown."""
+        if sequence not in self.by_sequence:
             raise InputError(f"annotations {self.path} have no frames of a sequence {sequence!r}")
-        return self.of_sequence[sequence]
+        return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """The decoded entry.
+        """Decode the entry at a position.
 
-        Raises InputError that names the file, the frame and the field that does not fit.
+        Raises:
+            InputError: A field is missing or invalid; the message names the file, the frame and the field.
         """
         key = self.keys[position]
         where = f"{self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
@@ -114,21 +122,34 @@ class FrameIndex:
 
 
 def read_frame_index(path: Path) -> FrameIndex:
-    """Open a category's frame annotations. Raises InputError where they cannot be read."""
+    """Read the frame annotations of a category.
+
+    Raises:
+        InputError: The file is missing or truncated, or a frame has no sequence name or number.
+    """
     data = decompress(path)
-    # Two passes over the bytes, each skipping what it does not need, cost less than one that builds every frame.
+    # Two passes that each skip most of the bytes are faster than one that builds every frame.
     keys = decode(data, list[FrameKey], path)
     entries = msgspec.json.decode(data, type=list[msgspec.Raw])  # views into `data`, not copies
-    of_sequence: dict[str, list[int]] = {}
+    by_sequence: dict[str, list[int]] = {}
     for position, key in enumerate(keys):
-        of_sequence.setdefault(key.sequence_name, []).append(position)
-    for positions in of_sequence.values():
+        by_sequence.setdefault(key.sequence_name, []).append(position)
+    for positions in by_sequence.values():
         positions.sort(key=lambda position: keys[position].frame_number)
-    return FrameIndex(path, entries, keys, of_sequence)
+    return FrameIndex(path, entries, keys, by_sequence)
 
 
 def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
-    """Validated JSON as `kind`. Raises InputError that says where and which field does not fit."""
+    """Decode and validate JSON.
+
+    Args:
+        data: The JSON.
+        kind: Type of the result, for msgspec.
+        where: Name of the file, for error messages.
+
+    Raises:
+        InputError: The JSON is invalid, or a field is missing or of another type.
+    """
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
@@ -138,22 +159,26 @@ def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
 
 
 def decompress(path: Path) -> bytes:
-    """The JSON of an annotation file. Raises InputError where the file is missing or cut off."""
+    """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity.
+
+    Raises:
+        InputError: The file is missing or truncated.
+    """
     compressed = read_bytes(path, "annotations")
     try:
         data = gzip.decompress(compressed)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"annotations {path} are not complete gzip data: {error}") from error
-    # Python's json writes NaN and Infinity, which JSON does not have. As null they are "not given" where that
-    # is allowed and an error that names the field where it is not.
+    # Python's json writes NaN and Infinity, which are not valid JSON. Null is then accepted by optional fields, and
+    # refused by the others with the name of the field.
     if b"NaN" in data or b"Infinity" in data:
         data = re.sub(rb"(?<=[:,\[\s])-?(?:NaN|Infinity)(?=[,\]}\s])", b"null", data)
     return data
 
 
 def compress(data: bytes) -> bytes:
-    """Gzip without name and time, so that equal data give equal bytes."""
-    buffer = io.BytesIO()
+    """Compress with gzip, without name and time in the header, so that equal data give equal bytes."""
+    buffer = io.BytesIO()  # gzip.compress would write the platform into the header
     with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
         file.write(data)
     return buffer.getvalue()

@@ -1,8 +1,7 @@
-"""Pinhole cameras: OpenCV conventions inside, exact conversion from and to PyTorch3D (CO3D v1 and v2).
+"""Pinhole cameras in OpenCV conventions, and their exact conversion from and to PyTorch3D (CO3D v1 and v2).
 
-Inside the library a camera maps world points as column vectors, `x_cam = R @ x_world + t`, +x right, +y down,
-+z forward, and its pixel coordinates are (x, y) with pixel centres at half-integers: the image covers
-[0, W] x [0, H].
+A camera maps world points to camera coordinates by `x_cam = R @ x_world + t` (column vectors; +x right, +y down,
++z forward). Pixel coordinates are (x, y) with pixel centres at half-integers: the image covers [0, W] x [0, H].
 """
 
 from collections.abc import Sequence
@@ -15,24 +14,31 @@ from zsp_lite.errors import InputError
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 
-NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"  # CO3D v1, and wherever the format is not given
+NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 
-# PyTorch3D's camera axes are +x left, +y up, +z forward: OpenCV's turned by 180 degrees about z.
+# PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
-# Annotations carry float32 rotations; what deviates more than this is not a rotation at all.
+# Largest entry of |R @ R.T - I|: a matrix above the first is refused, one above the second (rounded to a few
+# decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
 _ROTATION_TOLERANCE = 1e-3
-_EXACT = 1e-6  # what float32 leaves of one
+_FLOAT32_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated view of the world.
+    """Pinhole camera without distortion.
 
-    `R` (3, 3) and `t` (3,): world to camera; `focal_length` (2,) and `principal_point` (2,): (x, y), pixels; `size`:
-    image (height, width), pixels. Lengths are in the unit of the world. Raises InputError on values that are
-    not finite, an `R` that is not a rotation (to 1e-3; the nearest one is kept), a focal length or size that is
-    not positive.
+    Attributes:
+        R: (3, 3) rotation, world to camera. A matrix within 1e-3 of a rotation is replaced by the nearest rotation.
+        t: (3,) translation, world to camera, in units of the world.
+        focal_length: (2,) focal lengths along x and y, pixels.
+        principal_point: (2,) principal point (x, y), pixels.
+        size: Image (height, width), pixels.
+
+    Raises:
+        InputError: A value is not finite or has another shape, `R` is not a rotation, or a focal length or the size
+            is not positive.
     """
 
     R: Float[np.ndarray, "3 3"]
@@ -47,12 +53,21 @@ class Camera:
         deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
         if deviation > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
             raise InputError(f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
-        if deviation > _EXACT:  # written with few decimals: what follows takes it for a rotation
+        if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
         if (self.focal_length <= 0).any():
             raise InputError(f"camera focal_length is {self.focal_length.tolist()}, expected positive pixels")
         object.__setattr__(self, "size", _image_size(self.size))
+
+    def __repr__(self) -> str:
+        rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
+        first, second, third, translation = rows
+        return (
+            f"Camera(size={self.size}, focal_length={self.focal_length.round(2)}, "
+            f"principal_point={self.principal_point.round(2)},\n       t={translation},\n"
+            f"       R=[{first},\n          {second},\n          {third}])"
+        )
 
     @classmethod
     def from_pytorch3d(
@@ -64,22 +79,34 @@ class Camera:
         size: Sequence[int],
         intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
     ) -> "Camera":
-        """The camera of a CO3D viewpoint.
+        """Convert a PyTorch3D camera, such as a CO3D viewpoint.
 
-        `R` (3, 3) and `T` (3,) act on row vectors, `X_cam = X_world @ R + T`, +x left, +y up; `focal_length`
-        (2,) and `principal_point` (2,) are in the units of `intrinsics_format`; `size` is the image's
-        (height, width). Raises InputError on another format and on what `Camera` refuses.
+        Args:
+            R: (3, 3) rotation for row vectors, `X_cam = X_world @ R + T`, with +x left and +y up.
+            T: (3,) translation.
+            focal_length: (2,) focal lengths in the units of `intrinsics_format`.
+            principal_point: (2,) principal point in the units of `intrinsics_format`.
+            size: Image (height, width), pixels.
+            intrinsics_format: "ndc_norm_image_bounds" (each image side covers [-1, 1]) or "ndc_isotropic" (the
+                shorter side does).
+
+        Raises:
+            InputError: The format is unknown, or a value is not valid for a `Camera`.
         """
         R, T = _finite(R, (3, 3), "viewpoint R"), _finite(T, (3,), "viewpoint T")
         focal_length = _finite(focal_length, (2,), "viewpoint focal_length")
         principal_point = _finite(principal_point, (2,), "viewpoint principal_point")
         size = _image_size(size)
         scale, centre = _ndc(size, intrinsics_format)
-        # NDC's axes point left and up like the camera's, pixels' right and down: hence the minus.
+        # NDC axes point left and up, pixel axes right and down: hence the minus.
         return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """The exact inverse of `from_pytorch3d`: its arguments by name, but for `size`; arrays are numpy float64."""
+        """Convert to a PyTorch3D camera; the inverse of `from_pytorch3d`.
+
+        Returns:
+            The arguments of `from_pytorch3d` by name, without `size`; arrays are float64.
+        """
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,
@@ -97,31 +124,37 @@ class Camera:
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """World-to-camera transform (the paper's T^cam in column-vector form)."""
+        """World-to-camera transform for column vectors (T^cam in the paper)."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.R, self.t
         return matrix
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
-        """Where the camera stands in the world."""
+        """Camera centre in world coordinates."""
         return -self.R.T @ self.t
 
     def to_camera(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """World points in the camera's frame."""
+        """Transform points (..., 3) from world to camera coordinates."""
         return np.asarray(points, dtype=np.float64) @ self.R.T + self.t
 
     def to_world(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Camera-frame points in the world."""
+        """Transform points (..., 3) from camera to world coordinates."""
         return (np.asarray(points, dtype=np.float64) - self.t) @ self.R
 
     def project(
         self, points: Real[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
-        """Pixels (x, y) and depths of world points.
+        """Project world points to pixels.
 
-        Depth is the distance along +z. Points at depth 0 have pixels that are not finite, and those at a
-        negative depth lie behind the camera: look at the depth before using the pixel.
+        Check the depth before using a pixel: points at depth 0 have pixels that are not finite, and points at
+        negative depth are behind the camera.
+
+        Args:
+            points: (..., 3) points in world coordinates.
+
+        Returns:
+            Pixels (..., 2) as (x, y), and depths (...) along +z.
         """
         in_camera = self.to_camera(points)
         depth = in_camera[..., 2]
@@ -132,7 +165,15 @@ class Camera:
     def unproject_camera(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Camera-frame points seen at `pixels` (x, y) at `depth` along +z."""
+        """Compute the points in camera coordinates at given pixels and depths.
+
+        Args:
+            pixels: (..., 2) pixels (x, y).
+            depth: (...) depth along +z.
+
+        Returns:
+            (..., 3) points in camera coordinates.
+        """
         depth = np.asarray(depth, dtype=np.float64)[..., None]
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
@@ -140,16 +181,16 @@ class Camera:
     def unproject(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
-        """World points seen at `pixels` (x, y) at `depth`: the inverse of `project`."""
+        """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
 
     def crop(self, box: Box) -> "Camera":
-        """The camera of the image cut to `box`: cropping moves the principal point and nothing else."""
+        """Return the camera of the image cropped to `box` (top, left, height, width): the principal point moves."""
         top, left, height, width = box
         return replace(self, principal_point=self.principal_point - (left, top), size=(height, width))
 
     def resize(self, size: Sequence[int]) -> "Camera":
-        """The camera of the image resized to (height, width): both intrinsics scale, per axis."""
+        """Return the camera of the image resized to (height, width): the intrinsics are scaled per axis."""
         size = _image_size(size)
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
         return replace(
@@ -157,26 +198,8 @@ class Camera:
         )
 
 
-def rotation_from_quaternion(
-    quaternion: Real[np.ndarray, "4"] | Sequence, what: str = "quaternion"
-) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix of (x, y, z, w), normalised. Raises InputError for one without length."""
-    x, y, z, w = _finite(quaternion, (4,), what)
-    length = float(np.sqrt(x * x + y * y + z * z + w * w))
-    if length < 1e-6:
-        raise InputError(f"{what} is {list(quaternion)}, expected a quaternion (x, y, z, w) of length 1")
-    x, y, z, w = np.array([x, y, z, w]) / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels per NDC unit and the NDC origin's pixel, each (2,) as (x, y)."""
+    """Return the pixels per NDC unit and the pixel of the NDC origin, each (2,) as (x, y)."""
     height, width = size
     half = np.array([width, height]) / 2
     if intrinsics_format == NDC_NORM_IMAGE_BOUNDS:
@@ -189,6 +212,7 @@ def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.
 
 
 def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Convert to a float64 array of the given shape; InputError naming `what` if that fails or it is not finite."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What a CO3D folder holds, what is missing or broken in it, how much of it can be evaluated, and the disk it takes."""
+"""Check of a data folder: missing and broken files, sequences that can be evaluated, size on disk."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -12,17 +12,25 @@ from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 
-_FEWEST_FRAMES = 2  # a reference and something to choose a view from
+_MIN_FRAMES = 2  # complete frames of a sequence that can be evaluated
 
 
 @dataclass
 class CategoryCheck:
-    """What a category holds.
+    """Result of the check of a category.
 
-    layout: "v1", "v2" or "mixed".  sequences, frames: annotated.  complete: sequences whose every annotated file is
-    there and can be read as far as asked.  labelled: sequences with a label; usable: those of them that are complete
-    enough to be evaluated: at least two frames with image, mask, depth and camera.  pairs: files of evaluation pairs
-    that fit the data.  size: bytes of all annotated files.  problems: one line each.
+    Attributes:
+        category: Name of the category.
+        layout: "v1", "v2" or "mixed".
+        sequences: Number of annotated sequences.
+        frames: Number of annotated frames.
+        complete: Number of sequences without problems.
+        labelled: Number of sequences with a label.
+        usable: Number of labelled sequences that can be evaluated: at least two frames have image, mask, depth and
+            camera.
+        pairs: Number of valid files of evaluation pairs.
+        size: Total size of the annotated files, bytes.
+        problems: Messages, one line each.
     """
 
     category: str
@@ -40,11 +48,19 @@ class CategoryCheck:
 def check_folder(
     root: str | Path, deep: bool = False, progress: Callable[[Iterable], Iterable] | None = None
 ) -> list[CategoryCheck]:
-    """Every category of a data folder, by name.
+    """Check every category of a data folder.
 
-    deep: also decode every image, mask, depth map and point cloud, which is slow on large folders; otherwise look
-    only whether the files are there and not empty. Raises InputError where `root` is not a folder or holds no
-    category; everything else that is wrong is a line in `problems`.
+    Args:
+        root: The data folder.
+        deep: Also decode every image, mask, depth map and point cloud, which is slow on large folders. Otherwise only
+            check that the files exist and are not empty.
+        progress: Wraps the list of categories to show a progress bar, such as `tqdm`.
+
+    Returns:
+        One result per category, sorted by name.
+
+    Raises:
+        InputError: `root` is not a folder or has no category. All other problems are in the results.
     """
     dataset = Co3D(root)
     categories = dataset.categories()
@@ -67,29 +83,28 @@ def _check_category(dataset: Co3D, category: str, deep: bool) -> CategoryCheck:
         check.problems.append(f"sequence {name} has no frames in the annotations")
     layouts, usable = set(), set()
     for name in names:
-        problems, good = [], 0
+        problems, complete_frames = [], 0
         try:
             annotations = dataset.frames(category, name)
         except InputError as error:
             check.problems.append(str(error))
             continue
         for annotation in annotations:
-            wrong = _wrong_with_frame(dataset, annotation, deep, check)
-            whole = None not in (annotation.viewpoint, annotation.depth, annotation.mask)
-            good += whole and not wrong
-            problems += wrong
+            found = _check_frame(dataset, annotation, deep, check)
+            complete_frames += not found and None not in (annotation.viewpoint, annotation.depth, annotation.mask)
+            problems += found
             if annotation.viewpoint is not None:
                 layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
         if name not in sequences:
             problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
         elif (cloud := sequences[name].point_cloud) is not None:
-            wrong = _wrong_with_file(dataset, cloud.path, check)
-            if not wrong and deep:
-                wrong = _tried(lambda: dataset.point_cloud(category, name))
-            problems += wrong
+            found = _check_file(dataset, cloud.path, check)
+            if not found and deep:
+                found = _check_call(lambda: dataset.point_cloud(category, name))
+            problems += found
         check.complete += not problems
         check.problems += problems
-        if good >= _FEWEST_FRAMES:
+        if complete_frames >= _MIN_FRAMES:
             usable.add(name)
     check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
     _check_labels(dataset, check, set(names), usable)
@@ -105,11 +120,11 @@ def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usab
     check.labelled, check.usable = len(labels), len(set(labels) & usable)
     folder = label_folder(dataset.root, check.category)
     for name in sorted(set(labels) - annotated):
-        check.problems.append(f"label {folder / name}.json is of a sequence that the annotations lack")
+        check.problems.append(f"label {folder / name}.json is of a sequence that is not in the annotations")
     references = {label.reference_seq for label in labels.values()}
     if len(references) > 1:
         check.problems.append(f"labels in {folder} have references {', '.join(sorted(references))}, expected one")
-    # Not "**": the folder may hold millions of files.
+    # No recursive pattern: the folder may hold millions of files.
     patterns = (f"{part}determ_eval/*/{check.category}.pt" for part in ("", "data/"))
     for path in (path for pattern in patterns for path in sorted(dataset.root.glob(pattern))):
         try:
@@ -119,18 +134,20 @@ def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usab
             check.problems.append(str(error))
 
 
-def _wrong_with_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> list[str]:
+def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> list[str]:
+    """Return the problems of a frame's files and camera."""
     paths = [annotation.image.path]
     paths += [annotation.mask.path] if annotation.mask else []
     if annotation.depth:
         paths += [path for path in (annotation.depth.path, annotation.depth.mask_path) if path]
-    wrong = [problem for path in paths for problem in _wrong_with_file(dataset, path, check)]
-    if wrong or annotation.viewpoint is None:
-        return wrong
-    return _tried(lambda: dataset.load(annotation) if deep else dataset.camera(annotation))
+    problems = [problem for path in paths for problem in _check_file(dataset, path, check)]
+    if problems or annotation.viewpoint is None:
+        return problems
+    return _check_call(lambda: dataset.load(annotation) if deep else dataset.camera(annotation))
 
 
-def _wrong_with_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
+def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
+    """Return the problems of a file, and add its size to `check`."""
     try:
         path = path_inside(dataset.root, relative)
     except InputError as error:
@@ -142,7 +159,8 @@ def _wrong_with_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list
     return [] if size else [f"{relative} is empty"]
 
 
-def _tried(read: Callable[[], object]) -> list[str]:
+def _check_call(read: Callable[[], object]) -> list[str]:
+    """Return the message of the InputError that `read` raises, if any."""
     try:
         read()
     except InputError as error:

@@ -1,6 +1,7 @@
-"""CO3D folders, v1 and v2: a reader that loads only what is asked for, and a writer for the same layout."""
+"""Reader and writer of data sets in CO3D's layout (v1 and v2)."""
 
 import functools
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,14 +48,21 @@ if TYPE_CHECKING:
 
 
 class Co3D:
-    """The categories of a CO3D folder.
+    """A data set in CO3D's layout: ROOT/CATEGORY/frame_annotations.jgz and the files named there.
 
-    Reads what is on disk when a category is first asked for. The JSON of the category used last stays in
-    memory (about 100 MB for the largest), so work through categories one after the other.
+    Annotations are read at the first access to a category. The frame annotations of one category stay in memory
+    (about 100 MB for the largest), so process the categories one after the other.
     """
 
     def __init__(self, root: str | Path):
-        """Raises InputError where `root` is not a folder."""
+        """Open a data set.
+
+        Args:
+            root: The data folder.
+
+        Raises:
+            InputError: `root` is not a folder.
+        """
         self.root = Path(root)
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
@@ -62,14 +70,25 @@ class Co3D:
         self._index: tuple[str, FrameIndex] | None = None
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 
+    def __repr__(self) -> str:
+        names = self.categories()
+        lines = [f"Co3D({str(self.root)!r}, categories: {len(names)}"]
+        if names:
+            lines.append(textwrap.shorten(", ".join(names), 110, placeholder=" ..."))
+        if self._index is not None:
+            category, index = self._index
+            lines.append(f"in memory: {category}, {len(index.by_sequence)} sequences, {len(index.keys)} frames")
+        return "\n     ".join(lines) + ")"
+
     def categories(self) -> list[str]:
-        """Names of the folders that hold frame annotations, sorted."""
+        """List the folders that have frame annotations, sorted by name."""
         return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
 
     def sequences(self, category: str) -> list[SequenceAnnotation]:
-        """The category's sequences in file order.
+        """Read the sequence annotations of a category, in file order.
 
-        Raises InputError on what cannot be read or lacks a field.
+        Raises:
+            InputError: The category is unknown, or its annotations cannot be read or lack a field.
         """
         if category not in self._sequences:
             path = self._category_folder(category) / SEQUENCES_FILE
@@ -83,32 +102,52 @@ class Co3D:
         point_cloud_quality: float = 0.3,
         top: int | None = 10,
     ) -> list[SequenceAnnotation]:
-        """The sequences worth labelling: both scores above their bounds, best point clouds first, at most `top`.
+        """Select sequences for labelling by their quality scores.
 
-        The supplement's "Choice of evaluation categories & sequences"; a score that is not given passes no bound.
+        Follows the supplement, "Choice of evaluation categories & sequences".
+
+        Args:
+            category: Name of the category.
+            viewpoint_quality: The viewpoint quality score must be above it.
+            point_cloud_quality: The quality score of the point cloud must be above it.
+            top: Maximum number of sequences; None for all.
+
+        Returns:
+            The sequences that have both scores above their bounds, best point clouds first.
         """
-        scored = []
+        selected = []
         for sequence in self.sequences(category):
             cloud, views = sequence.point_cloud, sequence.viewpoint_quality_score
             score = None if cloud is None else cloud.quality_score
             if None not in (score, views) and score > point_cloud_quality and views > viewpoint_quality:
-                scored.append((-score, sequence.sequence_name, sequence))
-        return [sequence for *_, sequence in sorted(scored, key=lambda item: item[:2])[:top]]
+                selected.append(sequence)
+        selected.sort(key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name))
+        return selected[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
-        """Which frame stands at each position of the annotation file (what upstream's ids count)."""
+        """List the frames in the order of the annotation file, to which the ids of upstream's pairs refer."""
         return self._frame_index(category).keys
 
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
-        """The sequence's frames by frame number.
+        """Read the frame annotations of a sequence, sorted by frame number.
 
-        Raises InputError on an unknown sequence or a missing field.
+        Raises:
+            InputError: The sequence is unknown, or a field is missing.
         """
         index = self._frame_index(category)
         return [index.frame(position) for position in index.positions(sequence)]
 
     def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
-        """One frame by its number, which is not its position in `frames` where frames are missing."""
+        """Read the annotation of one frame.
+
+        Args:
+            category: Name of the category.
+            sequence: Name of the sequence.
+            frame_number: Number of the frame; it differs from the position in `frames` if frames are missing.
+
+        Raises:
+            InputError: The sequence or the frame is unknown, or a field is missing.
+        """
         index = self._frame_index(category)
         for position in index.positions(sequence):
             if index.keys[position].frame_number == frame_number:
@@ -116,7 +155,11 @@ class Co3D:
         raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
 
     def camera(self, annotation: FrameAnnotation) -> Camera:
-        """The frame's camera alone. Raises InputError where the annotation has no usable viewpoint."""
+        """Convert the viewpoint of a frame to a camera.
+
+        Raises:
+            InputError: The frame has no viewpoint, or an invalid one.
+        """
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         view = annotation.viewpoint
         if view is None:
@@ -129,11 +172,13 @@ class Co3D:
             raise InputError(f"frame {name}: {error}") from error
 
     def load(self, annotation: FrameAnnotation) -> Frame:
-        """The frame's image, camera and, where annotated, depth and mask.
+        """Load the image and camera of a frame, and its depth and mask if annotated.
 
-        Depth is unknown (0) where its file or its depth mask says so. Raises InputError where the annotation
-        has no viewpoint, a path leaves the data folder, or a file is missing,
-        corrupt or of another size than annotated.
+        Depth is 0 (unknown) where its file is 0 or the depth mask is 0.
+
+        Raises:
+            InputError: The frame has no viewpoint, a path leads out of the data folder, or a file is missing, corrupt
+                or of another size than annotated.
         """
         if not isinstance(annotation, FrameAnnotation):
             raise InputError(
@@ -149,8 +194,8 @@ class Co3D:
             reader = functools.partial(read_depth, scale_adjustment=annotation.depth.scale_adjustment)
             depth = self._read(reader, annotation.depth.path, size)
             if annotation.depth.mask_path is not None:
-                usable = self._read(read_mask, annotation.depth.mask_path, size) > 0
-                depth = np.where(usable, depth, np.float32(0))
+                valid = self._read(read_mask, annotation.depth.mask_path, size) > 0
+                depth = np.where(valid, depth, np.float32(0))
         return Frame(rgb, depth, mask, camera, name)
 
     def load_pair(self, pair: "Pair") -> tuple[Frame, list[Frame]]:
@@ -163,7 +208,7 @@ class Co3D:
             The reference frame and the target frames, in the order of `pair.target_frames`.
 
         Raises:
-            InputError: If a frame is not in the data set or cannot be loaded.
+            InputError: A frame is not in the data set or cannot be loaded.
         """
         reference = self.load(self.frame(pair.category, pair.reference_sequence, pair.reference_frame))
         targets = [self.load(self.frame(pair.category, pair.target_sequence, n)) for n in pair.target_frames]
@@ -172,7 +217,14 @@ class Co3D:
     def point_cloud(
         self, category: str, sequence: str
     ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-        """World points and colours of the sequence's point cloud. Raises InputError where there is none."""
+        """Read the point cloud of a sequence.
+
+        Returns:
+            Points (n, 3) in world coordinates, and 8-bit RGB colours (n, 3) or None.
+
+        Raises:
+            InputError: The sequence is unknown or has no point cloud, or the file cannot be read.
+        """
         for annotation in self.sequences(category):
             if annotation.sequence_name == sequence:
                 if annotation.point_cloud is None:
@@ -181,9 +233,10 @@ class Co3D:
         raise InputError(f"category {category} has no sequence {sequence!r}")
 
     def set_lists(self, category: str) -> dict[str, dict[str, list[tuple[str, int, str]]]]:
-        """The published splits, {file stem: {subset: [(sequence, frame number, image path), ...]}}, {} without any.
+        """Read CO3D's train and test splits: `set_lists.json` (v1) or `set_lists/*.json` (v2).
 
-        v1 has one `set_lists.json`, v2 a folder `set_lists/` of them.
+        Returns:
+            {file stem: {subset: [(sequence, frame number, image path), ...]}}; {} if the category has none.
         """
         folder = self._category_folder(category)
         paths = [folder / "set_lists.json"] if (folder / "set_lists.json").is_file() else []
@@ -207,14 +260,26 @@ class Co3D:
 
     def _frame_index(self, category: str) -> FrameIndex:
         if self._index is None or self._index[0] != category:
-            self._index = None  # free the last category's JSON before the next one is read
+            self._index = None  # frees the previous category's JSON before the next one is read
             self._index = category, read_frame_index(self._category_folder(category) / FRAMES_FILE)
         return self._index[1]
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceData:
-    """A sequence to be written: frames, their times (s), the point cloud in the frames' world, and scores."""
+    """Content of a sequence for `write_co3d`.
+
+    Attributes:
+        name: Name of the sequence.
+        frames: Frames, numbered from 0 in this order.
+        timestamps: Time of each frame, seconds.
+        points: (n, 3) point cloud in world coordinates.
+        colours: (n, 3) RGB colours of the points.
+        normals: (n, 3) normals of the points, or None.
+        viewpoint_quality: Viewpoint quality score, or None.
+        point_cloud_quality: Quality score of the point cloud, or None.
+        depth_scale_adjustment: CO3D's factor from stored depth to depth.
+    """
 
     name: str
     frames: Sequence[Frame]
@@ -224,7 +289,7 @@ class SequenceData:
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0  # what a stored depth is to be multiplied by
+    depth_scale_adjustment: float = 1.0
 
 
 def write_co3d(
@@ -236,10 +301,19 @@ def write_co3d(
 ) -> None:
     """Write sequences into `root / category` in CO3D's layout; the same input gives the same bytes.
 
-    Sequences that are there already stay; one of the same name is replaced. `quality` is JPEG's (0 to 100),
-    `intrinsics_format` v1's or v2's. The annotations are brought up to date after each sequence, each file in
-    one step, so an interrupted run leaves a folder that reads. Not for two writers in one category at a time.
-    Raises InputError on names that are not plain and on sequences whose parts do not fit together.
+    Other sequences in the folder are kept; those of the same names are replaced. The annotations are updated
+    atomically after each sequence, so the folder stays readable if the run is interrupted. Only one process may write
+    to a category at a time.
+
+    Args:
+        root: The data folder.
+        category: Name of the category.
+        sequences: The sequences.
+        quality: JPEG quality, 0 to 100.
+        intrinsics_format: "ndc_norm_image_bounds" (v1) or "ndc_isotropic" (v2).
+
+    Raises:
+        InputError: A name is not a plain folder name, or the parts of a sequence do not fit together.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
@@ -281,7 +355,7 @@ def _write_sequence(
             write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
             write_binary_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
-            # Summed over the stored 8-bit values: integers add up to the same on every machine.
+            # The stored 8-bit values are summed, because a sum of integers is the same on every machine.
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)

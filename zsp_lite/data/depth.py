@@ -1,6 +1,6 @@
-"""Depth maps: CO3D's 16-bit encoding, hole filling, and the 3D point behind each pixel or patch.
+"""Depth maps: CO3D's 16-bit encoding, in-painting, and the 3D point of each pixel or patch.
 
-A depth map is (H, W), along +z in the unit of the world; 0 means unknown.
+A depth map is (H, W), along +z in units of the world; 0 means unknown.
 """
 
 import cv2
@@ -12,27 +12,39 @@ from zsp_lite.errors import InputError
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
-    """Depth (float32, 0 = unknown) from a PNG's 16-bit values, whose bits are a float16 to be scaled.
+    """Decode CO3D's depth: the bits of each 16-bit value are those of a float16.
 
-    What is not finite or not positive is unknown.
+    Args:
+        bits: (H, W) values of the PNG.
+        scale_adjustment: Factor applied to the decoded depth.
+
+    Returns:
+        (H, W) depth, float32; values that are not finite or not positive become 0 (unknown).
     """
     depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
 def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> UInt16[np.ndarray, "h w"]:
-    """The inverse of `decode_depth`, to float16's relative precision of 2^-11."""
+    """Encode depth as the bits of float16 values (relative precision 2^-11); the inverse of `decode_depth`."""
     depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
-    # Beyond float16's range (65504) a value would become infinite: unknown, as what is not finite is.
+    # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
     return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
 
 
 def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
-    """Depth (float32) with the unknown pixels filled by OpenCV's Navier-Stokes in-painting.
+    """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting.
 
-    `radius` is in pixels. Known pixels keep their values; filled ones stay between the smallest and largest
-    known depth. Raises InputError where no pixel is known.
+    Args:
+        depth: (H, W) depth, 0 where unknown.
+        radius: Radius of the neighbourhood, pixels.
+
+    Returns:
+        (H, W) depth, float32. Known pixels are unchanged; filled ones are clipped to the range of the known depths.
+
+    Raises:
+        InputError: No pixel is known.
     """
     depth = np.ascontiguousarray(depth, dtype=np.float32)
     known = np.isfinite(depth) & (depth > 0)
@@ -42,12 +54,12 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
         return depth.copy()
     low, high = depth[known].min(), depth[known].max()
     filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), radius, cv2.INPAINT_NS)
-    filled = np.nan_to_num(filled, nan=low)  # the solver divides by weights that can vanish
+    filled = np.nan_to_num(filled, nan=low)  # OpenCV divides by weights that can be 0
     return np.where(known, depth, filled.clip(low, high))
 
 
 def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    """The camera-frame point behind each pixel's centre; unknown depth (0) gives the origin."""
+    """Compute the point (H, W, 3) of each pixel in camera coordinates; unknown depth (0) gives the origin."""
     depth = np.asarray(depth, dtype=np.float64)
     _check_size(depth, camera)
     height, width = depth.shape
@@ -58,22 +70,33 @@ def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.
 def patch_points(
     depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-    """One camera-frame point per patch of a (rows, cols) grid, and whether a known depth stands behind it.
+    """Compute one point per patch in camera coordinates.
 
-    A patch's point is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
-    silhouette the nearer surface is the object, and a single stray pixel does not decide. A patch without a
-    known depth takes the in-painted depth at its central pixel. (The paper in-paints and unprojects the matches; it
-    does not say which of a patch's 64 pixels it takes.) Raises InputError where the whole map is
-    unknown, the camera has another size, or the grid is finer than the image.
+    The point of a patch is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
+    silhouette the nearer surface is the object, and a percentile is robust to single outliers. A patch without known
+    depth takes the in-painted depth at its central pixel. (The paper in-paints the depth and unprojects the matches;
+    it does not say which of a patch's 64 pixels it takes.)
+
+    Args:
+        depth: (H, W) depth, 0 where unknown.
+        camera: Camera of the depth map.
+        grid: Rows and columns of patches.
+
+    Returns:
+        Points (rows, columns, 3), and (rows, columns) whether the patch has a known depth.
+
+    Raises:
+        InputError: No depth is known, the depth map and the camera differ in size, or the grid is finer than the
+            image.
     """
     depth = np.asarray(depth, dtype=np.float32)
     _check_size(depth, camera)
     if not all(0 < cells <= pixels for cells, pixels in zip(grid, depth.shape, strict=True)):
         raise InputError(f"patch grid is {tuple(grid)}, expected between 1 and the image's {depth.shape}")
-    rows, row_valid, row_middle = _bands(depth.shape[0], grid[0])
-    cols, col_valid, col_middle = _bands(depth.shape[1], grid[1])
+    rows, row_valid, row_middle = _split(depth.shape[0], grid[0])
+    cols, col_valid, col_middle = _split(depth.shape[1], grid[1])
 
-    # Pixel indices and depths of every patch, (rows, cols, pixels of a patch); infinity where unknown.
+    # Pixel indices and depths of every patch, (rows, cols, pixels per patch); infinity where unknown.
     shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
     pixel = np.broadcast_to(rows[:, None, :, None] * depth.shape[1] + cols[None, :, None, :], shape)
     pixel = pixel.reshape(*shape[:2], -1)
@@ -95,8 +118,13 @@ def patch_points(
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), filled.ravel()[index]), known
 
 
-def _bands(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`count` bands over `length` pixels: indices (count, widest), which are the band's own, band centres."""
+def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split `length` pixels into `count` bands.
+
+    Returns:
+        Pixel indices (count, width of the widest band), whether each index belongs to its band (same shape), and the
+        central index of each band (count,).
+    """
     edges = np.arange(count + 1) * length // count
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]

@@ -1,5 +1,10 @@
-"""One picture with all that is known about it, its object crop, and the only place that opens image files."""
+"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files.
 
+All image files are opened here.
+"""
+
+import base64
+import html
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +20,17 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image and, where known, its depth (0 = unknown pixel) and object mask (probability in [0, 1]).
+    """Image with its camera and, if known, its depth map and object mask.
 
-    Depth is along +z in the unit of the camera's world. Raises InputError where the parts do not fit together
-    or hold values outside their range.
+    Attributes:
+        rgb: (H, W, 3) colours, uint8.
+        depth: (H, W) depth along +z in units of the camera's world, 0 where unknown; or None.
+        mask: (H, W) probability that a pixel is on the object, in [0, 1]; or None.
+        camera: Camera of the image.
+        name: Name for error messages.
+
+    Raises:
+        InputError: Types or shapes do not fit together, or values are out of range.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -45,17 +57,35 @@ class Frame:
                 raise InputError(f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}")
             object.__setattr__(self, name, values)
 
+    def __repr__(self) -> str:
+        height, width = self.camera.size
+        depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
+        mask = "no mask" if self.mask is None else f"mask above 0.5 at {(self.mask > 0.5).mean():.0%}"
+        return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
+
+    def _repr_html_(self) -> str:
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(self.rgb[..., ::-1]))
+        image = base64.b64encode(data).decode()
+        return f'<img src="data:image/jpeg;base64,{image}" height="160"><br>{html.escape(repr(self))}'
+
     @property
     def _label(self) -> str:
         return f"frame {self.name}" if self.name else "frame"
 
 
 def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
-    """The object's box (top, left, height, width): where `mask` passes `threshold`, grown, within the image.
+    """Compute the bounding box of the mask above a threshold, padded and clipped to the image.
 
-    Height and width grow by the fraction `padding`, half of it on each side, as CO3D's own loader does. Where
-    no pixel passes, the threshold is lowered in steps of 0.05, down to "above 0".
-    Raises InputError on an empty mask.
+    Args:
+        mask: (H, W) probabilities.
+        threshold: Pixels above it count. If there is none, the threshold is lowered in steps of 0.05, down to 0.
+        padding: Fraction by which height and width grow, half of it on each side, as in CO3D's loader.
+
+    Returns:
+        (top, left, height, width), pixels.
+
+    Raises:
+        InputError: The mask is empty or not two-dimensional, or the threshold is not in [0, 1].
     """
     mask = np.asarray(mask)
     if not 0 <= threshold <= 1:
@@ -70,9 +100,10 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
 
 
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
-    """The frame cut to its object's box (see `mask_to_bbox`).
+    """Crop a frame to the bounding box of its object mask (see `mask_to_bbox`).
 
-    Raises InputError without a mask or with an empty one.
+    Raises:
+        InputError: The frame has no mask, or an empty one.
     """
     if frame.mask is None:
         raise InputError(f"{frame._label} has no object mask, expected one to crop to")
@@ -83,17 +114,25 @@ def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -
 
 
 def crop_frame(frame: Frame, box: Box) -> Frame:
-    """The frame cut to `box`, camera included. Raises InputError where the box leaves the image."""
+    """Crop a frame and its camera.
+
+    Args:
+        frame: The frame.
+        box: (top, left, height, width), pixels.
+
+    Raises:
+        InputError: The box is empty or extends beyond the image.
+    """
     top, left, height, width = box
     image_height, image_width = frame.camera.size
     if min(box) < 0 or height == 0 or width == 0 or top + height > image_height or left + width > image_width:
         raise InputError(f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}")
-    cut = np.s_[top : top + height, left : left + width]
+    inside = np.s_[top : top + height, left : left + width]
     return replace(
         frame,
-        rgb=frame.rgb[cut],
-        depth=None if frame.depth is None else frame.depth[cut],
-        mask=None if frame.mask is None else frame.mask[cut],
+        rgb=frame.rgb[inside],
+        depth=None if frame.depth is None else frame.depth[inside],
+        mask=None if frame.mask is None else frame.mask[inside],
         camera=frame.camera.crop(box),
     )
 
@@ -102,7 +141,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio.
 
     Colours are averaged (OpenCV's INTER_AREA) along a side that shrinks and interpolated along a side that grows.
-    Depth is taken from the nearest pixel, so that no values are made up at edges and holes. The mask is interpolated.
+    Depth is taken from the nearest pixel, since values interpolated at an edge or hole lie on no surface. The mask is
+    interpolated.
 
     Args:
         frame: The frame.
@@ -124,61 +164,75 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """An image file's colours, in the pixel grid as stored.
+    """Read the colours (H, W, 3) of an image file.
 
-    Raises InputError where it is missing or corrupt.
+    Raises:
+        InputError: The file is missing, truncated or corrupt.
     """
-    # An orientation tag would turn the picture against the camera that belongs to its stored pixels.
+    # An orientation tag is ignored, because the camera refers to the pixels as stored.
     image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """An 8-bit (or 1-bit) mask file as probabilities in [0, 1].
+    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1].
 
-    Raises InputError where missing or corrupt.
+    Raises:
+        InputError: The file is missing, truncated or corrupt.
     """
     return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
-    """A CO3D depth file (16-bit PNG of float16 bits) times `scale_adjustment`; 0 where unknown.
+    """Read a CO3D depth file: a 16-bit PNG that holds the bits of float16 values.
 
-    Raises InputError where the file is missing, corrupt or not 16-bit grey.
+    Args:
+        path: The file to read.
+        scale_adjustment: Factor applied to the stored depth.
+
+    Returns:
+        (H, W) depth, 0 where unknown.
+
+    Raises:
+        InputError: The file is missing, truncated or corrupt, or not a 16-bit greyscale PNG.
     """
     return decode_depth(read_grey16(path), scale_adjustment)
 
 
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
-    """A 16-bit grey PNG as stored. Raises InputError where it is missing, corrupt or of another kind."""
+    """Read the values (H, W) of a 16-bit greyscale PNG.
+
+    Raises:
+        InputError: The file is missing, truncated or corrupt, or not a 16-bit greyscale PNG.
+    """
     bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
-        raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit grey PNG")
+        raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
     return bits
 
 
 def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
-    """Write colours as JPEG of the given quality (0 to 100)."""
+    """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
     _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
-    """Write probabilities in [0, 1] as 8-bit PNG."""
+    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG."""
     _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
 
 
 def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> None:
-    """Write depth as a 16-bit PNG whose bits are the float16 of `depth / scale_adjustment`."""
+    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth / scale_adjustment`."""
     _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
 
 
 def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    """Write true and false as a 1-bit PNG, which reads as 255 and 0."""
+    """Write a boolean mask (H, W) as a 1-bit PNG, which reads as 255 and 0."""
     _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
-    """First and one past the last true index of a line, grown by `padding` in all and kept on the line."""
+    """Return the padded, clipped range [first, end) of the true values of a one-dimensional array."""
     first, last = np.flatnonzero(inside)[[0, -1]]
     margin = (last + 1 - first) * padding / 2
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
@@ -186,13 +240,13 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
 
 def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
-    # Decoders fill what a cut-off file lacks with grey and return it: look for the format's end mark as well, behind
-    # the last start of pixels, for a JPEG's preview has an end mark of its own.
+    # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
+    # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
     starts, ends = {b"\xff\xd8": (b"\xff\xda", b"\xff\xd9"), b"\x89P": (b"IDAT", b"IEND")}.get(data[:2], (b"", b""))
     complete = data and (not ends or data.rfind(ends) > data.rfind(starts))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
-    except cv2.error:  # a header that promises more pixels than OpenCV accepts
+    except cv2.error:  # the size in the header is beyond OpenCV's limit
         image = None
     if image is None:
         raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG")

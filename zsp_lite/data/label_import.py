@@ -1,4 +1,4 @@
-"""Upstream's pose labels and evaluation pairs brought into a data folder, and labels carried from CO3D v1 to v2."""
+"""Import of published pose labels and evaluation pairs, and transfer of labels from CO3D v1 to v2."""
 
 import hashlib
 import io
@@ -13,19 +13,18 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels
+from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels, rigid_label
 from zsp_lite.data.pairs import check_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder, fetch
 from zsp_lite.io.files import plain_name, read_bytes, write_atomic
-from zsp_lite.labelling.keypoints import rigid_label
 
-# Cameras of the same frames in v1 and v2 differ by a similarity, up to what the reconstruction was improved by.
+# Residual above which the camera centres of v1 and v2 are not related by a similarity.
 MAX_RESIDUAL = 0.05
-_FEWEST_CAMERAS = 4
-_KINDS = {"class_labels": ".json", "determ_eval": ".pt"}  # folders and their files' endings
-# What zipfile and tarfile raise for bytes that are cut or wrong, a password, or a compression they do not know.
-_BROKEN = (
+_MIN_CAMERAS = 4
+_EXTENSIONS = {"class_labels": ".json", "determ_eval": ".pt"}  # by folder
+# Exceptions of zipfile and tarfile for truncated, damaged or encrypted archives and unknown compression methods.
+_ARCHIVE_ERRORS = (
     zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError,
 )  # fmt: skip
 
@@ -33,19 +32,29 @@ _BROKEN = (
 def import_labels(
     source: str | Path, root: str | Path, sha256: str | None = None, replace: bool = False
 ) -> dict[str, int]:
-    """Bring labels and evaluation pairs from upstream's repository into the data folder `root`.
+    """Import pose labels and evaluation pairs of the published code into a data folder.
 
-    source: a local clone (a folder), an archive of one (.zip, .tar, .tar.gz), or the URL of such an archive.  sha256:
-    of the archive, required for a URL.  The files class_labels/CATEGORY/SEQ.json and determ_eval/SET/CATEGORY.pt are
-    taken, wherever these folders lie; all are checked before the first is written, nothing in them is executed.
-    replace: even files of these names that say something else.  Returns how many files of each kind came. Raises
-    InputError where the checksum differs, a file is not what it should be, one would be lost, the labels of a category
-    would have two reference sequences, or there are none.
+    Imports the files class_labels/CATEGORY/SEQ.json and determ_eval/SET/CATEGORY.pt at any depth of the source. All
+    files are checked before the first is written, and code in them is not executed.
+
+    Args:
+        source: A clone of the published repository (a folder), an archive of it (.zip, .tar, .tar.gz), or the URL of
+            an archive.
+        root: The data folder.
+        sha256: SHA-256 digest of the archive; required for a URL.
+        replace: Overwrite existing files of other content.
+
+    Returns:
+        Number of imported files by kind, "class_labels" and "determ_eval".
+
+    Raises:
+        InputError: The source has no such files or another digest, a file is invalid or would be overwritten, or a
+            category would have two reference sequences.
     """
     if not Path(root).is_dir():
-        raise InputError(f"data folder {root} is not there, expected a folder with categories in CO3D's layout")
+        raise InputError(f"data folder {root} does not exist, expected a folder with categories in CO3D's layout")
     files, labels = {}, {}
-    for path, data in _files(source, sha256):
+    for path, data in _read_files(source, sha256):
         kind, group, name = PurePosixPath(path).parts[-3:]
         group, name = plain_name(group, "folder"), plain_name(name, "file")
         if kind == "class_labels":
@@ -59,29 +68,41 @@ def import_labels(
             files[kind, Path(root) / kind / group / name] = data
     if not files:
         raise InputError(f"{source} holds no class_labels/CATEGORY/SEQ.json, expected a clone of the published code")
-    for category, brought in labels.items():
-        _check_one_reference(root, category, brought)
-    _write({path: data for (_, path), data in files.items()}, replace)
+    for category, imported in labels.items():
+        _check_one_reference(root, category, imported)
+    _write_all({path: data for (_, path), data in files.items()}, replace)
     kinds = [kind for kind, _ in files]
-    return {kind: kinds.count(kind) for kind in ("class_labels", "determ_eval")}
+    return {kind: kinds.count(kind) for kind in _EXTENSIONS}
 
 
 def transfer_labels(
     source: str | Path, target: str | Path, category: str, max_residual: float = MAX_RESIDUAL, replace: bool = False
 ) -> dict[str, float]:
-    """Labels made on `source` (CO3D v1) written for the same sequences of `target` (v2), whose worlds differ.
+    """Transfer the labels of a category from CO3D v1 to v2, where the sequences have other world coordinates.
 
-    The centres of the same frames' cameras are aligned by Umeyama with scale, sequence by sequence; labels are carried
-    along. Returns the residual of each sequence: root mean square distance, a share of the centres' spread. Raises
-    InputError, and writes nothing, where one exceeds `max_residual`, a sequence lacks in `target`, fewer than four
-    cameras are common, or `target` has labels of another reference sequence, or other ones and not `replace`.
+    For each sequence, the camera centres of the frames in both data sets are aligned by Umeyama's method with scale.
+
+    Args:
+        source: Data folder with labels (v1).
+        target: Data folder without (v2).
+        category: Name of the category.
+        max_residual: Largest accepted residual of a sequence.
+        replace: Overwrite existing labels of other content.
+
+    Returns:
+        Residual of each sequence: RMS distance of the aligned camera centres over their RMS distance from their mean.
+
+    Raises:
+        InputError: A residual is above `max_residual`, a sequence is not in `target`, fewer than four cameras are in
+            both data sets, or labels in `target` would be overwritten or have another reference sequence. Nothing is
+            written then.
     """
     labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
     if not labels:
         raise InputError(f"{source} has no labels of category {category}, expected class_labels/{category}/SEQ.json")
     (reference, *others) = {label.reference_seq for label in labels.values()}
     if others:
-        raise InputError(f"labels of {category} in {source} have several references, expected one")
+        raise InputError(f"labels of {category} in {source} have several reference sequences, expected one")
     worlds, residuals = {}, {}
     for name in dict.fromkeys([reference, *labels]):
         worlds[name], residuals[name] = align_worlds(old, new, category, name)
@@ -91,27 +112,41 @@ def transfer_labels(
                 f"alignment, expected at most {max_residual:g}; nothing was written"
             )
     centre = new.point_cloud(category, reference)[0].mean(axis=0)
-    carried = []
+    transferred = {}
     for name, label in labels.items():
-        rigid = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
-        trans = rigid_label(worlds[name] @ rigid @ worlds[reference].inverse(), centre, name, reference)
-        carried.append(PoseLabel(np.eye(4), name, reference) if name == reference else trans)
-    _check_one_reference(target, category, {label.seq: label for label in carried})
-    _write({label_folder(target, category) / f"{label.seq}.json": label_bytes(label) for label in carried}, replace)
+        similarity = worlds[name] @ Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3]) @ worlds[reference].inverse()
+        moved = rigid_label(similarity, centre, name, reference)
+        transferred[name] = PoseLabel(np.eye(4), name, reference) if name == reference else moved
+    _check_one_reference(target, category, transferred)
+    folder = label_folder(target, category)
+    _write_all({folder / f"{name}.json": label_bytes(label) for name, label in transferred.items()}, replace)
     return residuals
 
 
 def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Sim3, float]:
-    """The similarity from a sequence's world in one data set to that in another, and its residual (see above)."""
+    """Align a sequence's world coordinates in two data sets by the camera centres of the frames in both.
+
+    Args:
+        old: The one data set.
+        new: The other data set.
+        category: Name of the category.
+        sequence: Name of the sequence.
+
+    Returns:
+        The similarity from `old` to `new`, and its residual (see `transfer_labels`).
+
+    Raises:
+        InputError: Fewer than four frames have cameras in both data sets, or the centres are collinear.
+    """
     centres = [
         {one.frame_number: data.camera(one).centre for one in data.frames(category, sequence) if one.viewpoint}
         for data in (old, new)
     ]
     common = sorted(centres[0].keys() & centres[1].keys())
-    if len(common) < _FEWEST_CAMERAS:
+    if len(common) < _MIN_CAMERAS:
         raise InputError(
             f"sequence {category}/{sequence}: {len(common)} frames have cameras in both data sets, "
-            f"expected at least {_FEWEST_CAMERAS}"
+            f"expected at least {_MIN_CAMERAS}"
         )
     first, second = (np.array([one[number] for number in common]) for one in centres)
     sim3 = umeyama(first, second)
@@ -119,74 +154,77 @@ def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Si
     return sim3, float(np.sqrt(distance / np.square(second - second.mean(axis=0)).sum(axis=1).mean()))
 
 
-def _files(source: str | Path, sha256: str | None) -> Iterator[tuple[str, bytes]]:
-    """Relative paths and contents of the labels and pairs in a folder or archive."""
+def _read_files(source: str | Path, sha256: str | None) -> Iterator[tuple[str, bytes]]:
+    """Yield the relative paths and contents of labels and pairs in a folder, an archive, or an archive at a URL."""
     if str(source).startswith(("http://", "https://")):
-        if not sha256:
-            raise InputError(f"{source} needs its SHA-256, expected --sha256 with 64 hexadecimal digits")
-        name = hashlib.sha256(str(source).encode()).hexdigest()[:16]
-        path = cache_folder() / f"labels-{name}-{PurePosixPath(str(source)).name}"
-        fetch(str(source), path)
-        try:
-            yield from _files(path, sha256)
-        except InputError:
-            path.unlink(missing_ok=True)  # another try shall fetch it again
-            raise
-        return
-    source = Path(source)
-    if source.is_dir():
+        yield from _read_url(str(source), sha256)
+    elif Path(source).is_dir():
         if sha256:
             raise InputError(f"{source} is a folder, expected an archive or a URL where a SHA-256 is given")
-        for folder, ending in _KINDS.items():
-            for path in sorted(source.glob(f"**/{folder}/*/*{ending}")):
+        for folder, extension in _EXTENSIONS.items():
+            for path in sorted(Path(source).glob(f"**/{folder}/*/*{extension}")):
                 if path.is_file():
                     yield path.relative_to(source).as_posix(), read_bytes(path, "file")
-        return
-    data = read_bytes(source, "archive of labels")
+    else:
+        yield from _read_archive(Path(source), sha256)
+
+
+def _read_url(url: str, sha256: str | None) -> Iterator[tuple[str, bytes]]:
+    if not sha256:
+        raise InputError(f"{url} needs its SHA-256, expected --sha256 with 64 hexadecimal digits")
+    name = hashlib.sha256(url.encode()).hexdigest()[:16]
+    path = fetch(url, cache_folder() / f"labels-{name}-{PurePosixPath(url).name}")
+    try:
+        yield from _read_archive(path, sha256)
+    except InputError:
+        path.unlink(missing_ok=True)  # so that the next call downloads it again
+        raise
+
+
+def _read_archive(path: Path, sha256: str | None) -> Iterator[tuple[str, bytes]]:
+    data = read_bytes(path, "archive of labels")
     found = hashlib.sha256(data).hexdigest()
     if sha256 and found != sha256.lower():
-        raise InputError(f"archive {source} has SHA-256 {found}, expected {sha256.lower()}")
+        raise InputError(f"archive {path} has SHA-256 {found}, expected {sha256.lower()}")
     try:
         if zipfile.is_zipfile(io.BytesIO(data)):
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 for name in archive.namelist():
-                    if _is_taken(name):
+                    if _is_label_or_pairs(name):
                         yield name, archive.read(name)
             return
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             for member in archive:
-                if member.isfile() and _is_taken(member.name):
+                if member.isfile() and _is_label_or_pairs(member.name):
                     yield member.name, archive.extractfile(member).read()
-    except _BROKEN as error:
+    except _ARCHIVE_ERRORS as error:
         raise InputError(
-            f"archive {source} of {len(data)} bytes is broken, locked or none, expected .zip or .tar.gz"
+            f"archive {path} of {len(data)} bytes is damaged, encrypted or of another format, expected .zip or .tar.gz"
         ) from error
 
 
-def _is_taken(path: str) -> bool:
-    """Whether a file of an archive is a label or an evaluation set."""
+def _is_label_or_pairs(path: str) -> bool:
     parts = PurePosixPath(path).parts
-    return len(parts) >= 3 and parts[-3] in _KINDS and path.endswith(_KINDS[parts[-3]])
+    return len(parts) >= 3 and parts[-3] in _EXTENSIONS and path.endswith(_EXTENSIONS[parts[-3]])
 
 
-def _write(files: dict[Path, bytes], replace: bool) -> None:
-    """Write all files, or none where one of them stands there with other content and may not be replaced."""
-    lost = [path for path, data in files.items() if path.exists() and read_bytes(path, "file") != data]
-    if lost and not replace:
-        more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+def _write_all(files: dict[Path, bytes], replace: bool) -> None:
+    """Write all files; without `replace`, InputError and none is written if one exists with other content."""
+    conflicts = [path for path, data in files.items() if path.exists() and read_bytes(path, "file") != data]
+    if conflicts and not replace:
+        more = f" and {len(conflicts) - 1} more" if len(conflicts) > 1 else ""
         raise InputError(
-            f"{lost[0]}{more} would be replaced by other content, expected --replace where that is meant; "
-            "nothing was written"
+            f"{conflicts[0]}{more} would be replaced by other content, expected --replace to do so; nothing was written"
         )
     for path, data in files.items():
         write_atomic(path, data)
 
 
 def _check_one_reference(root: str | Path, category: str, new: dict[str, PoseLabel]) -> None:
-    """InputError where the category's labels, with the new ones over those that are there, have several references."""
+    """Raise InputError if the existing labels updated by the new ones have several reference sequences."""
     references = sorted({label.reference_seq for label in (read_labels(root, category) | new).values()})
     if len(references) > 1:
         raise InputError(
-            f"labels of {category} in {root} would have references {', '.join(references)}, expected one; "
+            f"labels of {category} in {root} would have reference sequences {', '.join(references)}, expected one; "
             "nothing was written"
         )

@@ -1,8 +1,7 @@
-"""Pose labels in the upstream form, and the ground-truth relative pose that they give with the cameras.
+"""Pose labels in the format of the published code, and ground-truth relative poses.
 
-A label is a rigid motion (unit scale, column vectors) from the point cloud of the category's reference
-sequence into the world of its own sequence; the reference sequence has the
-identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
+The label of a sequence is a rigid transform (column vectors) from the world of the category's reference sequence to the
+world of the sequence; the label of the reference sequence is the identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
 """
 
 import json
@@ -12,13 +11,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 
-# Labels are printed numbers; what deviates more than this from a rotation is no rigid motion.
+# Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
 _RIGID_TOLERANCE = 1e-3
 
 _Row = tuple[float, float, float, float]
@@ -32,7 +33,16 @@ class _LabelFile(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """`trans` (4, 4) takes points of `reference_seq`'s cloud into `seq`'s world. InputError where it is not rigid."""
+    """Pose label of a sequence.
+
+    Attributes:
+        trans: (4, 4) rigid transform from the world of `reference_seq` to the world of `seq`.
+        seq: Name of the sequence.
+        reference_seq: Name of the reference sequence.
+
+    Raises:
+        InputError: `trans` is not a finite rigid transform.
+    """
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -48,35 +58,49 @@ class PoseLabel:
         rotation = trans[:3, :3]
         deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
         if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid motion of unit scale")
+            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid transform")
         object.__setattr__(self, "trans", trans)
 
 
 def label_folder(root: str | Path, category: str) -> Path:
-    """Where the category's labels are or would be: ROOT/class_labels, or upstream's
-    ROOT/data/class_labels.
+    """Return the folder of a category's labels.
+
+    This is ROOT/class_labels/CATEGORY, or ROOT/data/class_labels/CATEGORY (the layout of the published code) if only
+    the latter exists.
     """
     folders = [Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
-    """The category's labels by sequence, sorted by name; {} where it has none.
+    """Read the labels of a category.
 
-    Raises InputError on a file that cannot be read, lacks a field, is not rigid, or speaks of another
-    sequence than its name says.
+    Returns:
+        Labels by sequence, sorted by name; {} if the category has none.
+
+    Raises:
+        InputError: A file cannot be read, lacks a field, is not rigid, or is the label of another sequence than its
+            name says.
     """
     labels = {}
     for path in sorted(label_folder(root, category).glob("*.json")):
         label = parse_label(read_bytes(path, "label"), str(path))
         if label.seq != path.stem:
-            raise InputError(f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as its name says")
+            raise InputError(f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as in its name")
         labels[label.seq] = label
     return labels
 
 
 def parse_label(data: bytes, where: str) -> PoseLabel:
-    """A label file's content. Raises InputError, naming `where` it came from, on what `read_labels` refuses."""
+    """Parse the content of a label file.
+
+    Args:
+        data: The JSON.
+        where: Name of the file, for error messages.
+
+    Raises:
+        InputError: The JSON is invalid, lacks a field, or is not rigid.
+    """
     label = decode(data, _LabelFile, where)
     try:
         return PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
@@ -85,29 +109,59 @@ def parse_label(data: bytes, where: str) -> PoseLabel:
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
-    """Write one label in one step, over an earlier one of the same sequence; returns the file's path."""
+    """Write a label atomically, replacing an earlier one of the same sequence, and return the path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
     write_atomic(path, label_bytes(label))
     return path
 
 
 def label_bytes(label: PoseLabel) -> bytes:
-    """What a label's file holds, in the upstream JSON form."""
+    """Encode a label as JSON in the format of the published code."""
     content = {"trans": label.trans.tolist(), "seq": label.seq, "reference_seq": label.reference_seq}
     return json.dumps(content).encode()
+
+
+def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
+    """Convert a similarity between two worlds to a label: its rotation, and the translation that maps `centre` alike.
+
+    The translation of the similarity itself would displace an object that is not at the origin, since a label has no
+    scale.
+
+    Args:
+        sim3: Similarity from the world of the reference sequence to the world of the sequence.
+        centre: (3,) object centre in the world of the reference sequence, such as the mean of its point cloud.
+        seq: Name of the sequence.
+        reference_seq: Name of the reference sequence.
+    """
+    centre = np.asarray(centre, dtype=np.float64)
+    trans = np.eye(4)
+    trans[:3, :3] = sim3.R
+    trans[:3, 3] = sim3.apply(centre) - sim3.R @ centre
+    return PoseLabel(trans, seq, reference_seq)
 
 
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Ground truth: what takes points of reference camera a's frame to target camera b's frame.
+    """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
 
-    `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)` ("Labelling pose for evaluation" in the supplementary, which writes
-    the composition from left to right). Raises InputError where the labels belong to different reference sequences.
+    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it from left to right.
+
+    Args:
+        label_a: Label T0a of the reference frame's sequence.
+        camera_a: Camera of the reference frame.
+        label_b: Label T0b of the target frame's sequence.
+        camera_b: Camera of the target frame.
+
+    Returns:
+        (4, 4) transform from the coordinates of camera a to those of camera b, for column vectors.
+
+    Raises:
+        InputError: The labels have different reference sequences.
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(
             f"labels of {label_a.seq} and {label_b.seq} refer to {label_a.reference_seq} and "
-            f"{label_b.reference_seq}, expected one reference sequence"
+            f"{label_b.reference_seq}, expected the same reference sequence"
         )
     return camera_b.matrix @ label_b.trans @ np.linalg.inv(label_a.trans) @ np.linalg.inv(camera_a.matrix)

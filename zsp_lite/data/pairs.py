@@ -1,7 +1,7 @@
-"""Evaluation pairs: one reference frame of a sequence against N target frames of another in its category.
+"""Evaluation pairs: a reference frame of one sequence and N target frames of another sequence of the category.
 
-The paper's section 5.1, "Evaluation setting". Pairs are sampled here or read from upstream's evaluation sets,
-torch files whose ids are positions in the category's frame list.
+See the paper's section 5.1, "Evaluation setting". Pairs are sampled, or read from the evaluation sets of the published
+code: torch files that refer to frames by their positions in the category's frame list.
 """
 
 import hashlib
@@ -23,7 +23,15 @@ _FIELDS = ("class", "reference_seq_name", "reference_frame_id", "target_seq_name
 
 @dataclass(frozen=True)
 class Pair:
-    """Frames are given by their `frame_number`."""
+    """A reference frame and the target frames to be compared with it.
+
+    Attributes:
+        category: Name of the category.
+        reference_sequence: Name of the sequence of the reference frame.
+        reference_frame: Frame number of the reference frame.
+        target_sequence: Name of the sequence of the target frames.
+        target_frames: Frame numbers of the target frames.
+    """
 
     category: str
     reference_sequence: str
@@ -33,27 +41,35 @@ class Pair:
 
     @property
     def key(self) -> str:
-        """Names the pair in results: equal for equal pairs, different for different ones."""
+        """Unique identifier of the pair, used in results."""
         targets = ",".join(map(str, self.target_frames))
         reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
         return f"{reference}/{self.target_sequence}:{targets}"
 
     @property
     def seed(self) -> int:
-        """What every draw on this pair starts from: a function of the key alone."""
+        """Seed of all random draws for this pair; it depends on the key only."""
         return _stable_hash(self.key)
 
 
 def sample_pairs(
     dataset: Co3D, category: str, n: int, n_targets: int, seed: int | np.random.Generator = 0
 ) -> list[Pair]:
-    """Draw `n` pairs with `n_targets` target frames each.
+    """Sample evaluation pairs of a category.
 
-    The reference goes round the category's labelled sequences in sorted order, the target is another of them
-    at random; the reference frame is random, the target frames are evenly spaced over the sequence from a
-    random start, in that order. An integer seed gives each category its own draws, and its first n pairs
-    whatever the n. Raises InputError on fewer than two labelled sequences or a
-    sequence of fewer than `n_targets` frames.
+    Reference sequences cycle through the labelled sequences in sorted order; the target sequence is a random other
+    one. The reference frame is random; the target frames are evenly spaced over the sequence, from a random start.
+
+    Args:
+        dataset: The data set, with labels.
+        category: Name of the category.
+        n: Number of pairs.
+        n_targets: Number of target frames per pair.
+        seed: Seed or generator. With an integer, the draws depend on the category and the seed only, and the pairs of
+            a smaller `n` are the first ones of a larger `n`.
+
+    Raises:
+        InputError: Fewer than two sequences are labelled, or a sequence has fewer than `n_targets` frames.
     """
     if n < 1 or n_targets < 1:
         raise InputError(f"pairs to sample are {n} with {n_targets} targets each, expected at least 1 and 1")
@@ -84,9 +100,10 @@ def sample_pairs(
 
 
 def labelled_categories(dataset: Co3D) -> list[str]:
-    """The categories that pairs can be made of: CO3D's folders hold more than anyone has labelled.
+    """List the categories with at least two labelled sequences.
 
-    Raises InputError where there is none.
+    Raises:
+        InputError: There is none.
     """
     categories = dataset.categories()
     if not categories:
@@ -100,16 +117,25 @@ def labelled_categories(dataset: Co3D) -> list[str]:
 
 
 def upstream_pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
-    """Where a data folder keeps its evaluation set: ROOT/determ_eval/{n}samples_{N}tgt/CATEGORY.pt."""
+    """Return the path of an evaluation set of `n` pairs: ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt."""
     folder = Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt"
     return folder / f"{plain_name(category, 'category')}.pt"
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """The data folder's own pairs with `n_targets` targets, from the first set of so many; [] where it has none.
+    """Read an evaluation set that is part of the data folder.
 
-    Sets lie in ROOT/determ_eval or, as upstream has them, in ROOT/data/determ_eval. Raises InputError as
-    `read_upstream_pairs`.
+    Args:
+        dataset: The data set; its sets are in ROOT/determ_eval or, as in the published code, ROOT/data/determ_eval.
+        category: Name of the category.
+        n_targets: Number of target frames per pair.
+        at_least: Smallest number of pairs of the set.
+
+    Returns:
+        The pairs of the first set that is large enough; [] if there is none.
+
+    Raises:
+        InputError: A set cannot be read (see `read_upstream_pairs`).
     """
     name = f"determ_eval/*samples_{n_targets}tgt/{plain_name(category, 'category')}.pt"
     for path in [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]:
@@ -120,36 +146,40 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
 
 
 def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
-    """The pairs of one upstream evaluation file, whose ids are positions in `dataset.frame_list(category)`.
+    """Read an evaluation set of the published code, whose ids are positions in `dataset.frame_list(category)`.
 
-    Nothing in the file is executed. Raises InputError on a file that holds more than plain data, has another
-    form, or does not fit the data set.
+    The file is loaded with `weights_only=True`, so code in it is not executed.
+
+    Raises:
+        InputError: The file holds more than plain data, has another structure, or does not fit the data set.
     """
     where = f"evaluation pairs {path}"
     pairs = []
     for number, item in enumerate(check_upstream_pairs(read_bytes(path, "evaluation pairs"), where)):
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)
         place = f"{where}, pair {number}"
-        pairs.append(
-            Pair(
-                category,
-                reference,
-                _frame_number(dataset, category, reference, reference_id, place),
-                target,
-                tuple(_frame_number(dataset, category, target, position, place) for position in target_ids),
-            )
-        )
+        reference_frame = _frame_number(dataset, category, reference, reference_id, place)
+        target_frames = tuple(_frame_number(dataset, category, target, position, place) for position in target_ids)
+        pairs.append(Pair(category, reference, reference_frame, target, target_frames))
     return pairs
 
 
 def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
-    """The content of an upstream evaluation file, as it stands there.
+    """Load an evaluation set of the published code and check its structure, without executing code in it.
 
-    Nothing in it is executed. Raises InputError, naming `where` it came from, on more than plain data and another form.
+    Args:
+        data: Content of the torch file.
+        where: Name of the file, for error messages.
+
+    Returns:
+        The dicts of the file, with `all_target_id` as a list or tuple.
+
+    Raises:
+        InputError: The file holds more than plain data, or has another structure.
     """
     try:
         items = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever its unpickler stumbles over
+    except Exception as error:  # torch does not limit the types of its exceptions here
         raise InputError(f"{where} are not a torch file of plain data") from error
     if not isinstance(items, list):
         raise InputError(f"{where} hold a {type(items).__name__}, expected a list of dicts")
@@ -167,7 +197,11 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
 
 
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
-    """Write pairs in the upstream form; InputError where the data set lacks one of their frames."""
+    """Write pairs as an evaluation set in the format of the published code.
+
+    Raises:
+        InputError: The data set lacks a frame of a pair.
+    """
     positions = {
         category: {(key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))}
         for category in dict.fromkeys(pair.category for pair in pairs)
@@ -182,13 +216,13 @@ def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D)
             raise InputError(f"pair {pair.key}: the data set has no frame {error.args[0]}") from error
         values = (pair.category, pair.reference_sequence, reference_id, pair.target_sequence, target_ids)
         items.append(dict(zip(_FIELDS, values, strict=True)))
-    buffer = io.BytesIO()  # a file name would go into the archive, and equal pairs would differ
+    buffer = io.BytesIO()  # torch.save to a file would store the file's name
     torch.save(items, buffer)
     write_atomic(path, buffer.getvalue())
 
 
 def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: str) -> int:
-    """The number of the frame at a position, which must be one of `sequence`."""
+    """Return the number of the frame at a position of the frame list; InputError if it is not in the sequence."""
     frames = dataset.frame_list(category)
     if isinstance(position, torch.Tensor) and position.numel() == 1:
         position = position.item()
@@ -200,5 +234,5 @@ def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: 
 
 
 def _stable_hash(text: str) -> int:
-    """63 bits that do not change from run to run, as Python's own hash of a string does."""
+    """Hash text to 63 bits; unlike Python's `hash`, the result is the same in every process."""
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1

@@ -1,13 +1,13 @@
-"""One's own RGB-D captures brought into CO3D's layout.
+"""Import of RGB-D captures into CO3D's layout.
 
-capture     a capture as all formats give it: images, depth, cameras in one world
-tum, nerfstudio, open3d_folder, lists    a reader for each format
-masks       the object in every frame: from a box by GrabCut, or given
-fusion      one point cloud of the object, and the scale that CO3D has
-convert     all of it in one call
+capture: a frame of a capture, and helpers of the readers
+tum, nerfstudio, open3d_folder, lists: one reader per format
+masks: object masks by GrabCut from a bounding box, or from files
+fusion: fused point cloud of the object, and its scale
+convert: the whole import
 """
 
-from zsp_lite.importers.capture import Capture, CaptureFrame
+from zsp_lite.importers.capture import CaptureFrame
 from zsp_lite.importers.convert import READERS, import_capture
 
-__all__ = ["READERS", "Capture", "CaptureFrame", "import_capture"]
+__all__ = ["READERS", "CaptureFrame", "import_capture"]

@@ -1,4 +1,4 @@
-"""A capture as every reader gives it: files, cameras, times; and what the readers share."""
+"""A frame of an RGB-D capture, and functions that the readers of the formats share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,26 +6,32 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside, read_bytes
 
-Pair = Sequence[float] | Float[np.ndarray, "2"]  # (x, y), pixels
-# Matrices in files are printed numbers; what deviates more is no rotation.
-_ROTATION_TOLERANCE = 2e-2
+# OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+# Largest deviation of a pose from a rigid transform: poses in files are decimal numbers of few digits.
+_RIGID_TOLERANCE = 2e-2
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
-    """One picture of a capture.
+    """Files and camera of a frame.
 
-    camera: of the image as stored (OpenCV axes, pixel centres at half-integers).  depth: a 16-bit PNG or a .npy file,
-    whose values times `depth_unit` are in the world's unit.  distortion: OpenCV's k1 k2 p1 p2 k3, () for none; camera,
-    image and depth are undistorted on loading.  A smaller depth map of the image's proportions, which phones store, is
-    enlarged to it.  time: seconds.
+    Attributes:
+        image: Image file.
+        depth: Depth file: a 16-bit PNG or .npy. A smaller depth map of the image's aspect ratio, as phones store it,
+            is enlarged to the size of the image.
+        camera: Camera of the image.
+        time: Time of the frame, seconds.
+        depth_unit: World units per stored depth value.
+        distortion: OpenCV's coefficients k1, k2, p1, p2, k3, or () for none. Image, depth and mask are undistorted.
+        mask: Mask file, or None.
     """
 
     image: Path
@@ -37,66 +43,73 @@ class CaptureFrame:
     mask: Path | None = None
 
     def load(self) -> Frame:
-        """The frame. Raises InputError where a file is missing, broken, or of another size than the camera's."""
+        """Load the frame.
+
+        Raises:
+            InputError: A file is missing, corrupt or of another size than the camera's image.
+        """
         size = self.camera.size
-        rgb = _sized(read_image(self.image), size, self.image)
-        depth = _enlarged(_read_depth(self.depth) * np.float32(self.depth_unit), size)
-        depth = _sized(depth, size, self.depth)
-        mask = None if self.mask is None else _sized(read_mask(self.mask), size, self.mask)
+        rgb = _check_size(read_image(self.image), size, self.image)
+        depth = _enlarge(_read_depth(self.depth) * np.float32(self.depth_unit), size)
+        depth = _check_size(depth, size, self.depth)
+        mask = None if self.mask is None else _check_size(read_mask(self.mask), size, self.mask)
         if any(self.distortion):
-            columns, rows = self._undistorted_pixels()
-            rgb = cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
-            depth = cv2.remap(depth, columns, rows, cv2.INTER_NEAREST)
-            mask = None if mask is None else cv2.remap(mask, columns, rows, cv2.INTER_LINEAR)
+            matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion, dtype=np.float64)
+            maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, size[::-1], cv2.CV_32FC1)
+            rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
+            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+            mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, depth, mask, self.camera, self.image.name)
 
-    def _undistorted_pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel of the undistorted image lies in the stored one; OpenCV counts from pixel centres."""
-        matrix = self.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        coefficients = np.array(self.distortion, dtype=np.float64)
-        return cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, self.camera.size[::-1], cv2.CV_32FC1)
 
-
-@dataclass(frozen=True)
-class Capture:
-    """The shots of one object, in the order in which they were taken, with cameras in one world."""
-
-    shots: tuple[CaptureFrame, ...]
-
-    def thinned(self, count: int) -> "Capture":
-        """At most `count` shots, evenly spread."""
-        if count < 1:
-            raise InputError(f"frames to keep are {count}, expected at least 1")
-        chosen = np.unique(np.linspace(0, len(self.shots) - 1, min(count, len(self.shots))).round().astype(int))
-        return Capture(tuple(self.shots[index] for index in chosen))
+def subsample(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
+    """Select at most `count` evenly spaced frames, with the first and the last."""
+    if count < 1:
+        raise InputError(f"maximum number of frames is {count}, expected at least 1")
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+    return [frames[index] for index in chosen]
 
 
 def camera_from_pose(
-    to_world: Float[np.ndarray, "4 4"],
-    focal: Pair,
-    principal_point: Pair,
+    pose: Float[np.ndarray, "4 4"],
+    focal_length: Sequence[float] | Real[np.ndarray, "2"],
+    principal_point: Sequence[float] | Real[np.ndarray, "2"],
     size: tuple[int, int],
     where: str,
 ) -> Camera:
-    """A camera from its pose in the world (OpenCV axes). Raises InputError, naming `where`, where it is not rigid."""
-    to_world = np.asarray(to_world, dtype=np.float64)
-    rotation = to_world[:3, :3]
+    """Create a camera from its pose.
+
+    Args:
+        pose: (4, 4) camera-to-world transform in OpenCV's axes. Its rotation is replaced by the nearest exact one.
+        focal_length: Focal lengths along x and y, pixels.
+        principal_point: Principal point (x, y), pixels.
+        size: Image (height, width), pixels.
+        where: File and line of the pose, for error messages.
+
+    Raises:
+        InputError: The pose is not rigid, or the intrinsics are invalid.
+    """
+    rotation = pose[:3, :3]
     if (
-        not np.isfinite(to_world).all()
-        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.abs(to_world[3] - (0, 0, 0, 1)).max() > _ROTATION_TOLERANCE  # such as a matrix column by column
+        not np.isfinite(pose).all()
+        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_TOLERANCE
+        or np.abs(pose[3] - (0, 0, 0, 1)).max() > _RIGID_TOLERANCE  # for instance a transposed matrix
     ):
-        raise InputError(f"{where}: pose is {to_world.tolist()}, expected a finite rigid camera-to-world matrix")
-    left, _, right = np.linalg.svd(rotation)  # printed with few digits: the nearest rotation
+        raise InputError(f"{where}: pose is {pose.tolist()}, expected a finite rigid camera-to-world matrix")
+    left, _, right = np.linalg.svd(rotation)
     rotation = left @ right
     try:
-        return Camera(rotation.T, -rotation.T @ to_world[:3, 3], np.array(focal), np.array(principal_point), size)
+        return Camera(rotation.T, -rotation.T @ pose[:3, 3], np.array(focal_length), np.array(principal_point), size)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
 
 def listed_file(folder: Path, relative: str, where: str) -> Path:
-    """A file that a list names. Raises InputError where it is not there or leads out of the capture's folder."""
+    """Return the path of a file named in a list.
+
+    Raises:
+        InputError: The file does not exist, or is not inside the folder.
+    """
     path = path_inside(folder, relative)
     if not path.is_file():
         raise InputError(f"{where}: file {relative} is not in {folder}")
@@ -104,9 +117,18 @@ def listed_file(folder: Path, relative: str, where: str) -> Path:
 
 
 def read_rows(path: Path, columns: int, what: str) -> list[tuple[int, list[str]]]:
-    """The lines of a text file that are no comments, split at blanks, with their numbers (from 1).
+    """Read the words of each line of a text file, without comments (#) and empty lines.
 
-    Raises InputError where one has fewer than `columns` words.
+    Args:
+        path: The file.
+        columns: Minimum number of words per line.
+        what: Kind of the file, for error messages.
+
+    Returns:
+        Line number (from 1) and words of each line.
+
+    Raises:
+        InputError: The file cannot be read, or a line has fewer words.
     """
     rows = []
     for number, line in enumerate(read_bytes(path, what).decode("utf-8", "replace").splitlines(), 1):
@@ -118,8 +140,8 @@ def read_rows(path: Path, columns: int, what: str) -> list[tuple[int, list[str]]
     return rows
 
 
-def numbers(words: Sequence[str], where: str) -> list[float]:
-    """Words as finite numbers, or InputError."""
+def parse_numbers(words: Sequence[str], where: str) -> list[float]:
+    """Convert words to finite numbers; InputError if one is not."""
     try:
         values = [float(word) for word in words]
     except ValueError as error:
@@ -130,7 +152,7 @@ def numbers(words: Sequence[str], where: str) -> list[float]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(height, width) of an image file."""
+    """Return (height, width) of an image file."""
     return read_image(path).shape[:2]
 
 
@@ -148,15 +170,15 @@ def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
 
 
-def _enlarged(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2"]:
-    """A smaller map of the same proportions, to a percent, at `size`; nearest values, for means lie on no surface."""
+def _enlarge(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2"]:
+    """Resize a smaller map whose aspect ratio agrees to 1 %, by the nearest values (means lie on no surface)."""
     (rows, columns), (height, width) = depth.shape, size
     if (rows, columns) != (height, width) and rows < height and abs(rows * width / (columns * height) - 1) < 0.01:
         return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     return depth
 
 
-def _sized(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+def _check_size(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
     if image.shape[:2] != tuple(size):
         raise InputError(f"{path} is {image.shape[:2]} pixels, expected the camera's (H, W) = {tuple(size)}")
     return image

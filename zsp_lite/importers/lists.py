@@ -1,8 +1,9 @@
-"""Plain lists: rgb.txt, depth.txt, poses.txt and intrinsics.txt, for captures of any other origin.
+"""Reader of captures given as plain text lists.
 
-rgb.txt and depth.txt name one file a line, poses.txt has one camera-to-world matrix a line (12 or 16 numbers, row by
-row, OpenCV axes: +x right, +y down, +z forward), intrinsics.txt the 3 x 3 matrix K in pixels, with pixel centres at
-half-integers (the image's middle is at half its width). Depth files are 16-bit PNGs, or .npy.
+rgb.txt, depth.txt: one file name per line; depth files are 16-bit PNGs or .npy
+poses.txt: one camera-to-world matrix per line, 12 or 16 numbers in row-major order, in OpenCV's axes (+x right,
+    +y down, +z forward)
+intrinsics.txt: the 3 x 3 matrix K in pixels, with pixel centres at half-integers
 """
 
 from pathlib import Path
@@ -11,20 +12,24 @@ import numpy as np
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
-    Capture,
     CaptureFrame,
     camera_from_pose,
     image_size,
     listed_file,
-    numbers,
+    parse_numbers,
     read_rows,
 )
 
 
-def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
-    """Line n of each list belongs together.  depth_unit: world units per stored value of depth.
+def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
+    """Read a capture: line n of each list describes frame n.
 
-    Raises InputError where a list is missing or broken, or their lengths differ.
+    Args:
+        folder: Folder of the lists.
+        depth_unit: World units per stored depth value.
+
+    Raises:
+        InputError: A list is missing or invalid, or the lists differ in length.
     """
     folder = Path(folder)
     columns = {"rgb.txt": 1, "depth.txt": 1, "poses.txt": 12}
@@ -32,26 +37,26 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> Capture:
     counts = {name: len(found) for name, found in rows.items()}
     if len(set(counts.values())) > 1 or not counts["rgb.txt"]:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"capture {folder}: lists have lines: {found}; expected equally many, at least 1")
+        raise InputError(f"capture {folder}: the lists have different numbers of lines or none: {found}")
     matrix = _intrinsics(folder / "intrinsics.txt")
-    size, shots = None, []
+    size, frames = None, []
     for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
         where = f"{folder / 'poses.txt'}, line {pose_line}"
-        values = numbers(pose, where)
+        values = parse_numbers(pose, where)
         if len(values) not in (12, 16):
             raise InputError(f"{where}: {len(values)} numbers, expected 12 or 16")
-        to_world = np.eye(4)
-        to_world[: len(values) // 4] = np.array(values).reshape(-1, 4)
+        pose = np.eye(4)
+        pose[: len(values) // 4] = np.array(values).reshape(-1, 4)
         path = listed_file(folder, image[0], f"{folder / 'rgb.txt'}, line {line}")
         size = size or image_size(path)
-        camera = camera_from_pose(to_world, matrix.diagonal()[:2], matrix[:2, 2], size, where)
+        camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2], size, where)
         depth_path = listed_file(folder, depth[0], f"{folder / 'depth.txt'}, line {line}")
-        shots.append(CaptureFrame(path, depth_path, camera, float(len(shots)), depth_unit))
-    return Capture(tuple(shots))
+        frames.append(CaptureFrame(path, depth_path, camera, float(len(frames)), depth_unit))
+    return frames
 
 
 def _intrinsics(path: Path) -> np.ndarray:
-    rows = [numbers(words, f"{path}, line {line}") for line, words in read_rows(path, 3, "intrinsics")]
+    rows = [parse_numbers(words, f"{path}, line {line}") for line, words in read_rows(path, 3, "intrinsics")]
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         raise InputError(f"intrinsics {path} have {len(rows)} lines, expected a 3 x 3 matrix in pixels")
     matrix = np.array(rows)

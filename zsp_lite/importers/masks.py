@@ -1,4 +1,4 @@
-"""The object in every frame of a capture: from one box by GrabCut, or from mask files."""
+"""Object masks of a capture: by GrabCut from one bounding box, or from mask files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,104 +13,132 @@ from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame, read_mask
 from zsp_lite.errors import InputError
 
-_ROUNDS = 4
-_GROWTH = 0.1  # of a box that is projected
-_BALL_DEPTH = 0.6  # of its radius, that the ball's centre lies behind the surface seen
+_ITERATIONS = 4  # of GrabCut
+_PADDING = 0.1  # of the projected bounding box, relative to its longer side
+_BALL_OFFSET = 0.6  # distance of the ball's centre behind the visible surface, relative to its radius
 _POINTS = 4000
 
 
 def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
-    """The frames with masks, given the object's box (top, left, height, width) in the first one.
+    """Segment the object in all frames, given its bounding box in the first one.
 
-    OpenCV's GrabCut (Rother, Kolmogorov and Blake, 2004) separates the colours inside and outside of each box. The
-    box of every other frame holds what is known of the object: the points that the frames before it saw, and a ball
-    as wide as the first box, for the sides that none of them saw.
-    Raises InputError where the box leaves the image, or a frame shows nothing of the object.
+    OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
+    every further frame is the projection of the object points of the previous frames and of a ball as wide as the first
+    box, which stands for the parts of the object that are not visible there.
+
+    Args:
+        frames: Frames with depth, in the order of the capture.
+        box: (top, left, height, width) of the object in the first frame, pixels.
+
+    Returns:
+        The frames with masks.
+
+    Raises:
+        InputError: The box extends beyond the image, or the object is not found in a frame.
     """
     height, width = frames[0].camera.size
     top, left, box_height, box_width = box
     if min(top, left) < 0 or min(box_height, box_width) < 4 or top + box_height > height or left + box_width > width:
         raise InputError(f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}")
-    made, points, ball = [], np.zeros((0, 3)), np.zeros((0, 3))
+    masked, points, ball = [], np.zeros((0, 3)), np.zeros((0, 3))
     for frame in frames:
-        if made:
-            box = _box_of(frame, np.concatenate([points, ball]))
+        if masked:
+            box = _project_box(frame, np.concatenate([points, ball]))
         mask = grab_cut(frame.rgb, box)
         if not mask.any():
-            raise InputError(f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected masks")
-        made.append(replace(frame, mask=mask))
-        points = np.concatenate([points, _object_points(made[-1])])
+            raise InputError(
+                f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected mask files"
+            )
+        masked.append(replace(frame, mask=mask))
+        points = np.concatenate([points, _object_points(masked[-1])])
         if not len(points):
-            raise InputError(f"frame {frame.name}: no known depth on the object, expected some to follow it by")
+            raise InputError(f"frame {frame.name}: no known depth on the object, expected some to track it")
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
-        if len(made) == 1:
-            ball = _ball(made[0], box)
-    return made
+        if len(masked) == 1:
+            ball = _ball(masked[0], box)
+    return masked
 
 
 def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]:
-    """The frames with the masks in `folder` that have their pictures' names (any extension).
+    """Read the masks of frames from files of the same names as the images, with any extension.
 
-    Raises InputError where one is missing or of another size.
+    Raises:
+        InputError: A mask is missing or of another size than the image.
     """
     files = {path.stem: path for path in sorted(Path(folder).glob("*")) if path.is_file()}
-    made = []
+    masked = []
     for frame in frames:
         stem = Path(frame.name).stem
         if stem not in files:
-            raise InputError(f"folder {folder} has no mask {stem}.png for the picture {frame.name}")
-        made.append(replace(frame, mask=read_mask(files[stem])))
-    return made
+            raise InputError(f"folder {folder} has no mask {stem}.png for the image {frame.name}")
+        masked.append(replace(frame, mask=read_mask(files[stem])))
+    return masked
 
 
 def grab_cut(rgb: np.ndarray, box: Box) -> Float[np.ndarray, "h w"]:
-    """0 or 1 per pixel: the object inside `box`, as far as its colours differ from those outside."""
+    """Segment the object inside a box by its colours.
+
+    Args:
+        rgb: (H, W, 3) image, uint8.
+        box: (top, left, height, width), pixels.
+
+    Returns:
+        (H, W) mask of 0 and 1: the largest connected foreground region, or 0 everywhere if there is none.
+
+    Raises:
+        InputError: The box covers the whole image, so there is no background.
+    """
     top, left, height, width = box
     labels = np.full(rgb.shape[:2], cv2.GC_BGD, np.uint8)
     labels[top : top + height, left : left + width] = cv2.GC_PR_FGD
     if (labels == cv2.GC_PR_FGD).all():
         raise InputError(f"box {tuple(box)} covers the whole image, expected some background around the object")
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.setRNGSeed(0)  # its clusters start at random
-    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), labels, None, *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
+    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     inside = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
     inside = cv2.morphologyEx(inside, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, parts, statistics, _ = cv2.connectedComponentsWithStats(inside)
+    count, regions, statistics, _ = cv2.connectedComponentsWithStats(inside)
     if count < 2:
         return np.zeros(inside.shape, np.float32)
-    return (parts == 1 + statistics[1:, cv2.CC_STAT_AREA].argmax()).astype(np.float32)
+    return (regions == 1 + statistics[1:, cv2.CC_STAT_AREA].argmax()).astype(np.float32)
 
 
 def _object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
-    """World points of the mask, but for its border, where depth may be the background's."""
+    """World points inside the mask, without its border, where depth may be that of the background."""
     inside = cv2.erode(frame.mask, np.ones((5, 5), np.uint8)) > 0.5
     depth = np.zeros(frame.camera.size, np.float32) if frame.depth is None else frame.depth
     return frame.camera.to_world(unproject_depth(depth, frame.camera)[inside & (depth > 0)])
 
 
 def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
-    """Points of the ball that the object may fill, given its box in the frame."""
+    """Points (n, 3) on a ball that may contain the object, given its bounding box in the frame."""
     top, left, height, width = box
     inside = (frame.mask > 0.5) & (frame.depth > 0)
     depth = float(np.median(frame.depth[inside]))
     radius = depth * max(width / frame.camera.focal_length[0], height / frame.camera.focal_length[1]) / 2
-    centre = frame.camera.unproject(np.array([left + width / 2, top + height / 2]), depth + _BALL_DEPTH * radius)
+    centre = frame.camera.unproject(np.array([left + width / 2, top + height / 2]), depth + _BALL_OFFSET * radius)
     directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))
     return centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _box_of(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
+def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
+    """Compute the padded bounding box of projected world points."""
     height, width = frame.camera.size
     pixels, depth = frame.camera.project(points)
     pixels = pixels[depth > 0]
     if not len(pixels):
-        raise InputError(f"frame {frame.name}: the object lies behind the camera, expected it in every frame")
+        raise InputError(
+            f"frame {frame.name}: the object is behind the camera, expected it to be visible in every frame"
+        )
     low, high = np.percentile(pixels, [1, 99], axis=0)
-    margin = _GROWTH / 2 * (high - low).max()
+    margin = _PADDING / 2 * (high - low).max()
     left, top = np.floor(low - margin).clip(0, (width - 1, height - 1)).astype(int)
     right, bottom = np.ceil(high + margin).clip(1, (width, height)).astype(int)
     if right - left < 4 or bottom - top < 4:
-        raise InputError(f"frame {frame.name}: the object is out of sight, expected it in every frame")
+        raise InputError(
+            f"frame {frame.name}: the object is outside the image, expected it to be visible in every frame"
+        )
     if right - left == width and bottom - top == height:
         left, top, right, bottom = 2, 2, width - 2, height - 2
     return int(top), int(left), int(bottom - top), int(right - left)

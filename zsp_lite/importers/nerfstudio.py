@@ -1,4 +1,7 @@
-"""nerfstudio's transforms.json with depth, as phone scanners export it: OpenGL cameras (+y up, looking along -z)."""
+"""Reader of nerfstudio's transforms.json with depth, which phone scanners export.
+
+Its cameras have OpenGL's axes (+y up, looking along -z).
+"""
 
 from pathlib import Path
 
@@ -7,7 +10,7 @@ import numpy as np
 
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Capture, CaptureFrame, camera_from_pose, listed_file
+from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, listed_file
 from zsp_lite.io.files import read_bytes
 
 FILE = "transforms.json"
@@ -17,7 +20,7 @@ _Row = tuple[float, float, float, float]
 
 
 class _Intrinsics(msgspec.Struct, kw_only=True):
-    """May stand for all frames, or with each."""
+    """Intrinsics, given for all frames together or for each frame."""
 
     fl_x: float | None = None
     fl_y: float | None = None
@@ -46,44 +49,46 @@ class _File(_Intrinsics, kw_only=True):
     depth_unit_scale_factor: float = 0.001
 
 
-def read_nerfstudio(folder: str | Path) -> Capture:
-    """The frames that have depth; files without it in the whole capture are an InputError.
+def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
+    """Read the frames that have depth.
 
-    Depth PNGs are in millimetres unless `depth_unit_scale_factor` says otherwise. Radial and tangential distortion is
-    taken out. Raises InputError for other camera models and missing intrinsics, naming the frame.
+    Stored depth is in millimetres unless the file has `depth_unit_scale_factor`. Radial and tangential distortion are
+    corrected on loading.
+
+    Args:
+        folder: Folder of transforms.json.
+
+    Raises:
+        InputError: The file is invalid, no frame has depth, the camera model is another one, intrinsics are missing, or
+            k4 is not 0.
     """
     path = Path(folder) / FILE
     content = decode(read_bytes(path, FILE), _File, path)
     if content.camera_model not in _MODELS:
         raise InputError(f"{path}: camera_model is {content.camera_model!r}, expected one of {', '.join(_MODELS)}")
-    shots = []
+    frames = []
     for number, frame in enumerate(content.frames):
         if frame.depth_file_path is None:
             continue
         where = f"{path}, frame {number}"
-        given = {name: _either(frame, content, name) for name in _Intrinsics.__struct_fields__}
+        given = {}
+        for name in _Intrinsics.__struct_fields__:
+            own, common = getattr(frame, name), getattr(content, name)
+            given[name] = common if own is None else own
         given["fl_y"] = given["fl_x"] if given["fl_y"] is None else given["fl_y"]
         missing = [name for name in ("fl_x", "cx", "cy", "w", "h") if given[name] is None]
         if missing:
             raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
         if given["k4"]:
-            raise InputError(f"{where}: k4 is {given['k4']}, expected 0, for OpenCV's distortion model has no r^8 term")
-        to_world = np.array(frame.transform_matrix) @ _TO_OPENCV
+            raise InputError(f"{where}: k4 is {given['k4']}, expected 0: OpenCV's distortion model has no r^8 term")
+        pose = np.array(frame.transform_matrix) @ _TO_OPENCV
         size = int(given["h"]), int(given["w"])
-        camera = camera_from_pose(to_world, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
-        files = [None if name is None else listed_file(Path(folder), name, where)
-                 for name in (frame.file_path, frame.depth_file_path, frame.mask_path)]  # fmt: skip
+        camera = camera_from_pose(pose, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
+        image, depth = (listed_file(Path(folder), name, where) for name in (frame.file_path, frame.depth_file_path))
+        mask = None if frame.mask_path is None else listed_file(Path(folder), frame.mask_path, where)
         distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
-        shots.append(
-            CaptureFrame(
-                files[0], files[1], camera, float(number), content.depth_unit_scale_factor, distortion, files[2]
-            )
-        )
-    if not shots:
+        unit = content.depth_unit_scale_factor
+        frames.append(CaptureFrame(image, depth, camera, float(number), unit, distortion, mask))
+    if not frames:
         raise InputError(f"{path}: none of {len(content.frames)} frames has depth_file_path, expected RGB-D frames")
-    return Capture(tuple(shots))
-
-
-def _either(frame: _Frame, content: _File, name: str) -> float | None:
-    own = getattr(frame, name)
-    return getattr(content, name) if own is None else own
+    return frames

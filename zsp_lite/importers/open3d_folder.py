@@ -1,4 +1,4 @@
-"""Open3D's RGB-D folders: color/ (or image/, rgb/), depth/ in millimetres, an intrinsic file and a trajectory log."""
+"""Reader of Open3D's RGB-D folders: color/ (or image/, rgb/), depth/, intrinsics as JSON, and a trajectory log."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Capture, CaptureFrame, camera_from_pose, numbers, read_rows
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, camera_from_pose, parse_numbers, read_rows
 from zsp_lite.io.files import read_bytes
 
 _COLOURS = "color", "image", "rgb"
@@ -20,13 +20,19 @@ _TRAJECTORIES = "trajectory.log", "scene/trajectory.log", "odometry.log"
 class _Intrinsic(msgspec.Struct):
     width: int
     height: int
-    intrinsic_matrix: list[float]  # column after column
+    intrinsic_matrix: list[float]  # column-major
 
 
-def read_open3d(folder: str | Path) -> Capture:
-    """Pictures and depth maps in the order of their names, the n-th of each with the n-th pose (camera to world).
+def read_open3d(folder: str | Path) -> list[CaptureFrame]:
+    """Read a capture: image, depth map and camera-to-world pose number n form frame n.
 
-    Depth is in millimetres, Open3D's default. Raises InputError where a part is missing or the numbers differ.
+    Images and depth maps are sorted by the numbers in their names. Depth is in millimetres, Open3D's default.
+
+    Args:
+        folder: The capture.
+
+    Raises:
+        InputError: A part is missing or invalid, or the numbers of images, depth maps and poses differ.
     """
     folder = Path(folder)
     colours = _images(folder, _COLOURS)
@@ -35,33 +41,34 @@ def read_open3d(folder: str | Path) -> Capture:
     given = decode(read_bytes(path, "intrinsic"), _Intrinsic, path)
     if len(given.intrinsic_matrix) != 9:
         raise InputError(f"intrinsic {path} has {len(given.intrinsic_matrix)} numbers in intrinsic_matrix, expected 9")
-    matrix = np.array(given.intrinsic_matrix).reshape(3, 3).T
+    matrix = np.array(given.intrinsic_matrix).reshape(3, 3).T + HALF_PIXEL
     trajectory = _first(folder, _TRAJECTORIES)
     poses = read_trajectory(trajectory)
     if not len(colours) == len(depths) == len(poses):
         raise InputError(
-            f"capture {folder} has {len(colours)} pictures, {len(depths)} depth maps and {len(poses)} poses, "
-            "expected equally many"
+            f"capture {folder} has {len(colours)} images, {len(depths)} depth maps and {len(poses)} poses, "
+            "expected equal numbers"
         )
-    shots = []
-    for number, (colour, depth, pose) in enumerate(zip(colours, depths, poses)):
-        # Open3D's pixel centres are at whole numbers, ours at half ones.
-        camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2] + 0.5, (given.height, given.width),
-                           f"{trajectory}, pose {number}")  # fmt: skip
-        shots.append(CaptureFrame(colour, depth, camera, float(number)))
-    return Capture(tuple(shots))
+    frames = []
+    for number, (colour, depth, pose) in enumerate(zip(colours, depths, poses, strict=True)):
+        size, where = (given.height, given.width), f"{trajectory}, pose {number}"
+        camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2], size, where)
+        frames.append(CaptureFrame(colour, depth, camera, float(number)))
+    return frames
 
 
 def read_trajectory(path: Path) -> list[Float[np.ndarray, "4 4"]]:
-    """The poses of a .log file: for each a line of three numbers and four lines of a matrix."""
+    """Read the (4, 4) poses of a .log file: per pose a line of three integers and four lines of a matrix."""
     rows = read_rows(path, 3, "trajectory")
     if not rows or len(rows) % 5:
-        raise InputError(f"trajectory {path} has {len(rows)} lines, expected five for each pose")
+        raise InputError(f"trajectory {path} has {len(rows)} lines, expected five per pose")
     poses = []
     for start in range(0, len(rows), 5):
-        lines = [numbers(words, f"trajectory {path}, line {number}") for number, words in rows[start + 1 : start + 5]]
+        lines = [
+            parse_numbers(words, f"trajectory {path}, line {number}") for number, words in rows[start + 1 : start + 5]
+        ]
         if any(len(line) != 4 for line in lines):
-            raise InputError(f"trajectory {path}, line {rows[start][0]}: expected four lines of four numbers after it")
+            raise InputError(f"trajectory {path}, line {rows[start][0]}: expected four lines of four numbers below it")
         poses.append(np.array(lines))
     return poses
 
@@ -75,7 +82,7 @@ def _images(folder: Path, names: tuple[str, ...]) -> list[Path]:
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Sorts 2.jpg before 10.jpg."""
+    """Sort key by the numbers in a name: 2.jpg before 10.jpg."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part) if part.isdigit() else -1, part) for part in parts]
 

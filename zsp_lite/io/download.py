@@ -1,4 +1,4 @@
-"""The only place that downloads: one file over HTTP, resumed where it stopped, checked, then named."""
+"""Download of a file over HTTP, with resume and checksum. Written here because pooch cannot resume a download."""
 
 import hashlib
 import http.client
@@ -15,16 +15,29 @@ CHUNK = 1 << 18  # bytes
 
 
 def cache_folder() -> Path:
-    """Where downloads are kept: $ZSP_LITE_CACHE, or ~/.cache/zsp-lite."""
+    """Return the folder of downloaded files: $ZSP_LITE_CACHE, or ~/.cache/zsp-lite."""
     return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
 
 
 def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str = "", timeout: float = 30.0) -> Path:
-    """Fetch `url` to `path` unless it is there; returns `path`.
+    """Download a file unless it exists.
 
-    Bytes gather in `path`.part; a later call, or the next of three attempts, asks the server for the rest
-    only. The file takes its name after its size (bytes, where known) and MD5 prefix were found right. Raises
-    InputError where the server cannot be reached, keeps breaking off, or sent another file.
+    Data is written to `path`.part, which is renamed after its size and checksum were verified. An interrupted download
+    is resumed, in up to three attempts and by later calls.
+
+    Args:
+        url: URL of the file.
+        path: Where to store it.
+        size: Expected size, bytes; None if unknown.
+        md5_prefix: Expected first digits of the MD5 digest.
+        timeout: Timeout of the connection, seconds.
+
+    Returns:
+        `path`.
+
+    Raises:
+        InputError: The server cannot be reached, the download was interrupted three times, or the size or checksum
+            differs.
     """
     path = Path(path)
     if path.exists():
@@ -37,13 +50,13 @@ def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str =
                 break
         else:
             raise InputError(
-                f"download of {url} broke off three times, last at {part.stat().st_size} bytes; call again to resume"
+                f"download of {url} was interrupted three times, at {part.stat().st_size} bytes; call again to resume"
             )
         if not has_size_and_hash(part, size, md5_prefix):
             received = part.stat().st_size
-            part.unlink()  # to resume from wrong bytes would fail for ever
+            part.unlink()  # resuming from wrong data would never succeed
             raise InputError(
-                f"download of {url} gave {received} bytes of another file, expected "
+                f"download of {url} gave another file of {received} bytes, expected "
                 f"{size if size is not None else 'any number of'} bytes with MD5 {md5_prefix or '(any)'}...; removed"
             )
         os.replace(part, path)
@@ -58,7 +71,7 @@ def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str =
 
 
 def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:
-    """Whether the file has that size (bytes, where known) and an MD5 that begins so."""
+    """Check the size of a file (bytes, if given) and the first digits of its MD5 digest."""
     if size is not None and path.stat().st_size != size:
         return False
     with open(path, "rb") as file:
@@ -67,7 +80,7 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
 
 
 def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
-    """One request for what `part` lacks; True when the transfer is complete, False when it broke off."""
+    """Request the missing rest of `part`. Returns True if the file is complete, False if interrupted."""
     start = part.stat().st_size if part.exists() else 0
     if size is not None and start == size:
         return True
@@ -77,7 +90,7 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
     try:
         response = urllib.request.urlopen(request, timeout=timeout)
     except urllib.error.HTTPError as error:
-        if error.code != 416:  # "range not satisfiable": nothing beyond what we have, or another file by now
+        if error.code != 416:  # 416 "range not satisfiable": complete already, or the file on the server changed
             raise
         if error.headers.get("Content-Range", "") == f"bytes */{start}":
             return True
@@ -87,7 +100,7 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
         if start and not (
             response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
         ):
-            start = 0  # no Range support: the server sends everything again
+            start = 0  # the server ignored the Range header and sends the whole file
         length = response.headers.get("Content-Length")
         total = start + int(length) if length is not None else None
         bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)

@@ -1,4 +1,4 @@
-"""Files on disk: atomic writes, reads that say what is wrong, and paths that must stay inside a folder."""
+"""Atomic writes, reads with errors that name the file, and checks of paths and names."""
 
 import os
 import secrets
@@ -12,14 +12,13 @@ from zsp_lite.errors import InputError
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path` so that a reader sees the old file or the new one, never half of one.
+    """Write a file atomically: a reader sees the old content or the new one, never a part.
 
-    Missing folders are made. The bytes go to a temporary neighbour first (same folder, hence same file
-    system), which then takes the name.
+    The data is written to a temporary file in the same folder, which is then renamed. Missing folders are created.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The process id alone would let two threads share a name.
+    # The random part is for threads, which share the process id.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:
         temporary.write_bytes(data)
@@ -29,7 +28,15 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:
-    """The bytes of `path`; InputError naming `what` it should be ("image", ...) where it cannot be read."""
+    """Read a file.
+
+    Args:
+        path: The file.
+        what: Its kind for error messages, such as "image".
+
+    Raises:
+        InputError: The file cannot be read.
+    """
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -38,29 +45,50 @@ def read_bytes(path: str | Path, what: str) -> bytes:
 
 
 def read_arrays(path: str | Path, names: tuple[str, ...], what: str) -> list[np.ndarray]:
-    """The arrays `names` of an .npz file; InputError naming `what` it should be where it is not, or is damaged."""
+    """Read arrays of an .npz file.
+
+    Args:
+        path: The file.
+        names: Names of the arrays.
+        what: Kind of the file for error messages.
+
+    Raises:
+        InputError: The file is missing or damaged, or lacks an array.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             return [file[name] for name in names]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{what} {path} are damaged or something else: {error}; remove it to make it anew") from error
+        raise InputError(f"{what} {path} cannot be read: {error}; delete the file to create it again") from error
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """`root / relative`, resolved; InputError where that leaves `root` (by `..`, an absolute path or a link)."""
+    """Resolve a path relative to a folder.
+
+    Raises:
+        InputError: The path leads out of the folder (by "..", as an absolute path or by a link).
+    """
     resolved_root = Path(root).resolve()
     try:
         resolved = (resolved_root / relative).resolve()
         inside = resolved.is_relative_to(resolved_root) and not Path(relative).is_absolute()
-    except (ValueError, OSError, RuntimeError) as error:  # a null byte, a name too long, a loop of links
-        raise InputError(f"path {relative!r} is not usable below {root}: {error}") from error
+    except (ValueError, OSError, RuntimeError) as error:  # null byte, name too long, cyclic links
+        raise InputError(f"path {relative!r} in {root} is invalid: {error}") from error
     if not inside:
-        raise InputError(f"path {relative!r} leaves the data folder {root}; expected a path inside it")
+        raise InputError(f"path {relative!r} leads out of the data folder {root}, expected a path inside")
     return resolved
 
 
 def plain_name(name: str, what: str) -> str:
-    """`name`, where it is fit to be one folder's or file's; InputError where it would lead elsewhere."""
+    """Return `name` if it is a valid name of a single file or folder.
+
+    Args:
+        name: The name.
+        what: What it names, for the error message.
+
+    Raises:
+        InputError: The name is empty, begins with a dot, or contains a separator.
+    """
     if not isinstance(name, str) or not name or name.startswith(".") or any(c in "/\\:\0" for c in name):
         raise InputError(f"{what} name is {name!r}, expected a plain folder name")
     return name

@@ -1,4 +1,4 @@
-"""The one place that imports Open3D, lazily."""
+"""Import of Open3D. All other modules call `load_open3d` instead of importing it."""
 
 import ctypes
 import functools
@@ -10,10 +10,9 @@ import sys
 def load_open3d():
     """Import and return the `open3d` module.
 
-    Open3D's Linux wheels link against libusb-1.0, which a bare machine lacks. The wheel `libusb-package` carries that
-    shared object; loading it with global symbols first satisfies the linker without root. In a notebook Open3D would
-    start a web server for its own viewer, which nothing here uses, and print that it did: it is told not to, unless
-    the environment says otherwise.
+    Open3D's Linux wheels link against libusb-1.0, which is often not installed. The package `libusb-package` contains
+    that library; it is loaded first, with global symbols. Open3D's web viewer is disabled unless the environment
+    variable is set, because in a notebook it starts a server and prints a message.
     """
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     if sys.platform.startswith("linux"):

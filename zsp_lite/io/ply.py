@@ -1,4 +1,4 @@
-"""Point clouds as PLY files."""
+"""Reading and writing of point clouds in PLY files."""
 
 import io
 import re
@@ -31,7 +31,7 @@ def write_ply(
         normals: Normals, (n, 3); zeros if not given.
 
     Raises:
-        InputError: If the arrays differ in length.
+        InputError: The arrays differ in length.
     """
     vertices = np.zeros(len(points), dtype=_VERTEX)
     normals = np.zeros(points.shape) if normals is None else normals
@@ -57,8 +57,7 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
         if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken as [0, 255] otherwise.
 
     Raises:
-        InputError: If the file is missing, truncated or empty, is not a point cloud, or has positions that are not
-            finite.
+        InputError: The file is missing, truncated, empty or not a point cloud, or has positions that are not finite.
     """
     data = read_bytes(path, "point cloud")
     try:

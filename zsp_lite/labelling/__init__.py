@@ -9,7 +9,8 @@ desktop     Open3D's picking window, driven from the terminal
 The notebook's widget is `zsp_lite.widgets.labelling`.
 """
 
-from zsp_lite.labelling.keypoints import Alignment, align_picks, rigid_label
+from zsp_lite.data.labels import rigid_label
+from zsp_lite.labelling.keypoints import Alignment, align_picks
 from zsp_lite.labelling.session import Labelling
 
 __all__ = ["Alignment", "Labelling", "align_picks", "rigid_label"]

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3, umeyama
-from zsp_lite.data.labels import PoseLabel
 from zsp_lite.errors import InputError
 
 MIN_KEYPOINTS = 4
@@ -52,19 +51,6 @@ def align_picks(reference: ArrayLike, picks: ArrayLike, names: Sequence[str] = (
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
-
-
-def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """The label of a similarity between two worlds: its rotation, and the translation that leaves `centre` in place.
-
-    centre: (3,) in the reference's world, such as its cloud's mean. Without the scale, the translation of the
-    similarity itself would move an object that does not stand at the origin; this one lays centre on centre.
-    """
-    centre = np.asarray(centre, dtype=np.float64)
-    trans = np.eye(4)
-    trans[:3, :3] = sim3.R
-    trans[:3, 3] = sim3.apply(centre) - sim3.R @ centre
-    return PoseLabel(trans, seq, reference_seq)
 
 
 def _check_apart(points: Float[np.ndarray, "n 3"], whose: str, names: Sequence[str]) -> None:

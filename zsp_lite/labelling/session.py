@@ -15,10 +15,10 @@ from jaxtyping import Float, Real
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import SequenceAnnotation, Triple, decode
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, write_label
+from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name, read_bytes, write_atomic
-from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks, rigid_label
+from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
