@@ -1,6 +1,7 @@
-"""README.md, docs/ and other pages: links lead somewhere, names exist, commands parse, the README's code runs."""
+"""README.md, docs/, notebooks' text: links lead somewhere, names exist, commands parse, the README's code runs."""
 
 import importlib
+import json
 import re
 import shlex
 from pathlib import Path
@@ -18,6 +19,8 @@ PAGES = [
     *sorted((REPOSITORY / "docs").glob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
     REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
+    *sorted((REPOSITORY / "notebooks").glob("*.ipynb")),
+    *sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb")),
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
@@ -25,19 +28,27 @@ _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 
+def markdown(page: Path) -> str:
+    """The text of a Markdown file, or of a notebook's Markdown cells."""
+    if page.suffix != ".ipynb":
+        return page.read_text()
+    cells = json.loads(page.read_text())["cells"]
+    return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
 def python_blocks(page: Path) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", markdown(page), re.DOTALL)
 
 
 def command_blocks(page: Path) -> list[str]:
     """The lines of indented code blocks, with continued lines joined."""
-    lines = [line[4:] for line in page.read_text().splitlines() if line.startswith("    ")]
+    lines = [line[4:] for line in markdown(page).splitlines() if line.startswith("    ")]
     return "\n".join(lines).replace("\\\n", " ").splitlines()
 
 
 def headings(page: Path) -> set[str]:
     """The anchors that GitHub makes of a page's headings."""
-    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    text = re.sub(r"```.*?```", "", markdown(page), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -48,7 +59,7 @@ def test_the_readme_has_at_most_150_lines():
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page):
-    for link in _LINK.findall(page.read_text()):
+    for link in _LINK.findall(markdown(page)):
         if "://" in link:
             continue
         path, _, anchor = link.partition("#")
@@ -65,7 +76,7 @@ def test_the_index_links_to_every_page():
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_module_and_file_of_the_package_that_is_named_exists(page):
-    text = page.read_text()
+    text = markdown(page)
     for name in re.findall(r"\bzsp_lite(?:\.\w+)+", text):
         module, *attributes = name.split(".")
         found = importlib.import_module(module)
@@ -80,10 +91,8 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
-    named = set(re.findall(r"\bZSP_LITE_\w+", page.read_text()))
-    named |= {
-        code for code in _INLINE_CODE.findall(page.read_text()) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)
-    }
+    named = set(re.findall(r"\bZSP_LITE_\w+", markdown(page)))
+    named |= {code for code in _INLINE_CODE.findall(markdown(page)) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)}
     for name in named:
         assert any(name.removeprefix("$") in path.read_text() for path in files), name
 
@@ -91,7 +100,7 @@ def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_make_target_that_is_named_exists(page):
     targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
-    commands = [*_INLINE_CODE.findall(page.read_text()), *command_blocks(page)]
+    commands = [*_INLINE_CODE.findall(markdown(page)), *command_blocks(page)]
     for command in commands:
         if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
             assert set(words) <= targets, command
@@ -139,7 +148,7 @@ def test_every_command_and_option_in_running_text_exists(page):
     commands = [*cli.commands.values()]
     commands += [one for command in commands for one in getattr(command, "commands", {}).values()]
     options = {option for command in commands for option in options_of(command)} | {"--force"}  # nbgrader's
-    for code in _INLINE_CODE.findall(page.read_text()):
+    for code in _INLINE_CODE.findall(markdown(page)):
         words = code.split()
         if words[0] == "zsp-lite" and len(words) > 1 and words[1] != "COMMAND":
             command = cli.commands[words[1]]
@@ -159,7 +168,7 @@ def test_every_benchmark_row_that_is_named_exists(page):
         words = shlex.split(command, comments=True)
         if "--methods" in words:
             assert set(words[words.index("--methods") + 1].split(",")) <= known, command
-    for code in _INLINE_CODE.findall(page.read_text()):
+    for code in _INLINE_CODE.findall(markdown(page)):
         if re.fullmatch(r"(ours|verified|rootsift|oracle)-[\w-]+", code):
             assert code in known, code
 
