@@ -70,7 +70,7 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
 
 
-def test_a_rotation_of_few_decimals_is_taken_for_the_nearest_one():
+def test_a_rounded_rotation_is_replaced_by_the_nearest_rotation():
     exact = random_camera(3)
     short = replace(exact, R=exact.R.round(4))
     assert 1e-6 < np.abs(exact.R.round(4) @ exact.R.round(4).T - np.eye(3)).max() < 1e-3
@@ -92,7 +92,7 @@ def test_v2_intrinsics_worked_out_by_hand():
     np.testing.assert_allclose(camera.principal_point, [95, 60])
 
 
-def test_what_is_left_and_up_in_pytorch3d_has_small_pixel_coordinates():
+def test_left_and_up_in_pytorch3d_are_small_pixel_coordinates():
     camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 0], [1, 1], [0, 0], (100, 100))
     pixel, depth = camera.project(np.array([0.5, 0.5, 1.0]))  # +x is left, +y is up there
     np.testing.assert_allclose(pixel, [25, 25])
@@ -157,7 +157,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"size": (np.inf, 5)}, "image size is .*inf"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(changes, message):
+def test_invalid_cameras_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         view(**changes)
 

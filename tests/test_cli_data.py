@@ -22,7 +22,7 @@ def root(tmp_path):
     return folder
 
 
-def test_a_complete_folder_passes_the_check_and_a_broken_one_does_not(root, capsys):
+def test_the_check_passes_a_complete_folder_and_no_broken_one(root, capsys):
     assert main(["data", "check", str(root)]) == 0
     text = capsys.readouterr().out
     assert "chair" in text and "No problems" in text
@@ -70,7 +70,7 @@ def test_label_lists_the_progress_and_draws_a_contact_sheet(root, tmp_path, caps
     assert "expected the name of a .png file" in capsys.readouterr().err
 
 
-def test_label_without_a_desktop_is_one_line(root, monkeypatch, capsys):
+def test_label_without_a_desktop_gives_one_line(root, monkeypatch, capsys):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -96,7 +96,7 @@ def test_label_without_a_desktop_is_one_line(root, monkeypatch, capsys):
         (["label", "/nowhere", "chair"], "does not exist"),
     ],
 )  # fmt: skip
-def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
+def test_bad_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
     code, error = main(arguments), capsys.readouterr().err
     assert code == 2 and message in error and len(error.strip().splitlines()) == 1
 

@@ -64,7 +64,7 @@ def test_a_frame_key_cannot_be_loaded_and_the_error_names_the_alternative(root):
 
 
 @pytest.mark.parametrize("intrinsics_format", [V1, V2])
-def test_what_is_written_is_read(tmp_path, intrinsics_format):
+def test_written_data_is_read_back(tmp_path, intrinsics_format):
     written = sequence_data("b_2", depth_scale_adjustment=1.7)
     write_co3d(tmp_path, "chair", [written], intrinsics_format=intrinsics_format)
     dataset = Co3D(tmp_path)
@@ -84,7 +84,7 @@ def test_what_is_written_is_read(tmp_path, intrinsics_format):
     np.testing.assert_array_equal(colours, written.colours)
 
 
-def test_the_layout_is_co3ds(root):
+def test_written_files_have_the_layout_of_co3d(root):
     names = {path.name for path in (root / "chair").iterdir()}
     assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
     inside = {str(path.relative_to(root / "chair/a_1")) for path in (root / "chair/a_1").rglob("*.*")}
@@ -101,7 +101,7 @@ def test_the_layout_is_co3ds(root):
     assert "meta" not in entry
 
 
-def test_the_format_of_intrinsics_is_told_frame_by_frame(tmp_path):
+def test_each_frame_has_its_own_format_of_intrinsics(tmp_path):
     old, new = sequence_data("old", frames=1), sequence_data("new", frames=1)
     write_co3d(tmp_path, "chair", [old], intrinsics_format=V1)
     write_co3d(tmp_path, "chair", [new], intrinsics_format=V2)
@@ -156,14 +156,14 @@ def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
     assert dataset.frame("chair", "a_1", 2).image.path == "chair/a_1/images/frame000003.jpg"
 
 
-def test_members_that_the_reader_does_not_know_are_ignored(root):
+def test_unknown_fields_are_ignored(root):
     change_first_frame(root, novelty={"deep": [1, 2]}, meta={"frame_type": "x"})
     edit_json(root / "chair" / "sequence_annotations.jgz", lambda items: items[0].update(novelty=1))
     assert first(root).meta == {"frame_type": "x"}
     assert len(Co3D(root).sequences("chair")) == 2
 
 
-def test_what_may_be_null_may_be_null(root):
+def test_optional_fields_may_be_null(root):
     change_first_frame(root, depth=None, mask=None)
     frame = Co3D(root).load(first(root))
     assert frame.depth is None and frame.mask is None
@@ -210,7 +210,7 @@ def test_a_camera_that_is_not_finite_fails_alone_and_by_name(root):
         dataset.frames("chair", "b_2")
 
 
-def test_a_matrix_that_is_no_rotation_is_refused_with_its_frame(root):
+def test_a_viewpoint_that_is_no_rotation_is_refused_with_its_frame(root):
     edit_json(frames_file(root), lambda frames: frames[0]["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]))
     with pytest.raises(InputError, match="frame b_2/0: camera R"):
         Co3D(root).load(first(root))
@@ -263,7 +263,7 @@ def test_paths_that_leave_the_folder_are_refused(root, path):
         Co3D(inside).point_cloud("chair", "b_2")
 
 
-def test_links_that_stay_inside_the_folder_are_fine(root):
+def test_links_inside_the_folder_are_followed(root):
     os.symlink(root / "chair", root / "alias")
     change_first_frame(root, image={"path": "alias/b_2/images/frame000001.jpg", "size": [24, 32]})
     assert Co3D(root).load(first(root)).rgb.shape == (24, 32, 3)
@@ -282,7 +282,7 @@ def test_the_depth_mask_makes_depth_unknown(root):
 
 
 @pytest.mark.parametrize("part", ["image", "depth", "mask"])
-def test_files_of_another_size_or_none_are_refused(root, part):
+def test_missing_files_and_files_of_another_size_are_refused(root, part):
     annotation = first(root)
     path = root / getattr(annotation, part).path
     path.unlink()
@@ -317,7 +317,7 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
     assert len(dataset.select("chair", viewpoint_quality=0, point_cloud_quality=0)) == 5
 
 
-def test_set_lists_are_found_in_both_places(root):
+def test_set_lists_are_read_in_both_layouts(root):
     assert Co3D(root).set_lists("chair") == {}
     entry = ["a_1", 0, "chair/a_1/images/frame000001.jpg"]
     (root / "chair/set_lists.json").write_text(json.dumps({"train_known": [entry]}))
@@ -327,7 +327,7 @@ def test_set_lists_are_found_in_both_places(root):
     assert lists == {"set_lists": {"train_known": [tuple(entry)]}, "set_lists_fewview_dev": {"val": []}}
 
 
-def test_sequences_that_do_not_fit_together_are_refused(tmp_path):
+def test_sequences_of_inconsistent_parts_are_refused(tmp_path):
     data = sequence_data("a_1")
     with pytest.raises(InputError, match="plain folder name"):
         write_co3d(tmp_path, "../chair", [data])

@@ -23,7 +23,7 @@ def frame_file(root, part, sequence="a"):
     return sorted((root / "chair" / sequence / part).iterdir())[0]
 
 
-def test_a_whole_folder_has_no_problems(root):
+def test_a_complete_folder_has_no_problems(root):
     dataset = Co3D(root)
     write_upstream_pairs(upstream_pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
     (check,) = check_folder(root, deep=True)
@@ -57,13 +57,13 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
     assert len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
 
 
-def test_a_camera_that_is_none_is_named(root):
+def test_an_invalid_camera_is_named(root):
     edit_json(root / "chair" / "frame_annotations.jgz", lambda frames: frames[1]["viewpoint"].update(T=[0, None, 1]))
     (check,) = check_folder(root)
     assert len(check.problems) == 1 and "viewpoint" in check.problems[0]
 
 
-def test_labels_of_nothing_and_of_two_references_are_named(root):
+def test_labels_of_unknown_sequences_and_of_two_references_are_named(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "q"))
     (check,) = check_folder(root)
     assert check.labelled == 3 and check.usable == 2
@@ -71,7 +71,7 @@ def test_labels_of_nothing_and_of_two_references_are_named(root):
     assert any("references a, q, expected one" in line for line in check.problems)
 
 
-def test_what_is_no_data_folder_is_refused(tmp_path):
+def test_a_folder_without_categories_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no category"):
         check_folder(tmp_path)
     with pytest.raises(InputError, match="does not exist"):

@@ -25,7 +25,7 @@ def test_the_bits_are_those_of_a_float16():
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
 
 
-def test_what_is_no_positive_number_is_unknown():
+def test_values_that_are_not_positive_and_finite_are_unknown():
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
     assert not decode_depth(np.array([[infinite, nan, negative, 0]], np.uint16)).any()
     assert not encode_depth(np.array([[np.inf, np.nan, -1, 1e9]])).any()
@@ -58,7 +58,7 @@ def test_complete_depth_needs_no_filling_and_none_at_all_is_refused():
         inpaint_depth(np.zeros((5, 6)))
 
 
-def test_the_structured_cloud_projects_onto_its_own_pixels():
+def test_unprojected_depth_projects_onto_its_own_pixels():
     camera = random_camera(3, (7, 9))
     depth = np.random.default_rng(0).uniform(1, 2, (7, 9))
     pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
@@ -118,7 +118,7 @@ def test_patches_need_not_divide_the_image():
     assert points[1, 2, 2] == np.sort(depth[2:, 4:].ravel())[2]
 
 
-def test_sizes_that_do_not_fit_are_refused():
+def test_inconsistent_sizes_are_refused():
     with pytest.raises(InputError, match="expected the camera's image size"):
         unproject_depth(np.ones((4, 5)), frontal((5, 4)))
     with pytest.raises(InputError, match="patch grid"):

@@ -57,11 +57,11 @@ def test_pixels_at_the_threshold_do_not_count():
 
 
 @given(st.floats(0.002, 1))
-def test_the_threshold_gives_way_until_something_passes(value):
+def test_the_threshold_is_lowered_until_a_pixel_passes(value):
     assert mask_to_bbox(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
 
 
-def test_a_lowered_threshold_keeps_the_surest_pixels():
+def test_a_lowered_threshold_keeps_the_most_probable_pixels():
     mask = square_mask(20, 40, 40, 60, 0.1) + square_mask(30, 50, 10, 10, 0.2)
     assert mask_to_bbox(mask, padding=0) == (30, 50, 10, 10)
 
@@ -127,7 +127,7 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(tr
         ({"mask": np.full(SIZE, 1.5, np.float32)}, "mask holds 1.5"),
     ],
 )
-def test_parts_that_do_not_fit_are_refused_by_name(changes, message):
+def test_inconsistent_parts_are_refused_by_name(changes, message):
     with pytest.raises(InputError, match=message):
         frame(**changes)
 
@@ -170,7 +170,7 @@ def test_missing_and_corrupt_files_are_refused_by_name(tmp_path, read):
             read(tmp_path / "bad.png")
 
 
-def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path):
+def test_a_truncated_jpeg_is_refused_although_opencv_fills_it_with_grey(tmp_path):
     write_image(tmp_path / "image.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
     data = (tmp_path / "image.jpg").read_bytes()
     (tmp_path / "image.jpg").write_bytes(data[: len(data) // 2])
@@ -187,7 +187,7 @@ def test_a_cut_off_jpeg_is_refused_although_decoders_fill_it_with_grey(tmp_path)
         read_image(tmp_path / "image.jpg")
 
 
-def test_an_8_bit_picture_is_no_depth(tmp_path):
+def test_an_8_bit_image_is_refused_as_depth(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.zeros(SIZE, np.uint8))
     with pytest.raises(InputError, match="16-bit"):
         read_depth(tmp_path / "depth.png")

@@ -117,7 +117,7 @@ def capture(request, tmp_path, views):
     return READERS[request.param](folder, **options)
 
 
-def test_every_format_gives_the_cameras_back_by_reprojection(capture, views):
+def test_every_format_gives_the_true_cameras(capture, views):
     assert len(capture) == len(views)
     points = np.random.default_rng(0).normal(size=(50, 3)) * 0.1 + views[0].camera.to_world(np.array([0, 0, 1.0]))
     for captured, view in zip(capture, views):
@@ -126,7 +126,7 @@ def test_every_format_gives_the_cameras_back_by_reprojection(capture, views):
         np.testing.assert_allclose(depth, expected_depth, atol=1e-5)
 
 
-def test_every_format_gives_depth_in_metres_where_the_surface_is(capture, views):
+def test_every_format_gives_the_true_depth_in_metres(capture, views):
     for captured, view in zip(capture, views):
         frame = captured.load()
         known = view.depth > 0
@@ -170,7 +170,7 @@ def test_an_imported_capture_is_complete_in_the_check(tmp_path, views):
     assert not check.problems and check.complete == 1
 
 
-def test_distortion_is_taken_out(tmp_path, views):
+def test_distortion_is_corrected(tmp_path, views):
     folder = tmp_path / "scan"
     folder.mkdir()
     write_nerfstudio(folder, views[:1])
@@ -298,7 +298,7 @@ def edited(change):
         ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt, line 1: '1 2 x', expected numbers"),
     ],
 )
-def test_a_broken_capture_gets_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
+def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
     options = WRITERS[kind](tmp_path, views)
     damage(tmp_path)
     with pytest.raises(InputError, match=message) as caught:
@@ -325,7 +325,7 @@ def test_tum_pictures_of_another_size_need_intrinsics(tmp_path, views):
 
 
 @pytest.mark.parametrize("values", [np.array([1 + 1j]), np.array(["x"]), np.float32(3), np.ones((4, 4, 3))])
-def test_npy_depth_that_is_no_map_is_named(tmp_path, views, values):
+def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
     write_lists(tmp_path, views[:1])
     np.save(tmp_path / f"z/{views[0].name}.npy", values)
     with pytest.raises(InputError, match=r"expected numbers \(H, W\)"):
@@ -347,7 +347,7 @@ def test_a_surface_that_one_of_many_frames_saw_is_left_out(views):
     assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()
 
 
-def test_frames_that_see_nothing_in_common_fuse_to_nothing(views):
+def test_frames_without_overlap_cannot_be_fused(views):
     apart = [replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])]
     with pytest.raises(InputError, match="expected overlapping depth maps"):
         fuse(apart)
@@ -375,7 +375,7 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
         import_capture(capture, tmp_path / "data", "teapot", "mine")
 
 
-def test_an_import_that_was_interrupted_is_done_by_doing_it_again(tmp_path, views, monkeypatch):
+def test_an_interrupted_import_can_be_repeated(tmp_path, views, monkeypatch):
     folder = tmp_path / "scan"
     folder.mkdir()
     write_nerfstudio(folder, views)

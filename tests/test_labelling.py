@@ -63,7 +63,7 @@ def test_picks_at_known_points_give_the_known_label(synthetic):
         assert rotation_error(made.trans[:3, :3], label.trans[:3, :3]) < 1
 
 
-def test_picks_with_noise_give_it_to_five_degrees(synthetic):
+def test_noisy_picks_give_the_label_to_five_degrees(synthetic):
     root, picks = synthetic
     known, rng = read_labels(root, "chair"), np.random.default_rng(0)
     reference, name = list(known)[0], list(known)[1]
@@ -78,7 +78,7 @@ def test_picks_with_noise_give_it_to_five_degrees(synthetic):
     assert all(0 < one.rms < 0.2 for one in made)
 
 
-def test_residuals_are_shares_of_the_keypoints_spread():
+def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     moved = Sim3(7.0, Rotation.random(random_state=1).as_matrix(), np.ones(3))
     points = corners().astype(float)
     target = moved.apply(points)
@@ -89,7 +89,7 @@ def test_residuals_are_shares_of_the_keypoints_spread():
     assert small.argmax() == 4
 
 
-def test_a_label_is_rigid_and_lays_centre_on_centre():
+def test_a_label_is_rigid_and_maps_centre_to_centre():
     sim3 = Sim3(1.4, Rotation.random(random_state=3).as_matrix(), np.array([0.3, 2, 1]))
     centre = np.array([5.0, -2, 4])
     trans = rigid_label(sim3, centre, "a", "b").trans
@@ -102,7 +102,7 @@ def test_a_label_is_rigid_and_lays_centre_on_centre():
     [
         (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
         (corners(), corners()[:4], "4 keypoints picked and 5"),
-        (corners(), corners()[[0, 1, 2, 3, 3]], "keypoints leg and number 5 of the sequence are one point"),
+        (corners(), corners()[[0, 1, 2, 3, 3]], "keypoints leg and number 5 of the sequence are the same point"),
         (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
         (corners()[:4] * np.nan, corners()[:4], "reference are not finite"),
     ],
@@ -127,7 +127,7 @@ def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
     ]  # fmt: skip
 
 
-def test_accepting_writes_the_upstream_form_and_the_references_identity(root):
+def test_accepting_writes_the_published_format_and_the_references_identity(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     turn = Rotation.random(random_state=5).as_matrix()
@@ -142,7 +142,7 @@ def test_accepting_writes_the_upstream_form_and_the_references_identity(root):
     assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9)) and states["b"] == ("open", None)
 
 
-def test_undo_skip_clear_and_move(root):
+def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners())
@@ -187,6 +187,16 @@ def test_undo_without_picks_leaves_a_skipped_sequence_skipped(root):
     assert labelling.progress()[-1].state == "skipped"
 
 
+def test_a_refused_change_leaves_a_skipped_sequence_skipped(root):
+    labelling = Labelling(root, "chair")
+    labelling.skip("b")
+    with pytest.raises(InputError, match="b has no pick 0"):
+        labelling.move("b", 0, (0, 0, 0))
+    with pytest.raises(InputError, match="all 0 keypoints are picked"):
+        labelling.pick("b", (0, 0, 0))
+    assert labelling.progress()[-1].state == "skipped"
+
+
 def test_a_guess_puts_the_picks_on_the_cloud(root):
     labelling = Labelling(root, "chair")
     with pytest.raises(InputError, match="needs 4 keypoints on the reference first"):
@@ -199,7 +209,7 @@ def test_a_guess_puts_the_picks_on_the_cloud(root):
     assert len(np.unique(labelling.picks("a"), axis=0)) == 5
 
 
-def test_what_cannot_be_labelled_is_refused(root):
+def test_invalid_categories_sequences_and_picks_are_refused(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners()[:3])
@@ -218,7 +228,7 @@ def test_what_cannot_be_labelled_is_refused(root):
     assert read_labels(root, "chair") == {}
 
 
-def test_labels_that_are_there_decide_the_reference(root):
+def test_existing_labels_decide_the_reference(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "b"))
     assert Labelling(root, "chair").reference == "b"
 
@@ -265,7 +275,7 @@ def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
     np.testing.assert_array_equal(Labelling(root, "chair").first_view("a"), np.eye(3))
 
 
-def test_the_desktop_says_what_picks_are_bad_and_asks_for_them_anew(root):
+def test_the_desktop_reports_bad_picks_and_asks_again(root):
     labelling, said = Labelling(root, "chair"), []
     pick_all(labelling, "best", corners())
     labelling.put("a", np.outer(np.arange(5), (1, 2, 3)))  # on a line, from an earlier run
@@ -276,7 +286,7 @@ def test_the_desktop_says_what_picks_are_bad_and_asks_for_them_anew(root):
 
     answers = iter(["a", "s"])
     label_category(labelling, lambda _: next(answers), said.append, guess, lambda *_: next(picks, []), lambda *_: None)
-    assert any("collinear" in line for line in said) and any("are one point" in line for line in said)
+    assert any("collinear" in line for line in said) and any("are the same point" in line for line in said)
     assert "b: no guess: no frame has depth" in said
     assert [row.state for row in labelling.progress()] == ["reference", "accepted", "skipped"]
 
@@ -298,7 +308,7 @@ def test_the_contact_sheet_has_a_row_for_every_candidate(root):
         contact_sheet(dataset, "chair", [])
 
 
-def test_without_a_display_the_window_says_so_at_once(root, monkeypatch):
+def test_a_window_without_a_display_is_an_input_error(root, monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -54,7 +54,7 @@ def test_labels_of_different_references_have_no_relative_pose():
 
 
 @pytest.mark.parametrize("folder", ["class_labels", "data/class_labels"])
-def test_labels_survive_their_files_in_either_place(tmp_path, folder):
+def test_labels_are_read_back_from_either_folder(tmp_path, folder):
     (tmp_path / folder / "chair").mkdir(parents=True)
     written = {name: random_label(number, name) for number, name in enumerate("ba")}
     for label in written.values():
@@ -66,7 +66,7 @@ def test_labels_survive_their_files_in_either_place(tmp_path, folder):
         assert (label.seq, label.reference_seq) == (name, "zero")
 
 
-def test_a_file_has_the_upstream_form(tmp_path):
+def test_a_label_file_has_the_published_format(tmp_path):
     path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
     assert path == tmp_path / "class_labels" / "chair" / "a.json"
     assert json.loads(path.read_text()) == {"trans": np.eye(4).tolist(), "seq": "a", "reference_seq": "a"}
@@ -86,7 +86,7 @@ def test_a_category_without_labels_has_none(tmp_path):
         ({"seq": None}, "seq"),
     ],
 )
-def test_a_label_that_cannot_be_is_refused_with_its_file(tmp_path, change, message):
+def test_an_invalid_label_is_refused_with_its_file(tmp_path, change, message):
     path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=message) as caught:

@@ -98,7 +98,7 @@ def test_a_generator_is_drawn_from_as_it_is(dataset):
     assert one == two
 
 
-def test_sampling_says_what_is_wanting(dataset, tmp_path):
+def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
     with pytest.raises(InputError, match="has 12 frames, expected at least 13"):
         sample_pairs(dataset, "chair", 1, 13)
     with pytest.raises(InputError, match="expected at least 1 and 1"):
@@ -116,7 +116,7 @@ def test_a_pairs_seed_is_a_function_of_its_key(dataset):
     assert len({pair.key for pair in pairs}) == len(set(pairs)) == len({pair.seed for pair in pairs})
 
 
-def test_pairs_survive_the_upstream_form(dataset, tmp_path):
+def test_pairs_are_read_back_from_the_published_format(dataset, tmp_path):
     pairs = sample_pairs(dataset, "chair", 10, 5)
     path = upstream_pairs_path(tmp_path, "chair", 10, 5)
     assert path == tmp_path / "determ_eval" / "10samples_5tgt" / "chair.pt"
@@ -165,7 +165,7 @@ def test_a_file_that_would_run_code_is_refused_and_not_run(dataset, tmp_path, mo
     assert not (tmp_path / "executed").exists()
 
 
-def test_what_is_no_pair_list_is_refused(dataset, tmp_path):
+def test_a_file_without_a_list_of_pairs_is_refused(dataset, tmp_path):
     path = tmp_path / "chair.pt"
     with pytest.raises(InputError, match=r"chair\.pt cannot be read"):
         read_upstream_pairs(path, dataset)
@@ -194,7 +194,7 @@ def test_what_is_no_pair_list_is_refused(dataset, tmp_path):
         ({"class": "sofa"}, "category 'sofa'"),
     ],
 )
-def test_ids_that_do_not_fit_the_data_are_refused(dataset, tmp_path, changes, message):
+def test_ids_of_other_data_are_refused(dataset, tmp_path, changes, message):
     path = save(tmp_path / "chair.pt", [item(dataset, **changes)])
     with pytest.raises(InputError, match=message):
         read_upstream_pairs(path, dataset)

@@ -60,7 +60,7 @@ def test_a_comment_may_mention_the_end_of_the_header(path, encoding):
     np.testing.assert_array_equal(read_ply(path)[1], COLOURS)
 
 
-def test_what_is_written_is_read(path):
+def test_written_data_is_read_back(path):
     write_ply(path, POINTS, COLOURS, POINTS)
     np.testing.assert_array_equal(read_ply(path)[0], POINTS)
     np.testing.assert_array_equal(read_ply(path)[1], COLOURS)

@@ -1,12 +1,12 @@
-"""Labelling poses as in the paper's supplement: the same keypoints picked on every sequence's point cloud.
+"""Pose labelling as in the paper's supplement: the same keypoints are picked on the point cloud of every sequence.
 
-keypoints   picks into an alignment, an alignment into a label
-session     what was picked and accepted so far, on disk at once
-guess       the method itself proposes the alignment, the person corrects it
-candidates  which sequences are worth labelling, as a contact sheet
-desktop     Open3D's picking window, driven from the terminal
+keypoints: alignment of two point clouds by keypoints
+session: picks and labels of a category, stored on disk
+guess: proposal of an alignment by pose estimation
+candidates: contact sheet of the sequences to label
+desktop: labelling in Open3D's picking window and the terminal
 
-The notebook's widget is `zsp_lite.widgets.labelling`.
+The widget for notebooks is in `zsp_lite.widgets.labelling`.
 """
 
 from zsp_lite.data.labels import rigid_label

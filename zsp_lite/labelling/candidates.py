@@ -1,4 +1,4 @@
-"""Which sequences are worth labelling: their scores, and a contact sheet to look at before one begins."""
+"""Contact sheet of the candidate sequences for labelling, with their quality scores."""
 
 from collections.abc import Sequence
 
@@ -15,9 +15,16 @@ _SIDE = 128  # pixels of a thumbnail
 
 
 def contact_sheet(dataset: Co3D, category: str, sequences: Sequence[SequenceAnnotation], views: int = 4) -> Figure:
-    """One row per candidate, best cloud first as given: `views` frames around the object, and the quality scores.
+    """Draw one row of evenly spaced frames per sequence, with its quality scores.
 
-    Raises InputError for no sequences and as `Co3D.load`.
+    Args:
+        dataset: The data set.
+        category: Name of the category.
+        sequences: The sequences, in the order of the rows.
+        views: Number of frames per row.
+
+    Raises:
+        InputError: There are no sequences, or a frame cannot be loaded.
     """
     if not sequences:
         raise InputError(f"category {category} has no candidate sequences, expected at least one")

@@ -1,6 +1,6 @@
-"""Labelling in Open3D's picking window, with questions in the terminal: `zsp-lite label ROOT CATEGORY`.
+"""Labelling in Open3D's picking window and the terminal: `zsp-lite label ROOT CATEGORY`.
 
-In the window: shift + left click picks the point, shift + right click takes the last one back, Q closes it.
+In the window, shift + left click picks a point, shift + right click removes the last pick, and Q closes the window.
 """
 
 import os
@@ -15,20 +15,19 @@ from zsp_lite.io.open3d import load_open3d
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import ACCEPTED, SKIPPED, Labelling
 
-Cloud = tuple[np.ndarray, np.ndarray]
-# Cloud and title to the indices picked on it, in order; two clouds and a title, to be looked at; question to answer.
-Pick = Callable[[Cloud, str], list[int]]
-Show = Callable[[np.ndarray, np.ndarray, str], None]
-Ask = Callable[[str], str]
-Guess = Callable[[str], None]
+Cloud = tuple[np.ndarray, np.ndarray]  # points and colours
+Pick = Callable[[Cloud, str], list[int]]  # cloud and window title -> indices of the picked points, in order
+Show = Callable[[np.ndarray, np.ndarray, str], None]  # two clouds and window title
+Ask = Callable[[str], str]  # question -> answer
+Guess = Callable[[str], None]  # name of a sequence
 
-# Open3D's windows look along -z with y up, cameras along z with y down.
-_WINDOW = np.diag([1.0, -1.0, -1.0])
+# Open3D's windows look along -z with +y up, cameras along +z with +y down.
+_CAMERA_TO_WINDOW = np.diag([1.0, -1.0, -1.0])
 _BLUE, _ORANGE = (0.0, 0.45, 0.70), (0.90, 0.62, 0.0)
 
 
 def pick_in_window(cloud: Cloud, title: str) -> list[int]:
-    """Indices of the points that were picked, in order. Raises InputError where no window can be opened."""
+    """Open a picking window. Returns the indices of the picked points in order; InputError without a display."""
     _check_display()
     window = load_open3d().visualization.VisualizerWithEditing()
     window.create_window(window_name=title, width=1280, height=900)
@@ -39,7 +38,7 @@ def pick_in_window(cloud: Cloud, title: str) -> list[int]:
 
 
 def show_in_window(reference: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], title: str) -> None:
-    """Both clouds in one plain colour each, blue the reference, orange the sequence."""
+    """Show the reference (blue) and the sequence (orange) in one window."""
     _check_display()
     o3d = load_open3d()
     clouds = [_geometry(points, np.tile(colour, (len(points), 1))) for points, colour in
@@ -51,9 +50,17 @@ def label_category(
     labelling: Labelling, ask: Ask, say: Callable[[str], None], guess: Guess | None = None,
     pick: Pick = pick_in_window, show: Show = show_in_window,
 ) -> None:  # fmt: skip
-    """Go through a category: the reference's keypoints, then every open sequence; accept, redo, skip or quit.
+    """Label the sequences of a category: first the keypoints of the reference, then every open sequence.
 
-    guess: fills in a sequence's picks, which are then looked at first. What was accepted stays on disk.
+    Each accepted label is stored at once, so the user can quit at any time.
+
+    Args:
+        labelling: The session.
+        ask: Asks the user a question and returns the answer.
+        say: Prints a message.
+        guess: Proposes the picks of a sequence, for the user to accept or redo.
+        pick: Opens the picking window.
+        show: Shows two aligned clouds.
     """
     reference = labelling.reference
     while len(labelling.names) < MIN_KEYPOINTS:
@@ -81,12 +88,12 @@ def _label_sequence(
     pick: Pick,
     show: Show,
 ) -> bool:
-    """One sequence; False to stop altogether."""
+    """Label one sequence. Returns False if the user quits."""
     cloud = labelling.cloud(sequence)
     if guess is not None and not len(labelling.picks(sequence)):
         try:
             guess(sequence)
-        except InputError as error:  # then by hand
+        except InputError as error:
             say(f"{sequence}: no guess: {error}")
     while True:
         if _alignment(labelling, sequence, say) is None:
@@ -107,9 +114,9 @@ def _label_sequence(
             continue
         for name, residual in zip(labelling.names, alignment.residuals):
             say(f"  {name:20} {100 * residual:5.1f} % of the keypoints' spread")
-        turn = _WINDOW @ labelling.first_view(sequence)
-        both = (alignment.sim3.apply(labelling.cloud(labelling.reference)[0]), cloud[0])
-        show(*(points @ turn.T for points in both), f"{sequence}: is it right?")
+        to_window = _CAMERA_TO_WINDOW @ labelling.first_view(sequence)
+        aligned = alignment.sim3.apply(labelling.cloud(labelling.reference)[0])
+        show(aligned @ to_window.T, cloud[0] @ to_window.T, f"{sequence}: is it right?")
         answer = _choice(ask, "Accept, redo, skip or quit?", "arsq")
         if answer == "a":
             say(f"Written: {labelling.accept(sequence)}")
@@ -122,20 +129,20 @@ def _label_sequence(
 
 
 def _choice(ask: Ask, question: str, answers: str) -> str:
-    """One of the letters `answers`; asked again until it is one."""
+    """Ask until the answer is one of the letters `answers`."""
     while (answer := ask(f"{question} [{'/'.join(answers)}] ").strip().lower()) not in tuple(answers):
         pass
     return answer
 
 
 def _in_first_view(labelling: Labelling, sequence: str) -> Cloud:
-    """A sequence's cloud, turned so that a window shows it as the first camera saw it."""
+    """Rotate the cloud of a sequence so that the window shows it as seen from the first camera."""
     points, colours = labelling.cloud(sequence)
-    return points @ (_WINDOW @ labelling.first_view(sequence)).T, colours
+    return points @ (_CAMERA_TO_WINDOW @ labelling.first_view(sequence)).T, colours
 
 
 def _alignment(labelling: Labelling, sequence: str, say: Callable[[str], None]) -> Alignment | None:
-    """The alignment by a sequence's picks; picks that give none, such as two at one place, are said and taken back."""
+    """Return the alignment of a sequence; invalid picks, such as two at one place, are reported and removed."""
     try:
         return labelling.alignment(sequence)
     except InputError as error:
@@ -145,7 +152,7 @@ def _alignment(labelling: Labelling, sequence: str, say: Callable[[str], None]) 
 
 
 def _check_display() -> None:
-    """Without a display Open3D draws into memory, and its window would wait for ever."""
+    """Raise InputError without a display, where Open3D would wait for its invisible window for ever."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
             "no window can be opened: DISPLAY is not set, expected a desktop; notebooks/08_label_poses.ipynb needs none"

@@ -1,4 +1,4 @@
-"""A first guess of a label by the method itself: the person corrects instead of beginning from nothing."""
+"""Proposal of a label by pose estimation, to be corrected by hand."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -20,29 +20,45 @@ def guess_alignment(
     dataset: Co3D, backbone: "Backbone", category: str, reference: str, sequence: str,
     references: int = 3, views: int = 6,
 ) -> tuple[Sim3, float]:  # fmt: skip
-    """The reference's world laid on the sequence's world, and how sure the method is (0 to 1).
+    """Estimate the similarity from the world of the reference sequence to that of another sequence.
 
-    From `references` frames of the one and `views` of the other, each evenly spread, by the verified solver; the
-    surest estimate is taken. Raises InputError where no frame of either has a camera, a mask and depth.
+    Poses are estimated by the verified solver between evenly spaced frames of both sequences; the estimate of the
+    highest confidence is returned.
+
+    Args:
+        dataset: The data set.
+        backbone: The backbone.
+        category: Name of the category.
+        reference: Name of the reference sequence.
+        sequence: Name of the other sequence.
+        references: Number of frames of the reference sequence.
+        views: Number of frames of the other sequence.
+
+    Returns:
+        The similarity and its confidence, in [0, 1].
+
+    Raises:
+        InputError: A sequence has no frame with camera, mask and depth.
     """
     method = ZeroShotPose(backbone, solver="verified")
     first, second = _frames(dataset, category, reference, references), _frames(dataset, category, sequence, views)
-    seen = method.views([*first, *second])
-    found = [method.estimate_from_views(view, seen[len(first) :]) for view in seen[: len(first)]]
-    best = int(np.argmax([estimate.confidence for estimate in found]))
-    to_camera, from_camera = _rigid(first[best].camera), _rigid(found[best].target_camera).inverse()
-    return from_camera @ found[best].sim3 @ to_camera, float(found[best].confidence)
+    extracted = method.views([*first, *second])
+    estimates = [method.estimate_from_views(view, extracted[len(first) :]) for view in extracted[: len(first)]]
+    best = int(np.argmax([estimate.confidence for estimate in estimates]))
+    estimate = estimates[best]
+    to_camera, from_camera = _world_to_camera(first[best].camera), _world_to_camera(estimate.target_camera).inverse()
+    return from_camera @ estimate.sim3 @ to_camera, float(estimate.confidence)
 
 
 def _frames(dataset: Co3D, category: str, sequence: str, count: int) -> Sequence[Frame]:
+    """Load `count` evenly spaced frames that have camera, mask and depth."""
     usable = [one for one in dataset.frames(category, sequence) if None not in (one.viewpoint, one.depth, one.mask)]
     if not usable:
-        raise InputError(f"sequence {category}/{sequence} has no frame with camera, depth and mask, expected some")
+        raise InputError(f"sequence {category}/{sequence} has no frame with camera, depth and mask")
     if len(usable) > count:
         usable = [usable[index] for index in np.linspace(0, len(usable) - 1, count + 1)[:-1].astype(int)]
     return [dataset.load(annotation) for annotation in usable]
 
 
-def _rigid(camera: Camera) -> Sim3:
-    """World to camera."""
+def _world_to_camera(camera: Camera) -> Sim3:
     return Sim3(1.0, camera.R, camera.t)

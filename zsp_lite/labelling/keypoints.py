@@ -1,7 +1,7 @@
-"""From keypoints picked on two clouds to a pose label: the one piece that the notebook and the desktop share.
+"""Alignment of two point clouds by keypoints picked on both.
 
-The supplement's "Labelling pose for evaluation": four or more keypoints of the reference's cloud, the same ones in the
-same order on another sequence's, Umeyama with scale; the label keeps the rigid part.
+See "Labelling pose for evaluation" in the paper's supplement: at least four keypoints are picked in the same order on
+the clouds of the reference sequence and of another sequence, and aligned by Umeyama's method with scale.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,12 @@ MIN_KEYPOINTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How the reference's cloud lies on a sequence's: `sim3` takes the one's world points to the other's.
+    """Alignment of the reference sequence with another sequence.
 
-    residuals: distance from each moved keypoint to its pick, in shares of the picks' own spread (their standard
-    deviation, averaged over the axes), so that 0.05 means the same on every object.
+    Attributes:
+        sim3: Similarity from the world of the reference sequence to that of the sequence.
+        residuals: (n,) distance of each transformed keypoint from its pick, relative to the spread of the picks (their
+            standard deviation, averaged over the axes), so that objects of any size can be compared.
     """
 
     sim3: Sim3
@@ -35,10 +37,15 @@ class Alignment:
 
 
 def align_picks(reference: ArrayLike, picks: ArrayLike, names: Sequence[str] = ()) -> Alignment:
-    """Umeyama with scale from the reference's keypoints (n, 3) to the same ones picked elsewhere (n, 3), n >= 4.
+    """Align keypoints by Umeyama's method with scale.
 
-    names: of the keypoints, for errors. Raises InputError for unequal or too small numbers, for a keypoint picked
-    twice at one place, and for keypoints on one line.
+    Args:
+        reference: (n, 3) keypoints on the reference sequence, n >= 4.
+        picks: (n, 3) the same keypoints on another sequence.
+        names: Names of the keypoints, for error messages.
+
+    Raises:
+        InputError: The numbers differ or are below 4, two keypoints are at one place, or all are collinear.
     """
     reference, picks = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (reference, picks))
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
@@ -46,19 +53,19 @@ def align_picks(reference: ArrayLike, picks: ArrayLike, names: Sequence[str] = (
             f"{len(picks)} keypoints picked and {len(reference)} on the reference, expected equally many, "
             f"at least {MIN_KEYPOINTS}"
         )
-    for points, whose in ((reference, "reference"), (picks, "sequence")):
-        _check_apart(points, whose, names)
+    for points, owner in ((reference, "reference"), (picks, "sequence")):
+        _check_distinct(points, owner, names)
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
 
 
-def _check_apart(points: Float[np.ndarray, "n 3"], whose: str, names: Sequence[str]) -> None:
+def _check_distinct(points: Float[np.ndarray, "n 3"], owner: str, names: Sequence[str]) -> None:
     if not np.isfinite(points).all():
-        raise InputError(f"keypoints of the {whose} are not finite: {points.tolist()}")
+        raise InputError(f"keypoints of the {owner} are not finite: {points.tolist()}")
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     first, second = np.unravel_index(distance.argmin(), distance.shape)
     if distance[first, second] < 1e-9:
-        called = [names[i] if i < len(names) else f"number {i + 1}" for i in (first, second)]
-        raise InputError(f"keypoints {called[0]} and {called[1]} of the {whose} are one point, expected two")
+        same = [names[i] if i < len(names) else f"number {i + 1}" for i in (first, second)]
+        raise InputError(f"keypoints {same[0]} and {same[1]} of the {owner} are the same point, expected two points")

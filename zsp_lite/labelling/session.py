@@ -1,7 +1,7 @@
-"""What was picked and accepted in a category so far. Every change is on disk at once; a restart loses nothing.
+"""Labelling session of a category, stored on disk after every change.
 
-ROOT/label_picks/CATEGORY.json holds the keypoints' names and all picks, ROOT/class_labels/CATEGORY/SEQ.json the
-labels that were accepted, in the upstream form.
+ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks; ROOT/class_labels/CATEGORY/SEQ.json holds
+the accepted labels in the format of the published code.
 """
 
 from collections.abc import Sequence
@@ -33,9 +33,14 @@ class _Picks(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a sequence is.  state: "reference", "open", "accepted" or "skipped".  picks: how many.
-    rms: residual of its alignment, a share of the picks' spread; None before all keypoints are picked.
-    problem: why its picks give no alignment, such as two at one place; "" where nothing is wrong.
+    """Progress of a sequence.
+
+    Attributes:
+        sequence: Name of the sequence.
+        state: "reference", "open", "accepted" or "skipped".
+        picks: Number of picked keypoints.
+        rms: RMS residual of the alignment relative to the spread of the picks, or None before all keypoints are picked.
+        problem: Why the picks give no alignment, such as two at one place; "" if there is no problem.
     """
 
     sequence: str
@@ -46,20 +51,28 @@ class Progress:
 
 
 class Labelling:
-    """The labelling of one category: pick, undo, name, align, accept.
+    """Labelling of one category: pick keypoints, align, accept.
 
-    The reference is the sequence whose point cloud scores best (or that of labels which are there already); picks are
-    world points of their sequence, in the order of the reference's keypoints. Use it from one process at a time.
+    Keypoints are defined on the reference sequence and picked on the others in the same order, as points in world
+    coordinates of the sequence. Only one process may use a session at a time.
     """
 
     def __init__(
         self, root: str | Path, category: str, sequences: Sequence[str] | None = None, reference: str | None = None
     ):
-        """Open the category, with what was picked before.
+        """Open a category with its stored picks.
 
-        sequences: the candidates; default: the ten with the best clouds (`Co3D.select`), or all that have a cloud
-        where the data has no scores.  reference: default as above. Raises InputError where the category or a sequence
-        is not there, where fewer than two have clouds, or where the picks or labels on disk are another reference's.
+        Args:
+            root: The data folder.
+            category: Name of the category.
+            sequences: Sequences to label. The default is the ten with the best point clouds (`Co3D.select`), or all
+                with a point cloud if there are no quality scores.
+            reference: Reference sequence. The default is that of the stored picks and labels, or else the sequence
+                with the best point cloud.
+
+        Raises:
+            InputError: The category or a sequence is unknown, fewer than two sequences have point clouds, or the stored
+                picks or labels have another reference.
         """
         self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
@@ -74,15 +87,15 @@ class Labelling:
                 f"{len(stored.picks.get(stored.reference_seq, []))} picks on the reference, expected equally many"
             )
         labelled = {label.reference_seq for label in read_labels(root, category).values()}
-        bound = ({stored.reference_seq} if stored else set()) | labelled
-        if len(bound | ({reference} if reference else set())) > 1:
+        references = ({stored.reference_seq} if stored else set()) | labelled
+        if len(references | ({reference} if reference else set())) > 1:
             given = f"reference {reference}, " if reference else ""
             raise InputError(
-                f"category {category}: {given}labels and picks on disk refer to {', '.join(sorted(bound))}, "
+                f"category {category}: {given}labels and picks on disk refer to {', '.join(sorted(references))}, "
                 "expected one reference sequence"
             )
         best = max(chosen, key=lambda name: _cloud_quality(known.get(name)), default="")
-        self.reference = reference or next(iter(bound), None) or best
+        self.reference = reference or next(iter(references), None) or best
         if self.reference and self.reference not in chosen:
             chosen.insert(0, self.reference)
         for name in chosen:
@@ -91,22 +104,24 @@ class Labelling:
                     f"sequence {category}/{name} has no point cloud, expected some of {', '.join(with_cloud) or 'none'}"
                 )
         if len(chosen) < 2:
-            raise InputError(f"category {category} has {len(chosen)} sequence with a cloud, expected at least two")
+            raise InputError(
+                f"category {category} has {len(chosen)} sequence with a point cloud, expected at least two"
+            )
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The keypoints' names, in the order in which they are picked."""
+        """Names of the keypoints, in the order of picking."""
         return tuple(self._stored.names)
 
     def picks(self, sequence: str) -> Float[np.ndarray, "n 3"]:
-        """World points picked on a sequence so far."""
+        """Return the picks (n, 3) on a sequence, in its world coordinates."""
         return np.array(self._stored.picks.get(self._known(sequence), []), dtype=np.float64).reshape(-1, 3)
 
     def cloud(self, sequence: str) -> tuple[np.ndarray, np.ndarray]:
-        """World points (n, 3) and colours (n, 3), uint8, of a sequence's cloud; grey where it has no colours."""
+        """Return points (n, 3) and colours (n, 3), uint8, of a sequence's point cloud; grey if it has no colours."""
         if self._known(sequence) not in self._clouds:
             points, colours = self.dataset.point_cloud(self.category, sequence)
             if colours is None:
@@ -115,17 +130,23 @@ class Labelling:
         return self._clouds[sequence]
 
     def first_view(self, sequence: str) -> Float[np.ndarray, "3 3"]:
-        """World directions right, down and away, as rows, of a sequence's first camera; the world's own without one."""
+        """Return the rotation (3, 3) from world to first camera of a sequence; the identity without cameras."""
         for frame in self.dataset.frames(self.category, self._known(sequence)):
             if frame.viewpoint is not None:
                 return self.dataset.camera(frame).R
         return np.eye(3)
 
     def pick(self, sequence: str, point: Point, name: str | None = None) -> None:
-        """Add the next keypoint of a sequence: `point` (3,) in its world.
+        """Add the next keypoint of a sequence.
 
-        name: of a new keypoint of the reference (default: a number). Raises InputError where all keypoints are picked
-        already, or the reference's would change under those of other sequences.
+        Args:
+            sequence: Name of the sequence.
+            point: (3,) point in its world coordinates.
+            name: Name of a new keypoint of the reference; the default is a number.
+
+        Raises:
+            InputError: All keypoints are picked, the point is not finite, or the reference's keypoints are in use on
+                other sequences.
         """
         point = _finite_point(point, sequence)
         picks = self._editable(sequence)
@@ -134,45 +155,61 @@ class Labelling:
         elif len(picks) >= len(self.names):
             raise InputError(f"sequence {sequence}: all {len(self.names)} keypoints are picked; undo one to pick again")
         picks.append(point)
-        self._save()
+        self._save(sequence)
 
     def undo(self, sequence: str) -> None:
-        """Take the last pick of a sequence back; nothing happens where there is none."""
+        """Remove the last pick of a sequence, if there is one."""
         if len(self.picks(sequence)):
             self._editable(sequence).pop()
             if sequence == self.reference:
                 self._stored.names.pop()
-            self._save()
+            self._save(sequence)
 
     def clear(self, sequence: str) -> None:
-        """Take all picks of a sequence back. A label that was accepted stays until another is."""
+        """Remove all picks of a sequence. An accepted label is kept until another one is accepted."""
         self._editable(sequence).clear()
         if sequence == self.reference:
             self._stored.names.clear()
-        self._save()
+        self._save(sequence)
 
     def put(self, sequence: str, points: Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
-        """Replace all picks of a sequence: what taking a change back needs.  names: of the reference's keypoints."""
+        """Replace all picks of a sequence, as needed to undo a change.
+
+        Args:
+            sequence: Name of the sequence.
+            points: (n, 3) picks.
+            names: Names of the keypoints, for the reference only.
+
+        Raises:
+            InputError: The points are not finite, or their number does not fit the keypoints.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         wanted = len(names) if sequence == self.reference else min(len(points), len(self.names))
         if not np.isfinite(points).all() or len(points) != wanted:
-            raise InputError(f"{len(points)} picks put on {sequence}, expected {wanted} finite points")
+            raise InputError(f"{len(points)} picks for {sequence}, expected {wanted} finite points")
         self._editable(sequence)[:] = [tuple(point) for point in points.tolist()]
         if sequence == self.reference:
             self._stored.names[:] = names
-        self._save()
+        self._save(sequence)
 
     def rename(self, index: int, name: str) -> None:
-        """Give keypoint `index` (from 0) another name."""
+        """Rename keypoint `index` (from 0)."""
         if not 0 <= index < len(self.names) or not name.strip():
             raise InputError(f"keypoint {index} as {name!r}: expected 0 to {len(self.names) - 1}, and a name")
         self._stored.names[index] = name.strip()
         self._save()
 
     def guess(self, sequence: str, sim3: Sim3) -> None:
-        """Put a sequence's picks where `sim3` (reference world to its world) says, each on the nearest cloud point.
+        """Set the picks of a sequence by transforming the keypoints of the reference.
 
-        No two on one point: a guess that is far off may lead several to the same.
+        Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken.
+
+        Args:
+            sequence: Name of the sequence.
+            sim3: Similarity from the world of the reference to that of the sequence.
+
+        Raises:
+            InputError: The sequence is the reference, or fewer than four keypoints are defined.
         """
         if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
             raise InputError(f"a guess for {sequence} needs {MIN_KEYPOINTS} keypoints on the reference first")
@@ -184,27 +221,38 @@ class Labelling:
             distance[taken] = np.inf
             taken.append(int(distance.argmin()))
         picks[:] = [tuple(cloud[index].tolist()) for index in taken]
-        self._save()
+        self._save(sequence)
 
     def move(self, sequence: str, index: int, point: Point) -> None:
-        """Put pick `index` (from 0) of a sequence elsewhere."""
+        """Move pick `index` (from 0) of a sequence to another point (3,)."""
         picks = self._editable(sequence)
         if not 0 <= index < len(picks):
             raise InputError(f"sequence {sequence} has no pick {index}, expected 0 to {len(picks) - 1}")
         picks[index] = _finite_point(point, sequence)
-        self._save()
+        self._save(sequence)
 
     def alignment(self, sequence: str) -> Alignment | None:
-        """The reference laid on a sequence by its picks; None before all are picked. Raises as `align_picks`."""
+        """Align the reference with a sequence by the picks.
+
+        Returns:
+            The alignment, or None before all keypoints are picked.
+
+        Raises:
+            InputError: Two picks are at one place, or all are collinear.
+        """
         picks = self.picks(sequence)
         if len(picks) < MIN_KEYPOINTS or len(picks) != len(self.names):
             return None
         return align_picks(self.picks(self.reference), picks, self.names)
 
     def accept(self, sequence: str) -> Path:
-        """Write the sequence's label, and the reference's own, the identity; returns the file.
+        """Write the labels of a sequence and of the reference (the identity).
 
-        Raises InputError where keypoints are missing.
+        Returns:
+            The label file of the sequence.
+
+        Raises:
+            InputError: Keypoints are missing, or the sequence is the reference.
         """
         if self._known(sequence) == self.reference:
             raise InputError(f"sequence {sequence} is the reference: its label is the identity and comes by itself")
@@ -218,15 +266,16 @@ class Labelling:
         label = rigid_label(alignment.sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
         path = write_label(self.root, self.category, label)
-        if sequence in self._stored.skipped:
-            self._stored.skipped.remove(sequence)
-        self._save()
+        self._save(sequence)
         return path
 
     def skip(self, sequence: str) -> None:
-        """Leave a sequence out, such as a bad cloud; picking on it takes it up again. The label made of its picks goes.
+        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of its picks.
 
-        Raises InputError for the reference, and for a sequence whose label was not made of picks.
+        Any later change of its picks includes it again.
+
+        Raises:
+            InputError: The sequence is the reference, or has a label that was not made of picks.
         """
         if self._known(sequence) == self.reference:
             raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
@@ -239,7 +288,7 @@ class Labelling:
             self._save()
 
     def progress(self) -> list[Progress]:
-        """Every sequence's state, the reference first."""
+        """Return the progress of every sequence, the reference first."""
         labels = read_labels(self.root, self.category)
         rows = []
         for name in self.sequences:
@@ -259,18 +308,19 @@ class Labelling:
         return sequence
 
     def _editable(self, sequence: str) -> list[Triple]:
-        """The list of a sequence's picks, where it may change."""
+        """Return the list of a sequence's picks; InputError if the reference's keypoints are in use."""
         if self._known(sequence) == self.reference:
             others = [name for name, picks in self._stored.picks.items() if name != sequence and picks]
             if others:
                 raise InputError(
                     f"keypoints of the reference {sequence} are in use on {', '.join(others)}; clear those first"
                 )
-        if sequence in self._stored.skipped:
-            self._stored.skipped.remove(sequence)
         return self._stored.picks.setdefault(sequence, [])
 
-    def _save(self) -> None:
+    def _save(self, changed: str | None = None) -> None:
+        """Write the session; a changed sequence is no longer skipped."""
+        if changed in self._stored.skipped:
+            self._stored.skipped.remove(changed)
         write_atomic(self.path, msgspec.json.format(msgspec.json.encode(self._stored), indent=1))
 
 
@@ -282,6 +332,6 @@ def _finite_point(point: Point, sequence: str) -> Triple:
 
 
 def _cloud_quality(sequence: SequenceAnnotation | None) -> float:
-    """The score of a sequence's cloud, below all others where it has none."""
+    """Return the quality score of a sequence's point cloud, or -inf without one."""
     score = None if sequence is None or sequence.point_cloud is None else sequence.point_cloud.quality_score
     return -np.inf if score is None else score
