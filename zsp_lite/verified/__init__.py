@@ -1,25 +1,17 @@
-"""A pose checked against everything that was seen: the solver beyond the paper, `ZeroShotPose(solver="verified")`.
+"""The verified solver, `ZeroShotPose(solver="verified")`: poses tested in all target views. It extends the paper.
 
-The paper picks one target view and trusts the consensus of its matches. But the target views' relative poses are
-known and all have depth, so a pose can be tested in every one of them. Stages, each a function of its own:
+The paper selects one target view and fits the pose to its matches. The relative poses of the target views are known and
+all of them have depth, so a pose can be tested in every view. Each stage is a function:
 
-scene         what all views saw, in one frame and unit
-proposals     poses suggested by three matches of one view, and the views' own rotations
-soft_icp      each drawn to its neighbourhood's best alignment, weighted by features
-verification  a score of named terms: features, silhouettes, free space, forward and in reverse; likeness of views
-refinement    the score itself climbed by random search
-hypotheses    the ranking, and the `VerifiedSolver` that runs all stages
-confidence    a calibrated chance that a hypothesis is right
+    scene         points, feature similarities and maps of all views, in normalised frames
+    proposals     poses from three matches of one view, and from the rotations of the views
+    soft_icp      local alignment with soft correspondences, weighted by feature similarity
+    verification  the score: a weighted sum of nine terms on features, silhouettes, free space and the viewpoint
+    refinement    random search that increases the score
+    solver        the ranked hypotheses, and the `VerifiedSolver` that runs all stages
+    confidence    calibrated probability that a hypothesis is correct
 
-What was tried and left out, before the view term came (276 pairs of 19 training categories, Acc30 of the paper's
-solver 59.4): locally optimised RANSAC with the truncated score in the chosen view, thresholds of 0.2 to 0.4 (60.1 to
-60.5: the inliers of a wrong pose agree as well as those of a right one); the same with thresholds from the object's
-size (62.3, of which a threshold from the size alone gives 61.6: `ZeroShotPose(adaptive_threshold=True)`; on
-evaluation objects it brought 2.6 points once and 1.0 another time). In the verification (418 pairs, fitted and
-judged on different categories, Acc30 84.7): similarity per point seen instead of per point, how many proposals agree
-with a pose, and roots and products of the terms (82.3 to 84.7); a prior on the scale (86.4) is within the noise; the
-view term (87.6) was kept. Calling answers equally good by what both show to view, not by their scores, flags a third
-of the right answers.
+docs/solvers.md compares it with the paper's solver and lists variants that were tried and not kept.
 """
 
 from zsp_lite.verified.solver import Solution, VerifiedSolver
