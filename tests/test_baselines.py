@@ -14,23 +14,24 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import icp as icp_module
 from zsp_lite.baselines import posecontrast, swav
-from zsp_lite.baselines.icp import align, icp, object_points
+from zsp_lite.baselines.icp import align, icp
 from zsp_lite.baselines.posecontrast import (
     PoseContrast,
-    TinyParts,
+    TinyPoseContrast,
     ViewpointHead,
     euler_to_rotation,
     load_posecontrast,
     load_posecontrast_tiny,
     pad_to_square,
-    padded,
-    predicted_angles,
+    predict_angles,
     rotation_to_euler,
+    square_crop,
 )
-from zsp_lite.baselines.resnet import TINY, ResNet, Shape
-from zsp_lite.baselines.sift import Keypoints, Sift, lifted, mutual_matches
+from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
+from zsp_lite.baselines.sift import Keypoints, Sift, mutual_matches, unproject_pixels
 from zsp_lite.baselines.swav import load_swav, load_swav_tiny
 from zsp_lite.benchmark.essential import essential_rotation
 from zsp_lite.data.frames import Frame
@@ -159,7 +160,7 @@ def test_a_viewpoint_is_pascals_in_front_of_the_object_and_beside_it():
 
 
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path):
-    network, head = ResNet(Shape(outputs=128)), ViewpointHead(2048)
+    network, head = ResNet(ResNetConfig(outputs=128)), ViewpointHead(2048)
     path = tmp_path / "posecontrast.pth"
     features = random_state(torchvision_shapes() | {"fc.weight": (128, 2048), "fc.bias": (128,)})
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head.state_dict()}, path)
@@ -169,7 +170,7 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
     assert found.feature.shape == (2048,)
     assert found.rotation @ found.rotation.T == pytest.approx(np.eye(3), abs=1e-9)
     network.load_state_dict(features)
-    batch = swav.normalised(torch.from_numpy(padded(frame, 224)).permute(2, 0, 1)[None] / 255)
+    batch = normalize(torch.from_numpy(square_crop(frame, 224)).permute(2, 0, 1)[None] / 255)
     with torch.inference_mode():
         logits, offsets = model.head(network.eval()(batch))
     chosen = [int(logit.argmax()) for logit in logits]
@@ -186,7 +187,7 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
 
 
 def test_posecontrast_tiny_loads_what_its_trainer_writes(tmp_path):
-    model = load_posecontrast_tiny(tiny_file(tmp_path, TinyParts(), "posecontrast-tiny.safetensors"))
+    model = load_posecontrast_tiny(tiny_file(tmp_path, TinyPoseContrast(), "posecontrast-tiny.safetensors"))
     assert isinstance(model, PoseContrast) and model.image_size == posecontrast.TINY_SIZE
     with pytest.raises(InputError, match="train-baseline"):
         load_posecontrast_tiny(tmp_path / "nowhere.safetensors")
@@ -195,13 +196,13 @@ def test_posecontrast_tiny_loads_what_its_trainer_writes(tmp_path):
 def test_predicted_angles_are_bin_and_offset():
     logits = [torch.eye(24)[[3]], torch.eye(12)[[11]], torch.eye(24)[[0]]]
     offsets = [torch.full((1, 24), 0.5), torch.full((1, 12), 1.5), torch.full((1, 24), -0.4)]
-    assert predicted_angles(logits, offsets).tolist() == [[52.5, 187.5, 0.0]]
+    assert predict_angles(logits, offsets).tolist() == [[52.5, 187.5, 0.0]]
 
 
 def test_padding_gives_a_crop_its_own_aspect_again():
     frame = render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity())
     frame = replace(frame, mask=None)
-    square = padded(object_crop(frame), 80)
+    square = square_crop(object_crop(frame), 80)
     assert (square[:9] == 0).all() and (square[71:] == 0).all() and square[20:60].any()
     assert pad_to_square(np.full((4, 4, 3), 9, np.uint8), 0.5, 8)[:, :, 0].tolist() == [[0, 0, 9, 9, 9, 9, 0, 0]] * 8
 
@@ -242,9 +243,8 @@ def test_icp_starts_where_the_first_cameras_stand(monkeypatch):
     assert np.median(cKDTree(target).query(placed)[0]) < 0.05
     align(first, targets, 0, firsts, seed=0)
     assert (clouds[2] == source).all() and (clouds[3] == target).all()
-    assert len(object_points(first)) == int((first.mask >= 0.5).sum())
-    with pytest.raises(InputError, match="depth"):
-        object_points(replace(first, depth=None))
+    with pytest.raises(InputError, match="no depth map"):
+        align(replace(first, depth=None), targets, 0, firsts, seed=0)
 
 
 def test_sift_finds_a_turned_picture_in_itself():
@@ -272,7 +272,7 @@ def test_sift_finds_a_turned_picture_in_itself():
 def test_keypoints_are_lifted_onto_the_surface():
     frame = render(look_at((1, 0.2, 0.4)), Sim3.identity())
     pixels = np.argwhere(frame.mask > 0)[::50, ::-1] + 0.5
-    points = lifted(frame, pixels)
+    points = unproject_pixels(frame, pixels)
     back, depth = frame.camera.project(frame.camera.to_world(points))
     assert back == pytest.approx(pixels, abs=1e-6)
     rows, columns = np.floor(pixels).astype(int).T[::-1]

@@ -1,1 +1,1 @@
-"""Other methods, in the same pipeline or beside it."""
+"""Other methods: the baselines of the paper (ICP, SIFT, SwAV, PoseContrast), and RootSIFT features."""

@@ -1,10 +1,11 @@
-"""PoseContrast: absolute viewpoints by a network trained on pose labels (Xiao et al. 2021), made relative (sec. 5.2).
+"""PoseContrast: absolute viewpoints by a network trained on pose labels (Xiao et al. 2021; paper sec. 5.2).
 
-A residual network describes the picture; from that a small head tells azimuth, elevation and in-plane rotation, each
-as one of a number of bins and an offset inside the bin. "posecontrast-tiny" is a small counterpart that this
-project trained on the pose labels of its training categories.
+A residual network computes a feature of the image. A small head predicts azimuth, elevation and in-plane rotation, each
+as a bin and an offset inside the bin. "posecontrast-tiny" is a small network of this project, trained on the pose
+labels of the training categories.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,56 +14,62 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from zsp_lite.backbones.backbone import prepare_images
+from zsp_lite.backbones.backbone import normalize, prepare_images
 from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.baselines.resnet import TINY, ResNet, Shape, load_weights
-from zsp_lite.baselines.swav import normalised
+from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig, load_weights
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder
 
-FILE = "posecontrast.pth"  # in the cache folder; nobody hosts it under a fixed address
+FILE = "posecontrast.pth"  # in the cache folder; there is no permanent URL
 TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "posecontrast-tiny.safetensors"
+TINY_SIZE = 64  # image size of posecontrast-tiny, pixels
 BIN = 15.0  # degrees
-BINS = (24, 12, 24)  # of azimuth, elevation and in-plane rotation
+BINS = (24, 12, 24)  # numbers of bins of azimuth, elevation and in-plane rotation
 ANGLES = ("azi", "ele", "inp")
-# Its cameras look along -z with y up (OpenGL), ours along z with y down.
+# PoseContrast's cameras look along -z with +y up (OpenGL), ours along +z with +y down.
 _AXES = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """rotation: from the category's canonical frame to the camera (ours).  feature: what the picture is like."""
+    """Viewpoint of an image.
+
+    Attributes:
+        rotation: (3, 3) rotation from the canonical frame of the category to the camera (OpenCV axes).
+        feature: (d,) feature of the image.
+    """
 
     rotation: Float[np.ndarray, "3 3"]
     feature: Float[Tensor, " d"]
 
 
 class ViewpointHead(nn.Module):
-    """Feature to logits over the bins of each angle, and an offset inside each bin, as a fraction of it."""
+    """Classifier of the bins of each angle, and regression of the offset inside each bin as a fraction of its width."""
 
-    def __init__(self, entering: int, width: int = 200):
+    def __init__(self, inputs: int, width: int = 200):
         super().__init__()
         layers: list[nn.Module] = []
-        for leaving in (4 * width, 2 * width, width):
-            layers += [nn.Linear(entering, leaving), nn.BatchNorm1d(leaving), nn.ReLU(inplace=True)]
-            entering = leaving
+        for outputs in (4 * width, 2 * width, width):
+            layers += [nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]
+            inputs = outputs
         self.compress = nn.Sequential(*layers)
         for kind in ("cls", "reg"):
             for angle, bins in zip(ANGLES, BINS, strict=True):
                 setattr(self, f"fc_{kind}_{angle}", nn.Linear(width, bins))
 
     def forward(self, feature: Float[Tensor, "b d"]) -> tuple[list[Tensor], list[Tensor]]:
-        """Logits and offsets, each of azimuth, elevation and in-plane rotation: (b, bins)."""
+        """Compute the logits and the offsets (b, bins) of azimuth, elevation and in-plane rotation."""
         x = self.compress(feature)
         logits, offsets = ([getattr(self, f"fc_{kind}_{angle}")(x) for angle in ANGLES] for kind in ("cls", "reg"))
         return logits, offsets
 
 
 class PoseContrast:
-    """Called on frames (`describe`): one Viewpoint each."""
+    """Estimator of absolute viewpoints."""
 
     def __init__(self, network: ResNet, head: ViewpointHead, name: str, image_size: int = 224):
         self.network, self.head = network.eval().requires_grad_(False), head.eval().requires_grad_(False)
@@ -70,37 +77,45 @@ class PoseContrast:
         self.device = torch.device("cpu")
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The weights, which tell one PoseContrast from another."""
+        """Return the weights, which identify the estimator in the benchmark's cache."""
         return self.network.state_dict() | self.head.state_dict(prefix="head.")
 
     def describe(self, frames: Sequence[Frame]) -> list[Viewpoint]:
-        """Viewpoints of object crops."""
-        found = []
+        """Estimate the viewpoints of object crops."""
+        viewpoints = []
         for frame in frames:
-            batch = normalised(prepare_images([padded(frame, self.image_size)], self.image_size))
+            batch = normalize(prepare_images([square_crop(frame, self.image_size)], self.image_size))
             with torch.inference_mode():
                 feature = self.network(batch)
-                angles = predicted_angles(*self.head(feature))[0]
-            found.append(Viewpoint(euler_to_rotation(angles.numpy()), feature[0].clone()))
-        return found
+                angles = predict_angles(*self.head(feature))[0]
+            viewpoints.append(Viewpoint(euler_to_rotation(angles.numpy()), feature[0].clone()))
+        return viewpoints
 
 
 def load_posecontrast(path: str | Path | None = None) -> PoseContrast:
-    """The published network from its checkpoint: {"net_feat": ResNet-50 with 128 outputs, "net_vp": the head, ...}.
+    """Load the published network.
 
-    path: default `posecontrast.pth` in the cache folder. Raises InputError where it is not there or of another layout.
+    Args:
+        path: Checkpoint {"net_feat": ResNet-50 with 128 outputs, "net_vp": head, ...}; by default `posecontrast.pth` in
+            the cache folder.
+
+    Raises:
+        InputError: The file is missing or damaged, or has other keys or shapes.
     """
     path = Path(path) if path is not None else cache_folder() / FILE
     if not path.is_file():
-        raise InputError(f"posecontrast: no checkpoint at {path}; put the authors' there, or use posecontrast-tiny")
+        raise InputError(
+            f"posecontrast: no checkpoint at {path}; copy the authors' file there, or use posecontrast-tiny"
+        )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever its unpickler stumbles over
-        raise InputError(f"posecontrast {path}: damaged, or not of tensors alone") from error
+    except Exception as error:  # torch does not limit the types of its exceptions here
+        raise InputError(f"posecontrast {path}: damaged, or holds more than tensors") from error
     parts = [content.get(part) if isinstance(content, dict) else None for part in ("net_feat", "net_vp")]
     if not all(isinstance(part, dict) for part in parts):
         raise InputError(f"posecontrast {path}: expected a dict with net_feat and net_vp")
-    network, head = ResNet(Shape(outputs=128)), ViewpointHead(Shape().channels[-1])
+    config = ResNetConfig(outputs=128)
+    network, head = ResNet(config), ViewpointHead(config.channels[-1])
     for module, weights in zip((network, head), parts, strict=True):
         weights = {key.removeprefix("module."): value for key, value in weights.items()}
         load_weights(module, weights, f"posecontrast {path}")
@@ -108,30 +123,36 @@ def load_posecontrast(path: str | Path | None = None) -> PoseContrast:
 
 
 def load_posecontrast_tiny(path: str | Path = TINY_WEIGHTS) -> PoseContrast:
-    """This project's small counterpart. Raises InputError where its weights are not there."""
+    """Load the small network of this project. Raises InputError if the file is missing or invalid."""
     if not Path(path).is_file():
         raise InputError(
-            f"posecontrast-tiny: {Path(path).name} is not there; `zsp-lite train-baseline posecontrast-tiny` makes it"
+            f"posecontrast-tiny: {Path(path).name} does not exist; `zsp-lite train-baseline posecontrast-tiny` creates "
+            "it"
         )
     weights, _ = read_checkpoint(path)
-    parts = TinyParts()
-    load_weights(parts, weights, f"posecontrast-tiny {path}")
-    return PoseContrast(parts.network, parts.estimator, "posecontrast-tiny", TINY_SIZE)
+    model = TinyPoseContrast()
+    load_weights(model, weights, f"posecontrast-tiny {path}")
+    return PoseContrast(model.network, model.estimator, "posecontrast-tiny", TINY_SIZE)
 
 
-TINY_SIZE = 64
-
-
-class TinyParts(nn.Module):
-    """The small network and its head: what the trainer trains and the file holds."""
+class TinyPoseContrast(nn.Module):
+    """Network and head of posecontrast-tiny, as one module for training and storage."""
 
     def __init__(self):
         super().__init__()
         self.network, self.estimator = ResNet(TINY), ViewpointHead(TINY.channels[-1], 64)
 
 
-def predicted_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Float[Tensor, "b 3"]:
-    """Degrees of the likeliest bins and their offsets, as the labels count them: all from 0."""
+def predict_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Float[Tensor, "b 3"]:
+    """Compute the angles of the most probable bins with their offsets.
+
+    Args:
+        logits: (b, bins) of azimuth, elevation and in-plane rotation.
+        offsets: (b, bins) of the same.
+
+    Returns:
+        (b, 3) angles in degrees, in the convention of `euler_to_rotation`.
+    """
     angles = []
     for logit, offset in zip(logits, offsets, strict=True):
         chosen = logit.argmax(1)
@@ -140,54 +161,46 @@ def predicted_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Flo
 
 
 def euler_to_rotation(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Canonical frame to camera (ours) from azimuth, elevation and in-plane rotation in degrees, all counted from 0.
+    """Convert viewpoint angles to rotations from the canonical frame to the camera (OpenCV axes).
 
-    Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth) towards a camera that looks along -z.
+    The rotation to an OpenGL camera is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
+
+    Args:
+        angles: (..., 3) azimuth in [0, 360), elevation in [0, 180] and in-plane rotation in [0, 360), degrees.
     """
-    radians = np.radians(np.asarray(angles, np.float64) - (0, 180, 180))
-    azimuth, elevation, in_plane = (np.asarray(angle) for angle in np.moveaxis(radians, -1, 0))
-    return _AXES @ _turn(in_plane, 2) @ _turn(elevation, 0) @ _turn(azimuth, 2)
+    zxz = (np.asarray(angles, np.float64) - (0, 180, 180))[..., ::-1]
+    rotation = Rotation.from_euler("ZXZ", zxz.reshape(-1, 3), degrees=True).as_matrix()
+    return _AXES @ rotation.reshape(*zxz.shape, 3)
 
 
 def rotation_to_euler(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """The inverse of `euler_to_rotation`: azimuth and in-plane rotation in [0, 360), elevation in [0, 180]."""
-    turned = _AXES @ np.asarray(rotation, np.float64)
-    # Seen straight from above or below, azimuth and in-plane rotation are one: all of it is given to the azimuth.
-    pole = np.hypot(turned[..., 2, 0], turned[..., 2, 1]) < 1e-9
-    in_plane = np.where(pole, 0.0, np.arctan2(-turned[..., 0, 2], turned[..., 1, 2]))
-    azimuth = np.where(
-        pole,
-        np.arctan2(-turned[..., 0, 1], turned[..., 0, 0]),
-        np.arctan2(-turned[..., 2, 0], -turned[..., 2, 1]),
-    )
-    elevation = -np.arccos(turned[..., 2, 2].clip(-1, 1))
-    degrees = np.degrees(np.stack([azimuth, elevation, in_plane], axis=-1)) + (0, 180, 180)
-    return np.stack([degrees[..., 0] % 360, degrees[..., 1], degrees[..., 2] % 360], axis=-1)
+    """Convert rotations to viewpoint angles; the inverse of `euler_to_rotation`.
+
+    At elevations 0 and 180, where only a combination of azimuth and in-plane rotation is defined, one of them is fixed.
+    """
+    rotation = _AXES @ np.asarray(rotation, np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the gimbal lock described above
+        zxz = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_euler("ZXZ", degrees=True)
+    # SciPy's middle angle is in [0, 180], ours in [-180, 0]: the other two change by 180 degrees.
+    in_plane, elevation, azimuth = zxz.T
+    angles = np.stack([(azimuth + 180) % 360, 180 - elevation, in_plane % 360], axis=-1)
+    return angles.reshape(rotation.shape[:-1])
 
 
-def padded(frame: Frame, size: int) -> UInt8[np.ndarray, "s s 3"]:
-    """An object crop in its own aspect again, with black beside or above and below it to make a square.
+def square_crop(frame: Frame, size: int) -> UInt8[np.ndarray, "s s 3"]:
+    """Restore the aspect ratio of an object crop, and pad it with black to a square of `size` pixels.
 
-    The crop's camera tells its aspect: a photograph's pixels were square before the crop was squeezed.
+    The aspect ratio follows from the camera of the crop, because the pixels of the photograph are square.
     """
     x, y = frame.camera.focal_length * (1 / frame.camera.size[1], 1 / frame.camera.size[0])
     return pad_to_square(frame.rgb, y / x, size)
 
 
 def pad_to_square(rgb: UInt8[np.ndarray, "h w 3"], aspect: float, size: int) -> UInt8[np.ndarray, "s s 3"]:
-    """A picture of width : height `aspect` in the middle of a black square."""
+    """Resize an image to the ratio width : height = `aspect` in the middle of a black square of `size` pixels."""
     width, height = (size, max(1, round(size / aspect))) if aspect > 1 else (max(1, round(size * aspect)), size)
     square = np.zeros((size, size, 3), np.uint8)
     top, left = (size - height) // 2, (size - width) // 2
     square[top : top + height, left : left + width] = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
     return square
-
-
-def _turn(angle: Float[np.ndarray, "*batch"], axis: int) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation about a coordinate axis."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.zeros((*np.shape(angle), 3, 3))
-    matrix[..., axis, axis] = 1
-    matrix[..., first, first] = matrix[..., second, second] = np.cos(angle)
-    matrix[..., second, first], matrix[..., first, second] = np.sin(angle), -np.sin(angle)
-    return matrix

@@ -1,7 +1,7 @@
-"""Dense RootSIFT on the patch grid: the hand-made descriptor that a learnt one must beat in one pipeline.
+"""Dense RootSIFT descriptors on the patch grid, in place of the features of a network.
 
-The patch centres form a grid and all descriptors are upright, so a histogram's weights are a product of one of rows
-and one of columns: two small matrix products make all of them at once, 60 times faster than OpenCV does one by one.
+All descriptors are upright and their centres form a grid, so the weights of the histograms are separable in rows and
+columns. Two small matrix products compute all descriptors, 60 times faster than OpenCV's loop over keypoints.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,20 @@ from jaxtyping import Float, UInt8
 from zsp_lite.backbones.backbone import Image, prepare_images
 from zsp_lite.features import FeatureMap
 
-_CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations in each cell
+_CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
-# OpenCV's: the blur of its first octave, taking that of the camera for granted; where peaks are cut; its unit.
+# OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5), clipping, scale.
 _BLUR = (1.6**2 - 0.5**2) ** 0.5
-_PEAK, _UNIT = 0.2, 512.0
+_CLIP, _SCALE = 0.2, 512.0
 
 
 class RootSift:
-    """Called like a Backbone: images in, one FeatureMap each out, keys (28, 28, 128), saliency all ones.
+    """Feature extractor (see `features.FeatureExtractor`) with one RootSIFT descriptor per patch.
 
-    One upright SIFT descriptor (Lowe 2004) per patch centre of the image at 224 pixels, then RootSIFT
-    (Arandjelovic and Zisserman 2012): the square root of the L1-normalised histogram, whose dot products are
-    Hellinger kernels. A keypoint `keypoint_size` pixels wide has 4 x 4 cells of 1.5 times that side, so the
-    default of 24 describes a patch by most of the object around it.
-    SIFT knows no foreground: callers give masks, or take the whole image. The
-    global feature is the mean descriptor, normalised.
+    The image is resized to 224 pixels. The keys, (28, 28, 128), are upright SIFT descriptors (Lowe 2004) at the patch
+    centres as RootSIFT (Arandjelovic and Zisserman 2012): square roots of L1-normalised histograms, whose dot products
+    are Hellinger kernels. The saliency is 1 everywhere; use object masks. The global feature is the normalised mean of
+    the keys.
     """
 
     name = "rootsift"
@@ -39,17 +37,23 @@ class RootSift:
     device = torch.device("cpu")
 
     def __init__(self, keypoint_size: float = 24.0):
+        """Create the extractor.
+
+        Args:
+            keypoint_size: Size of the keypoints, pixels. A descriptor covers 4 x 4 cells of 1.5 times this side; the
+                default covers most of the object.
+        """
         self.keypoint_size = keypoint_size
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
-        """Features of (H, W, 3) images, uint8 or float in [0, 1]. Raises InputError on others."""
+        """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]; InputError for others."""
         return [self._describe(image, index) for index, image in enumerate(images)]
 
     def _describe(self, image: Image, index: int) -> FeatureMap:
         rgb = prepare_images([image], self.image_size, index)[0].mul(255).round().to(torch.uint8)
         grey = cv2.cvtColor(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
         side = self.image_size // self.patch_size
-        centres = (np.arange(side) + 0.5) * self.patch_size - 0.5  # OpenCV counts from the centre of pixel 0
+        centres = (np.arange(side) + 0.5) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
         histograms = dense_sift(grey, centres, self.keypoint_size)
         total = histograms.sum(axis=-1, keepdims=True)
         keys = torch.from_numpy(np.sqrt(histograms / np.maximum(total, 1e-12)).astype(np.float32))
@@ -60,36 +64,42 @@ class RootSift:
 def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
-    """SIFT descriptors of upright keypoints `size` pixels wide at (row, column) in centres x centres.
+    """Compute the descriptors of upright keypoints on a grid, equal to OpenCV's `SIFT.compute` up to rounding.
 
-    What OpenCV's `SIFT.compute` gives for them, in its whole numbers from 0 to 255, up to rounding.
+    Args:
+        grey: (n, n) greyscale image.
+        centres: Coordinates of the keypoints along both axes, pixels.
+        size: Size of the keypoints, pixels.
+
+    Returns:
+        (side, side, 128) integers from 0 to 255.
     """
     n, side = len(grey), len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)
-    right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # at the border no gradient is known
+    right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # gradients are 0 at the border
     right[1:-1, 1:-1] = blurred[1:-1, 2:] - blurred[1:-1, :-2]
     up[1:-1, 1:-1] = blurred[:-2, 1:-1] - blurred[2:, 1:-1]
     length, angle = cv2.cartToPolar(right, up, angleInDegrees=True)
-    # Each gradient is shared out between the two nearest orientations.
-    place = (angle * (_BINS / 360)).ravel()
-    lower = np.floor(place).astype(np.int64)
-    beyond = (place - lower) * length.ravel()
+    # Each gradient contributes to the two nearest orientations, with linear weights.
+    position = (angle * (_BINS / 360)).ravel()
+    lower = np.floor(position).astype(np.int64)
+    upper_part = (position - lower) * length.ravel()
     oriented = np.zeros((_BINS, n * n), np.float32)
     pixel = np.arange(n * n)
-    oriented[lower % _BINS, pixel] = length.ravel() - beyond
-    oriented[(lower + 1) % _BINS, pixel] += beyond
+    oriented[lower % _BINS, pixel] = length.ravel() - upper_part
+    oriented[(lower + 1) % _BINS, pixel] += upper_part
     weights = _weights(n, centres, _CELL * size)
     cells = (weights @ oriented.reshape(_BINS, n, n) @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
     histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)
-    histograms = np.minimum(histograms, _PEAK * np.linalg.norm(histograms, axis=-1, keepdims=True))
+    histograms = np.minimum(histograms, _CLIP * np.linalg.norm(histograms, axis=-1, keepdims=True))
     norm = np.linalg.norm(histograms, axis=-1, keepdims=True)
-    return np.round(histograms * (_UNIT / np.maximum(norm, np.finfo(np.float32).eps))).clip(0, 255)
+    return np.round(histograms * (_SCALE / np.maximum(norm, np.finfo(np.float32).eps))).clip(0, 255)
 
 
 def _weights(n: int, centres: Float[np.ndarray, " side"], cell: float) -> Float[np.ndarray, "rows n"]:
-    """Along one axis, what each of n pixels counts in each cell of each keypoint: rows are keypoints times cells."""
+    """Compute the weight of each of n pixels along one axis in each cell of each keypoint (keypoints x cells, n)."""
     offset = np.arange(n) - np.round(centres)[:, None]
-    place = offset / cell
-    reach = np.exp(-(place**2) / (_CELLS**2 / 2)) * (np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2))
-    apart = np.abs(place[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
-    return (reach[:, None] * np.maximum(1 - apart, 0)).reshape(-1, n).astype(np.float32)
+    in_cells = offset / cell
+    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * (np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2))
+    distance = np.abs(in_cells[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
+    return (window[:, None] * np.maximum(1 - distance, 0)).reshape(-1, n).astype(np.float32)

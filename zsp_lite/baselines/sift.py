@@ -1,4 +1,4 @@
-"""SIFT keypoints (Lowe 2004), matched as mutual nearest neighbours and lifted by depth (paper sec. 5.2)."""
+"""SIFT keypoints (Lowe 2004), matched as mutual nearest neighbours and unprojected by depth (paper sec. 5.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,37 +10,41 @@ from jaxtyping import Float, Int
 from zsp_lite.data.depth import inpaint_depth
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-
-_ON_OBJECT = 0.5
+from zsp_lite.points import ON_OBJECT
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """pixels: (x, y), centres of pixels at half-integers.  descriptors: of unit length."""
+    """Keypoints of an image.
+
+    Attributes:
+        pixels: (n, 2) positions (x, y), with pixel centres at half-integers.
+        descriptors: (n, 128) descriptors of unit length.
+    """
 
     pixels: Float[np.ndarray, "n 2"]
     descriptors: Float[np.ndarray, "n 128"]
 
 
 class Sift:
-    """Called on frames (`describe`): the keypoints on each object, by OpenCV with its own parameters.
+    """Detector and descriptor of keypoints on the object, by OpenCV with its default parameters.
 
-    SIFT knows no foreground: the mask tells it where to look, as the supplement does for the other baselines.
+    SIFT has no saliency, so the object mask selects the keypoints, as in the supplement for the other baselines.
     """
 
     name = "sift"
 
     def describe(self, frames: Sequence[Frame]) -> list[Keypoints]:
-        """Keypoints of object crops; of the whole picture where a frame has no mask."""
+        """Detect the keypoints of object crops, in the mask or, without a mask, in the whole image."""
         return [self._describe(frame) for frame in frames]
 
     def _describe(self, frame: Frame) -> Keypoints:
         grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
-        mask = None if frame.mask is None else (frame.mask >= _ON_OBJECT).astype(np.uint8)
+        mask = None if frame.mask is None else (frame.mask > ON_OBJECT).astype(np.uint8)
         points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
         if not points:
             return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
-        # OpenCV counts from the centre of the first pixel, in a picture that it has doubled with a shift of a quarter.
+        # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image that is shifted by -1/4 pixel.
         pixels = np.array([point.pt for point in points], dtype=np.float64) + 0.25
         length = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Keypoints(pixels, descriptors / np.maximum(length, 1e-12))
@@ -49,7 +53,17 @@ class Sift:
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Indices of at most k mutual nearest neighbours, and the cosines of their descriptors, most similar first."""
+    """Match keypoints as mutual nearest neighbours of their descriptors.
+
+    Args:
+        first: Keypoints of one image.
+        second: Keypoints of the other image.
+        k: Maximum number of matches.
+
+    Returns:
+        Indices of the matched keypoints in `first` and in `second`, and the cosine similarities of their descriptors,
+        most similar first.
+    """
     if not len(first.pixels) or not len(second.pixels):
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     similarity = first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)
@@ -60,10 +74,18 @@ def mutual_matches(
     return index, partner[index], similarity[index, partner[index]]
 
 
-def lifted(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Camera-frame points at pixels of a frame, unknown depths in-painted. Raises InputError without any depth."""
+def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Compute the points of pixels in camera coordinates, with in-painted depth where it is unknown.
+
+    Args:
+        frame: Frame with depth.
+        pixels: (n, 2) pixels (x, y).
+
+    Raises:
+        InputError: No depth is known.
+    """
     if frame.depth is None:
-        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to lift matches to 3D")
+        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to unproject matches")
     height, width = frame.camera.size
     columns, rows = np.floor(pixels).astype(np.int64).clip(0, (width - 1, height - 1)).T
     return frame.camera.unproject_camera(pixels, inpaint_depth(frame.depth)[rows, columns])

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.posecontrast import Viewpoint
-from zsp_lite.baselines.sift import Keypoints, lifted, mutual_matches
+from zsp_lite.baselines.sift import Keypoints, mutual_matches, unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.errors import InputError
@@ -44,7 +44,10 @@ def sift(problem: Problem) -> Answer:
     one, two, _ = found[view]
     details = {"matches": len(one), "inliers": 0}
     try:
-        points = lifted(reference, first.pixels[one]), lifted(targets[view], others[view].pixels[two])
+        points = (
+            unproject_pixels(reference, first.pixels[one]),
+            unproject_pixels(targets[view], others[view].pixels[two]),
+        )
         sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.io.open3d import load_open3d
+from zsp_lite.points import object_points
 
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
@@ -75,12 +75,8 @@ def unit_scale(points: Float[np.ndarray, "n 3"]) -> float:
 
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
-    clouds = []
-    for frame in frames:
-        if frame.depth is not None and frame.mask is not None:
-            inside = (frame.mask > 0.5) & (frame.depth > 0)
-            clouds.append(frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[inside])[::7])
-    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    clouds = [frame.camera.to_world(object_points(frame))[::7] for frame in frames]
+    points = np.concatenate(clouds)
     if len(points) < 4:
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))

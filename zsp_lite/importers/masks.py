@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Box
-from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame, read_mask
 from zsp_lite.errors import InputError
+from zsp_lite.points import object_pixels, object_points
 
 _ITERATIONS = 4  # of GrabCut
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
@@ -106,16 +106,14 @@ def grab_cut(rgb: np.ndarray, box: Box) -> Float[np.ndarray, "h w"]:
 
 def _object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """World points inside the mask, without its border, where depth may be that of the background."""
-    inside = cv2.erode(frame.mask, np.ones((5, 5), np.uint8)) > 0.5
-    depth = np.zeros(frame.camera.size, np.float32) if frame.depth is None else frame.depth
-    return frame.camera.to_world(unproject_depth(depth, frame.camera)[inside & (depth > 0)])
+    inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
+    return frame.camera.to_world(object_points(inner))
 
 
 def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
     """Points (n, 3) on a ball that may contain the object, given its bounding box in the frame."""
     top, left, height, width = box
-    inside = (frame.mask > 0.5) & (frame.depth > 0)
-    depth = float(np.median(frame.depth[inside]))
+    depth = float(np.median(frame.depth[object_pixels(frame)]))
     radius = depth * max(width / frame.camera.focal_length[0], height / frame.camera.focal_length[1]) / 2
     centre = frame.camera.unproject(np.array([left + width / 2, top + height / 2]), depth + _BALL_OFFSET * radius)
     directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))

@@ -16,17 +16,17 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines.posecontrast import (
     BIN,
     BINS,
     TINY_SIZE,
-    TinyParts,
+    TinyPoseContrast,
     euler_to_rotation,
     pad_to_square,
-    predicted_angles,
+    predict_angles,
     rotation_to_euler,
 )
-from zsp_lite.baselines.swav import normalised
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, rotation_error
 from zsp_lite.training.batches import MEAN, STD
@@ -74,7 +74,7 @@ def train(
     training, held_out = crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS)
     note_config(config, folder / "posecontrast-tiny.json")
     torch.manual_seed(config.seed)
-    model = TinyParts()
+    model = TinyPoseContrast()
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     with (folder / "posecontrast-tiny.jsonl").open("w") as file:
         for step in range(config.steps):
@@ -116,7 +116,7 @@ def sample(
     turned[:, 0, 0] = turned[:, 1, 1] = c
     turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = s, -s, 1
     labels = torch.from_numpy(rotation_to_euler(turned @ crops.rotation[index]).astype(np.float32))
-    first, second = (normalised(recolour(rng, images) * STD + MEAN) for _ in range(2))
+    first, second = (normalize(recolour(rng, images) * STD + MEAN) for _ in range(2))
     return first, second, labels
 
 
@@ -145,11 +145,11 @@ def pose_contrast(
 
 
 @torch.no_grad()
-def held_out_errors(model: TinyParts, crops: ObjectCrops, most: int = 400) -> dict[str, float]:
+def held_out_errors(model: TinyPoseContrast, crops: ObjectCrops, most: int = 400) -> dict[str, float]:
     """Median error (degrees) and Acc30 (%) of absolute poses of objects that no step has seen."""
     model.eval()
     index = np.arange(min(most, len(crops)))
-    angles = predicted_angles(*model.estimator(model.network(normalised(_pictures(crops, index)))))
+    angles = predict_angles(*model.estimator(model.network(normalize(_pictures(crops, index)))))
     errors = rotation_error(euler_to_rotation(angles.numpy()), crops.rotation[index])
     return {"held_out_median": round(float(median(errors)), 1), "held_out_acc30": round(float(accuracy(errors, 30)), 1)}
 

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines.resnet import TINY, ResNet
-from zsp_lite.baselines.swav import normalised
 from zsp_lite.errors import InputError
 from zsp_lite.matchers import sinkhorn
 from zsp_lite.synthetic.training_categories import TRAINING
@@ -158,5 +158,5 @@ def multi_crop(
     for side, scale in ((config.large, config.large_scale), (config.small, config.small_scale)):
         grid, _ = crop_grids(rng, 2 * len(pictures), 1, side, scale)
         cut = F.grid_sample(pictures.repeat(2, 1, 1, 1), grid, padding_mode="reflection", align_corners=False)
-        found.append(normalised(recolour(rng, cut) * STD + MEAN))
+        found.append(normalize(recolour(rng, cut) * STD + MEAN))
     return found
