@@ -1,4 +1,4 @@
-"""Two runs, or two rows, on the same pairs: by how much do they differ, and is it more than chance?"""
+"""Comparison of two runs, or of two rows, on the same pairs, with intervals and significance tests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,12 @@ from zsp_lite.metrics import accuracy, median, paired_test
 
 @dataclass(frozen=True)
 class Difference:
-    """Row `first` of run A against row `second` of run B on the `n` pairs that both have.
+    """Difference between row `first` of run A and row `second` of run B on their `n` common pairs.
 
     Attributes:
-        acc30, median: Of A and of B, in percent and degrees.
-        test: What `metrics.paired_test` returns, with bootstrap intervals and p values over objects.
+        acc30: Acc30 of A and of B in percent.
+        median: Median error of A and of B in degrees.
+        test: Result of `metrics.paired_test`, with bootstrap intervals and p values over objects.
     """
 
     first: str
@@ -92,9 +93,9 @@ def comparison_table(differences: list[Difference], first: str, second: str) -> 
         label = one.first if one.first == one.second else f"{one.first}:{one.second}"
         rows.append((label, tuple(cells)))
     note = (
-        "On the pairs that both have; errors of A and B are medians. Intervals (95 %) and p: bootstrap over objects. "
-        "The sign test (pairs that only one of the two solves) and the permutation test (mean difference) take pairs "
-        "for independent; pairs share objects, so their p values are too small. Of twenty rows that do not differ, one "
+        "On the common pairs; errors of A and B are medians. Intervals (95 %) and p: bootstrap over objects. The sign "
+        "test (pairs that only one of the two solves) and the permutation test (mean difference) treat pairs as "
+        "independent; pairs share objects, so their p values are too small. Of twenty rows without a difference, one "
         "has p < 0.05 by chance."
     )
     return Table("compare", f"A = {first}, B = {second}", tuple(columns), tuple(rows), note)

@@ -1,4 +1,4 @@
-"""Tables of a run inside a Markdown document, such as docs/results.md: replaces the text between a table's marks.
+"""Update of the tables in a Markdown document, for example docs/results.md. A table stands between two marks:
 
 <!-- table table_1 -->
 (anything)
@@ -21,10 +21,15 @@ _CATEGORY = re.compile(r"\w+ Acc30")
 
 
 def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
-    """The text with its marked tables anew, without their notes and columns of single categories.
+    """Return the text with its marked tables replaced, without notes and columns of single categories.
 
-    pairs: that the run's figures are of; the titles say so.
-    Raises InputError for a mark that names no table of the run or has no counterpart, and where there is none.
+    Args:
+        text: Markdown text.
+        tables: Tables of a run.
+        pairs: Number of pairs, for the titles.
+
+    Raises:
+        InputError: There are no marks, a mark has no counterpart, or the run has no such table.
     """
     by_name = {table.name: table for table in tables}
     marks = _MARK.findall(text)
@@ -36,18 +41,22 @@ def with_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     def fresh(found: re.Match[str]) -> str:
         start, name, _, end = found.groups()
         if name not in by_name:
-            raise InputError(f"document asks for table {name}, the run has {', '.join(by_name)}")
+            raise InputError(f"document has a mark for table {name}, the run has tables {', '.join(by_name)}")
         return f"{start}{as_markdown(_narrow(by_name[name], pairs))}\n{end}"
 
     return _MARKED.sub(fresh, text)
 
 
 def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> None:
-    """Write the tables into a file. Raises what `with_tables` does, and InputError for what is no text."""
+    """Update the tables in a Markdown file (see `with_tables`).
+
+    Raises:
+        InputError: The file is not UTF-8 text, or as for `with_tables`.
+    """
     try:
         text = read_bytes(Path(path), "document").decode()
     except UnicodeDecodeError as error:
-        raise InputError(f"document {path} is no UTF-8 text ({error})") from error
+        raise InputError(f"document {path} is not UTF-8 text ({error})") from error
     write_atomic(path, with_tables(text, tables, pairs).encode())
 
 

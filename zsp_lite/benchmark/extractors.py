@@ -1,4 +1,4 @@
-"""Who describes images for the benchmark's rows, by name, and how to tell two of them apart."""
+"""Feature extractors of the benchmark's rows by name, and fingerprints that identify them."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -18,10 +18,10 @@ from zsp_lite.features import FeatureMap
 
 Extractor = Callable[[list[np.ndarray]], list[FeatureMap]]
 
-# Makers from the backbone under test. What one makes is called on a list of images, or, where it has `describe`, on
-# a list of frames.
+# Functions that make an extractor from the backbone under test. An extractor is called on a list of images, or, if it
+# has the method `describe`, on a list of frames.
 EXTRACTORS: dict[str, Callable[[Any], Any]] = {
-    "none": lambda backbone: None,  # for rows that look at depth alone
+    "none": lambda backbone: None,  # for rows that use depth only
     "backbone": lambda backbone: backbone,
     "random": lambda backbone: random_backbone(backbone),
     "rootsift": lambda backbone: RootSift(),
@@ -34,7 +34,11 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
 
 
 def make_extractors(backbone: Extractor, names: Iterable[str]) -> dict[str, Any]:
-    """The named extractors. Raises InputError for unknown names, and where a row's weights are not at hand."""
+    """Make extractors by name.
+
+    Raises:
+        InputError: A name is unknown, or the weights of an extractor are not available.
+    """
     names = list(dict.fromkeys(names))
     if unknown := [name for name in names if name not in EXTRACTORS]:
         raise InputError(f"features {unknown}: expected some of {', '.join(EXTRACTORS)}")
@@ -42,9 +46,9 @@ def make_extractors(backbone: Extractor, names: Iterable[str]) -> dict[str, Any]
 
 
 def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
-    """A backbone of the same shape with random weights: what the architecture alone is worth."""
+    """Return a backbone of the same architecture with random weights."""
     if not isinstance(like, Backbone):
-        raise InputError(f"method 'random' needs a Backbone to copy the shape of, got {type(like).__name__}")
+        raise InputError(f"method 'random' needs a Backbone whose architecture it copies, got {type(like).__name__}")
     model = like.model
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -54,10 +58,9 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
 
 
 def fingerprint(extractor: Any) -> str:
-    """An extractor's name and a hash of its weights and of what it does with them, or of what someone's own is.
+    """Return the name of an extractor and a hash of its weights and settings.
 
-    Retrained weights of the same name are another extractor, and so are another block or facet, another size of the
-    input and another mean or standard deviation to normalise it by.
+    For a user-defined extractor, the hash is that of its code and attributes (see `identity.description`).
     """
     name = getattr(extractor, "name", type(extractor).__name__)
     if extractor is None:

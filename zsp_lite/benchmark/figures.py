@@ -1,4 +1,4 @@
-"""Figures from a run: errors' distribution and curves, what more target views bring, what confidences are worth."""
+"""Figures of a run: error distribution, error curves, accuracy against target views, and reliability of confidences."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,14 +16,17 @@ from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
 _VIEWS = (1, 3, 5, 10, 20)
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")
 _DPI = 150
-RIGHT = 30.0  # degrees: what a confidence is about
+RIGHT = 30.0  # degrees: a confidence is the probability of an error below this
 _LEAST_STATED = 20
 
 
 def error_distribution(results: Results, row: str = "ours") -> Figure:
-    """Every pair's rotation error, a line per category (the supplement's figure "err_distrib").
+    """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the supplement).
 
-    A second cluster near 180 degrees is front taken for back. Raises InputError for a row that the run has not.
+    A second cluster near 180 degrees consists of confusions of front and back.
+
+    Raises:
+        InputError: The run does not have the row.
     """
     by_category: dict[str, list[float]] = {}
     for key, error in results.errors(row).items():
@@ -44,10 +47,12 @@ def error_distribution(results: Results, row: str = "ours") -> Figure:
 
 
 def accuracy_against_views(results: Results) -> Figure:
-    """Acc30 and Acc15 over the number of target views, best view only and full, with 95 % intervals.
+    """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals.
 
-    What the paper printed, for CO3D, is dotted grey; the verified solver, where the run has it, is dashed.
-    Raises InputError where the run has fewer than two numbers.
+    The results that the paper published for CO3D are dotted grey; those of the verified solver are dashed.
+
+    Raises:
+        InputError: The run has fewer than two numbers of target views.
     """
     methods, views = results.summary["methods"], results.summary["data"]["targets"]
     lines = {}
@@ -80,7 +85,7 @@ def accuracy_against_views(results: Results) -> Figure:
 
 
 def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
-    """The share of pairs within every error, one line per row.  rows: default the run's first seven."""
+    """Draw the cumulative distribution of the errors, one line per row; by default for the first seven rows."""
     names = list(rows or list(results.summary["methods"])[: len(_COLOURS)])
     figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
     for index, name in enumerate(names):
@@ -90,23 +95,30 @@ def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
         axis.step(np.concatenate([[0], errors]), share, where="post", label=name, **style)
     for threshold in (15, 30):
         axis.axvline(threshold, color="0.7", lw=1, zorder=0)
-    axis.set(xlim=(0, 180), ylim=(0, 100), xlabel="rotation error (degrees)", ylabel="pairs within it (%)",
-             xticks=range(0, 181, 30))  # fmt: skip
+    axis.set(xlim=(0, 180), ylim=(0, 100), xticks=range(0, 181, 30))
+    axis.set(xlabel="rotation error (degrees)", ylabel="pairs with at most this error (%)")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="lower right")
     return figure
 
 
 def reliability_diagram(results: Results, row: str | None = None) -> Figure:
-    """How often answers of a confidence are within 30 degrees, in ten bins of as many pairs, and who is how sure.
+    """Draw a reliability diagram and a histogram of the confidences.
 
-    row: default the first that states confidences. Raises InputError where none does.
+    The diagram shows the fraction of errors below 30 degrees against the mean confidence, in ten bins of equal size.
+
+    Args:
+        results: The run.
+        row: Default: the first row with confidences.
+
+    Raises:
+        InputError: No row, or not this one, has enough confidences.
     """
-    names = dict.fromkeys([*results.summary.get("methods", ()), *results.rows])  # in the order they were asked for
+    names = dict.fromkeys([*results.summary.get("methods", ()), *results.rows])  # in the order of the run
     stated = {name: found for name in names if len(found := results.confidences(name)) >= _LEAST_STATED}
     row = row or next(iter(stated), None)
     if row not in stated:
-        raise InputError(f"reliability: {row or 'no row'} states fewer than {_LEAST_STATED} confidences")
+        raise InputError(f"reliability: {row or 'no row'} has fewer than {_LEAST_STATED} confidences")
     errors = results.errors(row)
     confidence = np.array(list(stated[row].values()))
     right = np.array([errors[key] < RIGHT for key in stated[row]])
@@ -117,14 +129,15 @@ def reliability_diagram(results: Results, row: str | None = None) -> Figure:
     spread = np.sqrt(found.accuracy * (1 - found.accuracy) / found.count)
     above.plot([0, 1], [0, 1], ":", color="0.5", label="calibrated")
     above.errorbar(found.confidence, found.accuracy, spread, fmt="o-", color=BLUE, capsize=2, ms=4, label=f'"{row}"')
-    above.set(ylim=(-0.02, 1.05), ylabel="share within 30°")
+    above.set(ylim=(-0.02, 1.05), ylabel="fraction within 30°")
     above.set_title(
         f"AUROC {found.auroc:.2f}, calibration error {100 * found.calibration_error:.1f} points,\n"
-        f"surest half {100 * found.top_half_accuracy:.0f} % right (all: {100 * right.mean():.0f} %)", fontsize=10,
-    )  # fmt: skip
+        f"more confident half {100 * found.top_half_accuracy:.0f} % correct (all: {100 * right.mean():.0f} %)",
+        fontsize=10,
+    )
     above.legend(fontsize=8, loc="upper left")
     below.hist([confidence[right], confidence[~right]], bins=np.linspace(0, 1, 21), stacked=True,
-               color=[BLUE, ORANGE], label=["right", "wrong"])  # fmt: skip
+               color=[BLUE, ORANGE], label=["correct", "wrong"])  # fmt: skip
     for patch in below.containers[1].patches:
         patch.set_hatch("///")
     below.set(xlim=(-0.02, 1.02), xlabel="confidence", ylabel="pairs")
@@ -135,7 +148,7 @@ def reliability_diagram(results: Results, row: str | None = None) -> Figure:
 
 
 def write_figures(results: Results, folder: str | Path) -> list[Path]:
-    """The figures that the run has rows for, as PNG files."""
+    """Write the figures for which the run has rows as PNG files; returns their paths."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     first = "ours" if "ours" in results.rows else next(iter(results.rows))
@@ -149,7 +162,7 @@ def write_figures(results: Results, folder: str | Path) -> list[Path]:
     for name, make in makers.items():
         try:
             figure = make()
-        except InputError:  # too few numbers of views, or nobody says how sure he is: this run has no such figure
+        except InputError:  # the run has no rows for this figure
             continue
         path = folder / f"{name}.png"
         figure.savefig(path, dpi=_DPI)

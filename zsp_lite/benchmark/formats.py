@@ -23,12 +23,12 @@ _LATEX = str.maketrans(
 
 
 def as_rich(table: Table) -> RichTable:
-    """For a terminal: an interval below its figure, published figures dim and headed as such."""
+    """Return the table for a terminal: intervals on a second line, published results dimmed."""
     made = RichTable(
         title=table.title, caption=table.note or None, caption_justify="left", box=SIMPLE_HEAD, pad_edge=False
     )
     longest = max((len(label) for label, _ in table.rows), default=0)
-    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
+    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # names of rows are not truncated
     for column in table.columns:
         group = column.group.removeprefix(THIS_RUN).removeprefix(": ")
         title = column.title.replace(" (", "\n(").replace(" Acc30", "\nAcc30")
@@ -41,7 +41,7 @@ def as_rich(table: Table) -> RichTable:
 
 
 def print_tables(tables: Iterable[Table]) -> None:
-    """To the terminal; what is wider than it goes on in the next line, and no figure is cut."""
+    """Print tables to the terminal. Lines that are wider than the terminal are wrapped and not truncated."""
     console = Console()
     for table in tables:
         made = as_rich(table)
@@ -50,7 +50,7 @@ def print_tables(tables: Iterable[Table]) -> None:
 
 
 def as_csv(table: Table) -> str:
-    """Plain numbers; a figure's interval in two columns of its own."""
+    """Return the table as CSV; the ends of an interval are two further columns."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     intervals = [any(isinstance(cells[i], Cell) and cells[i].low is not None for _, cells in table.rows)
@@ -69,7 +69,7 @@ def as_csv(table: Table) -> str:
 
 
 def as_markdown(table: Table) -> str:
-    """A pipe table under its title."""
+    """Return the table as a Markdown table below its title."""
     titles = _flat_titles(table, ": ")
     lines = [f"**{table.title}**", "", _piped(["", *titles]), "|---|" + "---:|" * len(titles)]
     lines += [_piped([label, *map(_text, cells)]) for label, cells in table.rows]
@@ -77,12 +77,12 @@ def as_markdown(table: Table) -> str:
 
 
 def _piped(cells: Sequence[str]) -> str:
-    """A line of a Markdown table."""
+    """Return one line of a Markdown table."""
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def as_latex(table: Table) -> str:
-    """A booktabs table; needs nothing else."""
+    """Return the table as LaTeX; it needs the package booktabs."""
     groups = _groups(table)
     lines = ["\\begin{table}", "\\centering", f"\\caption{{{_latex(table.title)}. {_latex(table.note)}}}",
              f"\\begin{{tabular}}{{l{'r' * len(table.columns)}}}", "\\toprule"]  # fmt: skip
@@ -100,7 +100,7 @@ def as_latex(table: Table) -> str:
 
 
 def as_html(table: Table) -> str:
-    """A table element; published figures are set apart by the class "published"."""
+    """Return the table as an HTML element; cells with published results have the class "published"."""
 
     def cell(tag: str, text: str, group: str, span: int = 1) -> str:
         kind = ' class="published"' if group.startswith("published") else ""
@@ -125,7 +125,7 @@ def as_html(table: Table) -> str:
 
 
 def write_tables(tables: Iterable[Table], folder: str | Path) -> list[Path]:
-    """Each table as NAME.csv, .md, .tex and .html in the folder, and all of them in tables.html."""
+    """Write each table as NAME.csv, .md, .tex and .html to the folder, and all of them to tables.html."""
     folder, written, pages = Path(folder), [], []
     for table in tables:
         for suffix, render in ((".csv", as_csv), (".md", as_markdown), (".tex", as_latex), (".html", as_html)):

@@ -1,4 +1,4 @@
-"""What a backbone, or someone's own function or object, is: two of the same digest can be expected to answer alike."""
+"""Digests of backbones, functions and objects. Equal digests mean equal results."""
 
 import functools
 import hashlib
@@ -17,12 +17,12 @@ _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]+")
 
 
 def digest_of(value: Any) -> str:
-    """A hash of `description`."""
+    """Return a hash of `description(value)`."""
     return hashlib.sha256(description(value).encode()).hexdigest()[:16]
 
 
 def backbone_digest(backbone: Backbone) -> str:
-    """A hash of a backbone's weights and of what it does with them; neither its device nor its batches count."""
+    """Return a hash of a backbone's weights and settings. The device and the batch size are ignored."""
     chosen = (
         backbone.layer, backbone.facet, backbone.saliency_heads, backbone.image_size, backbone.mean, backbone.std,
         backbone.precision,
@@ -34,11 +34,11 @@ def backbone_digest(backbone: Backbone) -> str:
 
 
 def description(value: Any, _within: tuple[int, ...] = ()) -> str:
-    """Functions by their source, defaults and what they close over; objects by their class and public attributes.
+    """Describe a value as text.
 
-    Objects that say themselves what they are (`__repr__`) are believed, arrays and weights go in as hashes. What a
-    function looks up among its module's globals is not followed; attributes whose names begin with an underscore, and
-    cached properties, are taken for caches.
+    A function is described by its source, defaults and closure, without the globals that it uses. An object is
+    described by its `__repr__`, if its class defines one, otherwise by its class and its public attributes except
+    cached properties. Arrays and weights are described by hashes.
     """
     value = inspect.unwrap(value) if callable(value) else value
     if id(value) in _within:
@@ -100,7 +100,7 @@ def _bytes(tensor: torch.Tensor) -> bytes:
 def _source(known: Any) -> str:
     try:
         return inspect.getsource(known)
-    except (OSError, TypeError):  # typed in at a prompt, unpickled in a worker, or compiled
+    except (OSError, TypeError):  # defined at a prompt, unpickled in a worker, or compiled
         name = getattr(known, "__qualname__", str(known))
     if inspect.isclass(known):
         members = {

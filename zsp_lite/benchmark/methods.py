@@ -1,7 +1,7 @@
-"""The rows of the benchmark's tables as plain data, groups of them by name, and your own.
+"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and user-defined methods.
 
-A row is the paper's method with some of its settings changed, or a function of its own (`solve`). What a function is
-given and may answer stands in `problem`.
+A row is the paper's method with some settings changed, or a function (`solve`). `problem` defines the argument and the
+results of such functions.
 """
 
 import hashlib
@@ -24,12 +24,14 @@ from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 class Method:
     """A row of the tables.
 
-    features: what describes the images, a name in `extractors.EXTRACTORS`.
-    answer: the fitted pose; the best view taken as it is ("Ours-BV"); the pose fitted in the target view that is truly
-    nearest in rotation; or, without depth, the essential matrix between the reference and the best view.
-    settings: of `ZeroShotPose`, where they differ from the paper's.
-    targets: target views per pair, where the row fixes them; None takes the run's.
-    solve: does everything instead, from a `Problem`; `features` then only says which extractor it will ask for.
+    Attributes:
+        features: Name of the feature extractor in `extractors.EXTRACTORS`.
+        answer: "pose" for the fitted pose, "best view" for the best view without a fit ("Ours-BV"), "true view" for the
+            pose fitted in the target view that is nearest in rotation to the ground truth, or "essential matrix" for
+            the rotation between the reference and the best view without depth.
+        settings: Settings of `ZeroShotPose` that differ from the paper's.
+        targets: Number of target views per pair; None for that of the run.
+        solve: Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     """
 
     features: str = "backbone"
@@ -53,7 +55,7 @@ _VERIFIED = {"solver": "verified"}
 
 
 def _verified_rows() -> dict[str, Method]:
-    """The solver beyond the paper: with less to see, and with parts of it taken away."""
+    """Return the rows of the verified solver: with fewer views, with the true mask, and with single parts disabled."""
     rows = {"verified": Method(settings=_VERIFIED), "verified-mask": Method(settings=_VERIFIED | _MASK)}
     rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 10, 20)}
     rows |= {f"verified-mask-n{n}": Method(settings=_VERIFIED | _MASK, targets=n) for n in (1, 3, 5, 10)}
@@ -74,7 +76,7 @@ def _verified_rows() -> dict[str, Method]:
 
 
 def _damaged_rows() -> dict[str, Method]:
-    """The paper's solver and the verified one on data that were spoilt; wrong masks only harm those who use them."""
+    """Return the rows of both solvers on corrupted data. Rows with a wrong mask use it as the foreground."""
     rows = {}
     for name in ("clean", *DAMAGES):
         mask = _MASK if name.startswith("mask") else {}
@@ -86,7 +88,7 @@ def _damaged_rows() -> dict[str, Method]:
 METHODS: dict[str, Method] = {
     "ours": Method(),
     "ours-bv": Method(answer="best view"),
-    # SIFT has no saliency: it gets the true mask, which no other row does unless its name says so.
+    # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says so.
     "rootsift": Method("rootsift", settings=_MASK),
     "rootsift-bv": Method("rootsift", "best view", _MASK),
     "ours-mask": Method(settings=_MASK),
@@ -98,7 +100,7 @@ METHODS: dict[str, Method] = {
     "ours-k30-nokmeans": Method(settings={"k": 30, "kmeans": False}),
     "ours-k50-nokmeans": Method(settings={"kmeans": False}),
     "ours-k70-nokmeans": Method(settings={"k": 70, "kmeans": False}),
-    # Table 3: the other ways to choose a view.
+    # Table 3: the other view selectors.
     "ours-globalsim": Method(settings={"view_selector": "global"}),
     "ours-saliencyiou": Method(settings={"view_selector": "saliency"}),
     "ours-cyclicaliou": Method(settings={"view_selector": "cyclical"}),
@@ -108,9 +110,9 @@ METHODS: dict[str, Method] = {
     "ours-trials500": Method(settings={"trials": 500}),
     "ours-trials2000": Method(settings={"trials": 2000}),
     "ours-nodepth": Method(answer="essential matrix"),
-    # Cycles, clusters and salience from the target view, as in the published code.
+    # Cycles, clusters and saliency of the target view, as in the published code.
     "ours-published": Method(settings={"cycle_from": "target"}),
-    # Table 1, the baselines. Convolutional features are told the object by the mask, too.
+    # Table 1, the baselines. Convolutional features have no saliency and use the true mask.
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
@@ -150,23 +152,26 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 def _union(*names: str) -> tuple[str, ...]:
-    """Rows of several groups, each once."""
+    """Return the rows of several groups without duplicates."""
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
-# Every switch of the paper at one number of views; then all its tables, with what stands in for the large networks.
+# All ablations of the paper at one number of views; all its tables, with small networks instead of the large ones.
 GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
 GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
-# The paper's tables and what goes beyond them, on data as they are.
+# The paper's tables and the rows beyond the paper, on data that are not corrupted.
 GROUPS["all"] = _union("paper", "verified-views", "oracle-view", "ours-adaptive")
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
-    """Rows by name, in order, each once.
+    """Resolve names to rows, in order and without duplicates.
 
-    methods: names in `METHODS` or `GROUPS` or of the form "module:name"; or a mapping from the names that the tables
-    shall show to such names, `Method`s, functions of a `Problem`, or objects with `ZeroShotPose`'s `estimate`.
-    Raises InputError for what is none of these.
+    Args:
+        methods: Names in `METHODS` or `GROUPS`, or "module:name"; or a mapping from names for the tables to such names,
+            `Method`s, functions of a `Problem`, or objects with the method `estimate(reference, targets)`.
+
+    Raises:
+        InputError: A name is unknown or cannot be imported, or an object is none of these.
     """
     if isinstance(methods, str):
         methods = [methods]
@@ -179,9 +184,9 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
 
 
 def fingerprint(method: Method) -> str:
-    """What decides a row's results, as far as it can be told: its settings, and what functions and objects do.
+    """Return a hash of all that determines a row's results: its settings, functions and objects.
 
-    Two rows of one name and different fingerprints must not share a file.
+    Two rows with the same name and different fingerprints must not be stored in one run.
     """
     if method.solve is not None or any(callable(value) for value in method.settings.values()):
         return digest_of((method.features, method.answer, method.settings, method.targets, method.solve))
@@ -211,10 +216,14 @@ def _method(name: str, meant: Any) -> Method:
 
 
 def import_object(path: str) -> Any:
-    """What "module:name" stands for, in an installed module or one of the current folder. InputError where nothing."""
+    """Import the object "module:name" from an installed module or a module in the current folder.
+
+    Raises:
+        InputError: There is no such module or object.
+    """
     module, _, name = path.partition(":")
     if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not look into the current folder by itself
+        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
     try:
         found = importlib.import_module(module)
         for part in name.split("."):
@@ -226,7 +235,7 @@ def import_object(path: str) -> Any:
 
 @dataclass(frozen=True)
 class _Estimator:
-    """Someone's object with `estimate(reference, targets) -> PoseEstimate`: it is given the whole frames."""
+    """Adapter of a user-defined object with `estimate(reference, targets)`, which gets the whole frames."""
 
     estimator: Any
 

@@ -1,22 +1,27 @@
-"""The figures that the paper printed (Goodwin et al., ECCV 2022), for comparison only.
+"""Results published in the paper (Goodwin et al., ECCV 2022), for comparison only.
 
-CO3D, 20 categories, 100 pairs each, DINO ViT-S/8: other data than this project's synthetic benchmark, so never in one
-column with its figures. "med" is the median rotation error in degrees, "acc30" and "acc15" are in percent, and so are
-the five categories of Table 1, which are Acc30.
+They were measured on CO3D (20 categories with 100 pairs each) with DINO ViT-S/8. These are other data than those of the
+synthetic benchmark, so the tables show them in separate columns. "med" is the median rotation error in degrees, "acc30"
+and "acc15" are percentages; the columns of single categories in Table 1 are Acc30 in percent.
 """
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Printed:
-    """A printed table: columns, and rows of as many figures by their label."""
+class PublishedTable:
+    """A published table.
+
+    Attributes:
+        columns: Names of the columns.
+        rows: Label to one value per column.
+    """
 
     columns: tuple[str, ...]
     rows: dict[str, tuple[float, ...]]
 
 
-TABLE_1 = Printed(
+TABLE_1 = PublishedTable(
     ("med", "acc30", "acc15", "bike", "hydrant", "mcycle", "teddy", "toaster"),
     {
         "ICP": (111.8, 3.8, 0.7, 3.0, 6.0, 1.0, 1.0, 7.0),
@@ -29,7 +34,7 @@ TABLE_1 = Printed(
     },
 )
 
-TABLE_2 = Printed(
+TABLE_2 = PublishedTable(
     ("med", "acc30", "acc15"),
     {
         "Ours-BV (N=1)": (92.8, 12.6, 3.7),
@@ -41,7 +46,7 @@ TABLE_2 = Printed(
     },
 )
 
-TABLE_3 = Printed(
+TABLE_3 = PublishedTable(
     ("med", "acc30", "acc15"),
     {
         "CyclicalDistIoU": (94.7, 22.3, 13.1),
@@ -51,7 +56,7 @@ TABLE_3 = Printed(
     },
 )
 
-TARGETS = Printed(
+TARGETS = PublishedTable(
     ("bv_acc30", "bv_acc15", "full_acc30", "full_acc15"),
     {
         "1": (12.6, 3.7, 23.8, 13.4),
@@ -62,7 +67,7 @@ TARGETS = Printed(
     },
 )
 
-MATCHERS = Printed(
+MATCHERS = PublishedTable(
     ("med", "acc30", "acc15"),
     {
         "Optimal transport": (54.6, 44.8, 29.1),
@@ -71,7 +76,7 @@ MATCHERS = Printed(
     },
 )
 
-CORRESPONDENCES = Printed(
+CORRESPONDENCES = PublishedTable(
     ("no_kmeans_acc30", "no_kmeans_acc15", "kmeans_acc30", "kmeans_acc15"),
     {
         "30": (38.7, 25.2, 43.5, 29.0),
@@ -80,7 +85,7 @@ CORRESPONDENCES = Printed(
     },
 )
 
-DEPTH = Printed(
+DEPTH = PublishedTable(
     ("med", "acc30", "acc15"),
     {
         "No depth (essential matrix)": (81.7, 23.6, 6.8),
@@ -89,7 +94,7 @@ DEPTH = Printed(
     },
 )
 
-TRIALS = Printed(
+TRIALS = PublishedTable(
     ("acc30",),
     {
         "500": (45.8,),

@@ -1,7 +1,7 @@
-"""The paper's tables from a run's summary, with intervals, and what the paper printed in columns of its own.
+"""The paper's tables from the summary of a run, with intervals, and with the published results in separate columns.
 
-Medians are means of the categories' medians, as the paper averages them; accuracies are over all pairs, which is the
-same average where every category has as many. A table without a single row in the run is left out.
+As in the paper, medians are averaged over the categories. Accuracies are over all pairs, which is the same average if
+all categories have equally many pairs. Tables without a row in the run are left out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsp_lite.benchmark import published
-from zsp_lite.benchmark.published import Printed
+from zsp_lite.benchmark.published import PublishedTable
 from zsp_lite.errors import InputError
 
 THIS_RUN = "this run"
@@ -27,7 +27,7 @@ _FIGURES = ("med", "acc30", "acc15")
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure with its interval, where it has one."""
+    """A value, optionally with its interval."""
 
     value: float
     low: float | None = None
@@ -38,7 +38,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """group: what stands above several columns of one kind."""
+    """A column; `group` is the common heading of several columns."""
 
     title: str
     group: str = ""
@@ -46,7 +46,15 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """name: a file's stem.  rows: a label and one cell per column, None where there is no figure."""
+    """A table.
+
+    Attributes:
+        name: Stem of the file name.
+        title: Title.
+        columns: Columns.
+        rows: Label and one cell per column; None for a missing value.
+        note: Text below the table.
+    """
 
     name: str
     title: str
@@ -57,7 +65,7 @@ class Table:
 
 @dataclass(frozen=True)
 class _Block:
-    """Columns of one kind: `figures` of the row (a benchmark row's name, or None) that stands for each label."""
+    """Columns with a common heading: `figures` of the benchmark row (None if it has none) of each label."""
 
     group: str
     rows: Mapping[str, str | None]
@@ -65,7 +73,7 @@ class _Block:
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Tables 1 to 3 and those of the supplement, as far as the run has rows for them, and what it has beyond them."""
+    """Return Tables 1 to 3, those of the supplement and those beyond the paper, if the run has rows for them."""
     names = {"icp": "ICP", "sift": "SIFT", "swav": "SWaV", "icp-bv": "ICP+BV", "posecontrast": "PoseContrast"}
     table1 = {label: name for name, label in names.items()}
     table1 |= {"swav-tiny (stand-in)": "swav-tiny", "posecontrast-tiny (stand-in)": "posecontrast-tiny"}
@@ -77,7 +85,7 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
     views = summary["data"]["targets"]
 
     def at(row: str, n: int) -> str:
-        """The row at a number of views, under the name that the run has it by."""
+        """Return the name in the run of a row with n target views."""
         named = f"{row}-n{n}"
         return row if n == views and named not in summary["methods"] else named
 
@@ -128,7 +136,7 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def all_rows(summary: Mapping[str, Any]) -> Table:
-    """Every row of the run: its figures, and how many of its answers say themselves that they are not to be trusted."""
+    """Return a table with all rows of the run: results, numbers of flagged estimates, and tests against ours."""
     columns = (
         "pairs", "Med. err. (°)", "Acc30 (%)", "Acc15 (%)", "above 150° (%)", "flagged", "failed", "ours - row (%)",
         "p", "p, sign test",
@@ -143,15 +151,15 @@ def all_rows(summary: Mapping[str, Any]) -> Table:
                  None if test is None else Cell(test["sign_test_p"], p_value=True)]  # fmt: skip
         rows.append((name, tuple(cells)))
     note = (
-        "Med. err.: mean of the categories' medians. flagged: estimates that the method itself warns about; they count "
-        'as they are. ours - row: difference in Acc30 to "ours" on the same pairs. Intervals (95 %) and p: bootstrap '
-        "over objects. The sign test takes pairs for independent; pairs share objects, so its p values are too small."
+        "Med. err.: mean of the categories' medians. flagged: estimates with a warning of the method, included "
+        'in all values. ours - row: difference in Acc30 to "ours" on the same pairs. Intervals (95 %) and p: bootstrap '
+        "over objects. The sign test treats pairs as independent; pairs share objects, so its p values are too small."
     )
     return Table("all_rows", "All rows", tuple(map(Column, columns)), tuple(rows), note)
 
 
 def category_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Every row by category: median error, Acc30 and Acc15, one table each."""
+    """Return tables of all rows by category: median error, Acc30 and Acc15."""
     categories = list(dict.fromkeys(c for row in summary["methods"].values() for c in row["per_category"]))
     columns = tuple(Column(category) for category in (*categories, "all"))
     tables = []
@@ -165,9 +173,10 @@ def category_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
-    """Acc30 of some rows, a line for each category: narrow enough for a terminal.
+    """Return the Acc30 of some rows with one line per category, narrow enough for a terminal.
 
-    Raises InputError where the run has no such row.
+    Raises:
+        InputError: The run does not have one of the rows.
     """
     methods = summary["methods"]
     if lacking := [name for name in names if name not in methods]:
@@ -182,7 +191,7 @@ def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
 
 
 def every_table(summary: Mapping[str, Any]) -> list[Table]:
-    """All of them."""
+    """Return all tables of a run."""
     return [all_rows(summary), *paper_tables(summary), *category_tables(summary)]
 
 
@@ -190,9 +199,9 @@ def _builder(summary: Mapping[str, Any]) -> Callable[..., tuple[Table, list[str]
     methods = summary["methods"]
 
     def build(
-        name: str, title: str, blocks: Sequence[_Block], printed: Printed | None = None, unit: str = ""
+        name: str, title: str, blocks: Sequence[_Block], printed: PublishedTable | None = None, unit: str = ""
     ) -> tuple[Table, list[str]]:
-        """A table, and the names of the run's rows in it."""
+        """Return a table and the names of the benchmark rows in it."""
         columns = [Column(_TITLES.get(figure, f"{figure} Acc30"), block.group) for block in blocks
                    for figure in block.figures]  # fmt: skip
         if printed is not None:
@@ -219,7 +228,7 @@ def _named_figure(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
 
 
 def _figure(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
-    """A figure of a row, or of a row's category, with its interval."""
+    """Return a value of a row, or of one category of a row, with its interval."""
     if row is None:
         return None
     name = figure

@@ -1,7 +1,7 @@
-"""What the backbone is asked for: correspondence on one surface, geometry per patch, attention on the object.
+"""Training losses: correspondence, choice of the view, geometry per patch, and attention on the object.
 
-All four use what a renderer knows about the views of ONE build, whose proportions differ from view to view: which
-places correspond, and which views look from the same side. No loss compares two builds, none sees a category's name.
+The losses use ground truth of the renderer for the views of one object: corresponding surface points and views from the
+same side. The object's proportions differ from view to view. No loss compares two objects or uses category names.
 """
 
 import torch
@@ -16,12 +16,23 @@ def correspondence_loss(
     descriptors: Float[Tensor, "crops n dim"], surface: Float[Tensor, "crops n 3"], objects: int,
     radius: float, temperature: float, queries: int, generator: torch.Generator,
 ) -> tuple[Tensor, float]:  # fmt: skip
-    """InfoNCE between the views of each object, with soft targets by distance on its surface.
+    """Compute InfoNCE between the views of each object, with soft targets by distance on its surface.
 
-    A query patch must find, among the patches of the object's other views, those near its own surface point: the
-    target falls with distance as a Gaussian of standard deviation `radius` (object units), up to 2.4 of these, and
-    is 0 beyond. Descriptors are unit vectors. Returns the loss, as the divergence from the soft target so that 0 is
-    perfect, and the share of queries whose nearest descriptor lies where the target is not 0.
+    The target of a query patch is a distribution over the patches of the object's other views. It is a Gaussian of the
+    distance between the surface points, and 0 beyond 2.4 standard deviations.
+
+    Args:
+        descriptors: Unit vectors, ordered by object and view.
+        surface: Surface point of each patch in object coordinates, NaN on the background.
+        objects: Number of objects.
+        radius: Standard deviation of the Gaussian, in object units.
+        temperature: Temperature of the softmax over similarities.
+        queries: Largest number of query patches per object.
+        generator: Source of the random queries.
+
+    Returns:
+        The loss, as the divergence from the targets, so that 0 is its minimum; and the fraction of queries whose
+        nearest descriptor has a non-zero target.
     """
     crops, n, dim = descriptors.shape
     views = crops // objects
@@ -56,12 +67,23 @@ def view_loss(
     keys: Float[Tensor, "crops h w dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float,
     queries: int, generator: torch.Generator, log_binned: bool = True,
 ) -> tuple[Tensor, float]:  # fmt: skip
-    """Which of the object's other views looks from the same side? Cross-entropy over the best-view score.
+    """Compute the cross-entropy of selecting, among the object's other views, the one from the same side.
 
-    Views come in pairs (2k, 2k + 1). The score of two views is what the method chooses the best view by, in a form
-    with gradients: the mean over one view's object patches, at most `queries` of them, of the highest similarity of
-    their log-binned descriptors (or bare keys) in the other. Opposite sides, front and back, are among the wrong
-    answers. Returns the loss and the share of views whose partner scores highest.
+    Views 2k and 2k + 1 show the same side; views of the opposite side are among the negatives. The score of two views
+    is a differentiable form of the best-view score: the mean over patches of one view of their highest similarity in
+    the other view, made symmetric.
+
+    Args:
+        keys: Keys, ordered by object and view.
+        on_object: Patches on the object.
+        objects: Number of objects.
+        temperature: Temperature of the softmax over scores.
+        queries: Largest number of patches per view.
+        generator: Source of the random patches.
+        log_binned: Compare log-binned descriptors; False compares the keys.
+
+    Returns:
+        The loss, and the fraction of views whose partner has the highest score.
     """
     crops = len(keys)
     views = crops // objects
@@ -82,19 +104,19 @@ def view_loss(
         score = torch.stack([rows.mean(0) if len(rows) else rows.new_full((views,), -1.0) for rows in taken])
         scores.append((score + score.T) / 2)
     seen = on_object.view(objects, views, -1).sum(2) > 3
-    out_of_question = torch.eye(views, dtype=torch.bool, device=keys.device) | ~seen[:, None]
-    asked = seen & seen[:, partner]
-    if not asked.any():
+    excluded = torch.eye(views, dtype=torch.bool, device=keys.device) | ~seen[:, None]
+    valid = seen & seen[:, partner]
+    if not valid.any():
         return keys.sum() * 0, 0.0
-    logits = (torch.stack(scores) / temperature).masked_fill(out_of_question, -1e4)[asked]
-    answer = partner.expand(objects, -1)[asked]
-    return F.cross_entropy(logits, answer), (logits.argmax(1) == answer).float().mean().item()
+    logits = (torch.stack(scores) / temperature).masked_fill(excluded, -1e4)[valid]
+    labels = partner.expand(objects, -1)[valid]
+    return F.cross_entropy(logits, labels), (logits.argmax(1) == labels).float().mean().item()
 
 
 def geometry_loss(
     prediction: Float[Tensor, "crops n 5"], geometry: Float[Tensor, "crops n 4"], on_object: Bool[Tensor, "crops n"]
 ) -> Tensor:
-    """Read normals, relative depth (channels 0 to 3) and foreground (channel 4) from each patch token."""
+    """Compute the loss of predicted normals and relative depth (channels 0 to 3) and foreground logit (channel 4)."""
     inside = on_object.float()
     foreground = F.binary_cross_entropy_with_logits(prediction[..., 4], inside)
     error = F.smooth_l1_loss(prediction[..., :4], geometry, beta=0.3, reduction="none").mean(-1)
@@ -104,13 +126,18 @@ def geometry_loss(
 def attention_loss(
     cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
 ) -> tuple[Tensor, float]:
-    """Ask the CLS attention, averaged over heads, to spread evenly over the object and leave the rest.
+    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask.
 
-    cls_logits holds 1 + n columns, the CLS token first.
+    The target is uniform on the object and zero elsewhere. The loss is the divergence between the normalised mask and
+    the attention over patches, plus a cross-entropy that separates object and background at 0.12 times the mean
+    attention on the object.
 
-    Divergence between the normalised mask and the attention over patches, and a cross-entropy that separates the two
-    sides at 0.12 of the object's mean attention. This is supervision by rendered masks. Returns the loss and the mean
-    IoU of (attention, min-max scaled) > 0.05 with the mask, the paper's foreground rule.
+    Args:
+        cls_logits: Attention logits of the CLS token, CLS first.
+        coverage: Fraction of each patch that the object covers.
+
+    Returns:
+        The loss, and the mean IoU of the mask with the patches of min-max normalised attention above 0.05.
     """
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
