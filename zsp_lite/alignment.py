@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 from zsp_lite.errors import InputError, check_integer, check_seed
 
 # Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
-# paper gives none; without a range, RANSAC can shrink the source into a dense spot of the target.
+# paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
 SCALE_RANGE = (0.2, 5.0)
-# Below this ratio of the second to the first singular value of the covariance, the points are taken for collinear: the
-# rotation about their line is noise. It is a ratio of squared widths: 1e-6 is a cloud 1000 times longer than wide.
+# Below this ratio of the second to the first singular value of the covariance, the points are treated as collinear: the
+# rotation about their line is undetermined. It is a ratio of squared widths: 1e-6 is a cloud 1000 times longer than
+# wide.
 _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
 # The same for a single cloud, as a ratio of widths: the rounding of float32 coordinates on a line stays below it.

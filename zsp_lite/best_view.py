@@ -1,7 +1,7 @@
 """Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
 
-Each score is a function of what it needs; `VIEW_SELECTORS` gives all four the same argument, a `ViewPair`. The view of
-highest score is selected.
+Each score is a function of features or matches. The entries of `VIEW_SELECTORS` have one argument, a `ViewPair`. The
+view of highest score is selected.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class ViewPair:
         target_foreground: Foreground patches of the target view.
         similarity: Cosines between the descriptors of the reference's patches and the target's.
         matches: At most k matches.
-        k: Number of matches that were asked for.
+        k: Requested number of matches.
     """
 
     reference: FeatureMap
@@ -50,7 +50,7 @@ class ViewPair:
 
 @runtime_checkable
 class ViewSelector(Protocol):
-    """A score of how well a target view suits the reference. Any callable with this signature will do.
+    """A score of how well a target view suits the reference. Any callable with this signature is accepted.
 
     A selector that counts the matches whose descriptors are close:
 
@@ -73,7 +73,7 @@ def correspondence_score(matches: Matches, k: int) -> float:
 
     Args:
         matches: At most k matches.
-        k: Number of matches that were asked for.
+        k: Requested number of matches.
     """
     return score_from_cosines(torch.as_tensor(matches.similarity), k)
 

@@ -28,7 +28,7 @@ class DemoResult:
         estimate: Its pose estimate.
         error: Rotation error in degrees.
         seconds: Run time of the estimate, from frames in memory.
-        sequence: At most six whole frames, evenly spaced over the target sequence, to show the propagated pose in.
+        sequence: At most six whole frames, evenly spaced over the target sequence, for displaying the propagated pose.
     """
 
     pair: Pair

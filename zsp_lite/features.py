@@ -66,7 +66,7 @@ class FeatureMap:
 
 @runtime_checkable
 class FeatureExtractor(Protocol):
-    """A backbone: maps images to feature maps. Any callable with this signature will do.
+    """A backbone: maps images to feature maps. Any callable with this signature is accepted.
 
     An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the default is 224.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Matcher(Protocol):
-    """A way to match patches. Any callable with this signature will do.
+    """A way to match patches. Any callable with this signature is accepted.
 
     A matcher that takes the nearest neighbour if it is clearly better than the second nearest (Lowe's ratio test):
 

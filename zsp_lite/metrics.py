@@ -109,9 +109,10 @@ def object_weights(
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
     its two objects' multiplicities: the pigeonhole bootstrap (Owen, "The pigeonhole bootstrap", 2007) with one set of
     objects on both sides, as in the vertex bootstrap of a network (Snijders & Borgatti, 1999). It accounts for pairs
-    that share an object. It is conservative where the objects matter little, because the part of an error that is
-    specific to a pair is counted up to three times. Every category keeps its total weight. Pairs of a category with
-    fewer than three objects are resampled as if they were independent: two objects say nothing about their spread.
+    that share an object. It is conservative if the errors depend little on the objects, because the part of an error
+    that is specific to a pair is counted up to three times. Every category keeps its total weight. Pairs of a category
+    with fewer than three objects are resampled as if they were independent: the spread between objects cannot be
+    estimated from two.
 
     Args:
         objects: The two objects (reference, target) of each of the n pairs.
@@ -120,7 +121,7 @@ def object_weights(
         seed: Seed of the draws; equal pairs and seeds give equal weights.
 
     Returns:
-        Weights of the pairs, a row for each replicate; to be given to `bootstrap_ci`, `summarise` and `paired_test`.
+        Weights of the pairs, a row for each replicate; for `bootstrap_ci`, `summarise` and `paired_test`.
 
     Raises:
         InputError: For lists of different lengths, or no pairs.
@@ -150,7 +151,7 @@ def object_weights(
 
 
 def pair_weights(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
-    """Draw bootstrap weights of n pairs that are taken for independent: how often each is drawn, with replacement."""
+    """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
     return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
 
 
@@ -166,7 +167,7 @@ def bootstrap_ci(
         errors: (n,).
         statistic: Maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
             `lambda errors, weights: accuracy(errors, 30, weights)` do.
-        weights: From `object_weights`; None for `pair_weights(n)`, which takes pairs for independent.
+        weights: From `object_weights`; None for `pair_weights(n)`, which treats pairs as independent.
         level: Confidence level.
 
     Returns:
@@ -181,11 +182,11 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
 
     Args:
         errors: (n,) in degrees.
-        weights: From `object_weights`; None takes pairs for independent.
+        weights: From `object_weights`; None treats pairs as independent.
 
     Returns:
         {"n", "median" (degrees), "acc30", "acc15" (percent), for each of the three NAME_ci: [low, high], and
-        "above150": the percentage of errors above 150 degrees, mostly front taken for back}.
+        "above150": the percentage of errors above 150 degrees, mostly confusions of front and back}.
 
     Raises:
         InputError: If there are no errors.
@@ -231,7 +232,7 @@ def paired_difference(
         first: (n,) errors in degrees.
         second: (n,) errors of the same pairs in the same order.
         threshold: A pair is solved if its error is below it, in degrees.
-        weights: From `object_weights`; None takes pairs for independent.
+        weights: From `object_weights`; None treats pairs as independent.
 
     Returns:
         {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, and for
@@ -269,7 +270,7 @@ def paired_test(
 ) -> dict:
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
-    The sign test and the permutation test take pairs for independent. Where pairs share objects, their p values are too
+    The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
     small; the interval and the p value of `paired_difference` with `object_weights` are the ones to report.
 
     Args:
@@ -277,7 +278,7 @@ def paired_test(
         seed: Seed of the permutation test, which is exact for up to 13 pairs.
 
     Returns:
-        What `paired_difference` returns, and {"sign_test_p": McNemar's exact test over the pairs that only one of the
+        The entries of `paired_difference`, and {"sign_test_p": McNemar's exact test over the pairs that only one of the
         two solves, "permutation_test_p": of the mean difference, by 10,000 flips of the differences' signs}.
 
     Raises:
@@ -311,7 +312,7 @@ def sign_test(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def _mean(values: np.ndarray, weights: ArrayLike | None) -> np.ndarray | float:
-    """Weighted mean over the last axis."""
+    """Compute the weighted mean over the last axis."""
     if weights is None:
         return np.mean(values, axis=-1)
     weights = np.asarray(weights)
@@ -319,14 +320,14 @@ def _mean(values: np.ndarray, weights: ArrayLike | None) -> np.ndarray | float:
 
 
 def _interval(replicates: np.ndarray, level: float = 0.95) -> tuple[float, float]:
-    """Percentile interval of bootstrap replicates (resamples,)."""
+    """Compute the percentile interval of bootstrap replicates (resamples,)."""
     tail = 50 * (1 - level)
     low, high = np.percentile(replicates, [tail, 100 - tail])
     return float(low), float(high)
 
 
 def _multiplicities(n: int, resamples: int, rng: np.random.Generator) -> Int[np.ndarray, "resamples n"]:
-    """How often each of n items is drawn when n are drawn with replacement."""
+    """Count how often each of n items is drawn if n are drawn with replacement."""
     draws = rng.integers(n, size=(resamples, n)) + n * np.arange(resamples)[:, None]
     return np.bincount(draws.ravel(), minlength=resamples * n).reshape(resamples, n)
 

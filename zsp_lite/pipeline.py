@@ -131,7 +131,7 @@ class PoseEstimate:
 
 @runtime_checkable
 class Solver(Protocol):
-    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this signature will do.
+    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this signature is accepted.
 
     A solver that fits the pose in the first target view:
 
@@ -398,7 +398,7 @@ def view_alignment(reference: View, target: View) -> Sim3:
 
 
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
-    """Get the points of the foreground patches of measured depth; if they are too few, those of the whole crop."""
+    """Get the points of the foreground patches with measured depth; if they are too few, those of the whole crop."""
     points, known = view.patch_points
     for chosen in (view.known_foreground, known):
         if chosen.sum() >= _FEW:

@@ -14,7 +14,7 @@ from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureExtractor, FeatureMap
 
-IMAGE_SIZE = 224  # pixels of an object crop for a backbone that does not say its size
+IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
 _MASK_SHARE = 0.25
 
@@ -69,7 +69,7 @@ class View:
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
-        """Foreground patches of measured depth."""
+        """Foreground patches with measured depth."""
         return np.asarray(self.foreground.cpu()) & self.patch_points[1]
 
 
