@@ -1,4 +1,4 @@
-"""Small made-up sequences and cameras for the tests of what reads and writes them."""
+"""Small random sequences and cameras for the tests of reading and writing."""
 
 import gzip
 import json
@@ -16,7 +16,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
-    """A camera anywhere, with any aspect and unequal focal lengths."""
+    """A random camera with unequal focal lengths."""
     rng = np.random.default_rng(seed)
     size = size or tuple(int(side) for side in rng.integers(8, 2000, 2))
     rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()

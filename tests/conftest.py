@@ -1,4 +1,4 @@
-"""Every test runs with the library's annotations checked: shapes by jaxtyping, types by beartype."""
+"""Checks of the annotations in every test (shapes by jaxtyping, types by beartype), and a shared data set."""
 
 import contextlib
 import os
@@ -9,15 +9,15 @@ from beartype import BeartypeConf, beartype
 from hypothesis import settings
 from jaxtyping import config, install_import_hook
 
-os.environ.setdefault("MPLBACKEND", "Agg")  # figures are drawn, never shown
+os.environ.setdefault("MPLBACKEND", "Agg")  # without windows
 
-# An example's time says more about what else the machine does than about the library.
+# No time limit per example, because it depends on the load of the machine.
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# An int is fine where a float is asked for.
+# Accept an int for a float.
 typechecker = beartype(conf=BeartypeConf(is_pep484_tower=True))
-# Has to stand before the first import of zsp_lite; outside the tests nothing is checked.
+# Must precede the first import of zsp_lite. Outside the tests, nothing is checked.
 install_import_hook("zsp_lite", f"{__name__}.typechecker")
 
 from zsp_lite.errors import InputError  # noqa: E402
@@ -40,7 +40,7 @@ def _unchecked(expectation):
 def raises(expected, *args, **kwargs):
     """`pytest.raises`, but inside `raises(InputError)` annotations are not checked.
 
-    Bad input breaks the annotations by its nature; the subject there is the library's own refusal.
+    Bad input violates the annotations as well, but these tests are about the library's own error.
     """
     expectation = _raises(expected, *args, **kwargs)
     if expected is InputError and not args:
@@ -53,9 +53,9 @@ pytest.raises = raises
 
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
-    """A CO3D folder with one category, "ellipsoid": one object in two worlds, seven views of each, with labels.
+    """A labelled data set with the category "ellipsoid": two sequences of seven views of one object.
 
-    Sequence "b" stands in a world that is turned, moved and unlike that of "a", the reference of the labels.
+    The world of sequence "b" differs from that of "a", the reference of the labels, by a rigid transform.
     """
     import numpy as np
     from synthetic_views import look_at, render

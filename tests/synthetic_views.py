@@ -1,7 +1,7 @@
-"""Views of a bumpy ellipsoid, ray-cast in closed form, and a backbone that knows the object's coordinates.
+"""Views of an asymmetric implicit surface, and a backbone whose features are functions of the object coordinates.
 
-The colours of the pictures are the object's own coordinates, so features made of them are perfect and any
-error left is the pipeline's.
+The colours of the images encode the object coordinates. Features computed from them are exact, so that any error is
+caused by the pipeline.
 """
 
 from dataclasses import dataclass, replace
@@ -19,14 +19,14 @@ REACH = 1.6  # colours map [-REACH, REACH]
 
 
 def inside(points: np.ndarray) -> np.ndarray:
-    """Negative inside the object, (..., 3) -> (...); without any symmetry."""
+    """Implicit function of the object, (..., 3) -> (...), negative inside."""
     x, y, z = np.moveaxis(points, -1, 0)
     bumps = 0.08 * np.sin(4 * x + 1) + 0.08 * np.sin(5 * y - 2 * z) + 0.06 * np.cos(6 * z + x)
     return np.linalg.norm(points / AXES, axis=-1) - 1 - bumps
 
 
 def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 190.0) -> Camera:
-    """A camera at `distance` along `direction`, looking at the world's origin."""
+    """A camera at `distance` in `direction` from the origin, looking at the origin."""
     forward = -np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     right = np.cross(forward, (0.1, 0.2, 1.0))
     right /= np.linalg.norm(right)
@@ -35,25 +35,25 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
 
 
-# Two placements of the object, one from each end of a pair, and where the second one's cameras stand.
+# Object poses of the two sequences of a pair, and directions of cameras.
 AT_HOME = Sim3.identity()
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
 DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]
 
 
 def turned(camera: Camera, turn: np.ndarray) -> Camera:
-    """The same camera in a world that was turned about its origin."""
+    """The same camera in a world that is rotated about its origin."""
     return replace(camera, R=camera.R @ turn.T)
 
 
 def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
-    """The object seen from a camera; `placement` maps object to world coordinates."""
+    """Render the object; `placement` maps object to world coordinates."""
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
     to_object = placement.inverse()
     in_object = lambda depth: to_object.apply(camera.to_world(rays * depth[..., None]))  # noqa: E731
-    # From far to near, so that the crossing found last is the nearest one.
+    # From far to near, so that the last crossing found is the nearest one.
     far, behind = np.full((height, width), np.inf), np.zeros((height, width), dtype=bool)
     steps = np.linspace(7.0, 1.5, 56)
     for depth in steps:
@@ -74,7 +74,7 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
 
 @dataclass(frozen=True)
 class CoordinateBackbone:
-    """Fourier features of the object coordinates that `render` paints; black is background."""
+    """Fourier features of the object coordinates that are encoded in the colours; black is background."""
 
     grid: int = 28
     frequencies: int = 32

@@ -1,4 +1,4 @@
-"""The paper's baselines: networks load checkpoints of the published layouts, geometry is exact on exact input."""
+"""The paper's baselines: networks load the published checkpoints, geometry is exact for exact input."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ from zsp_lite.views import object_crop
 
 
 def torchvision_shapes() -> dict[str, tuple[int, ...]]:
-    """Keys and shapes of torchvision's ResNet-50 less its last layer, written down from its definition."""
+    """Keys and shapes of torchvision's ResNet-50 without its last layer, by its definition."""
     shapes: dict[str, tuple[int, ...]] = {"conv1.weight": (64, 3, 7, 7)}
     norms = {"bn1": 64}
     entering = 64
@@ -86,7 +86,7 @@ def test_resnet50_has_torchvisions_keys_and_its_layers_their_strides():
     assert [tuple(x.shape[1:]) for x in layers] == [(256, 16, 16), (512, 8, 8), (1024, 4, 4), (2048, 2, 2)]
 
 
-def test_a_block_is_what_it_is_by_hand():
+def test_a_block_is_two_convolutions_and_a_shortcut():
     with torch.random.fork_rng():
         torch.manual_seed(1)
         block = ResNet(TINY).layer1[0].eval()
@@ -111,7 +111,7 @@ def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_
             load_swav(path)
 
 
-def test_swav_that_cannot_be_fetched_says_what_to_do(tmp_path, monkeypatch):
+def test_a_failed_download_of_swav_names_the_alternative(tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
     monkeypatch.setattr(swav, "URL", "http://127.0.0.1:9/swav_800ep_pretrain.pth.tar")
     with pytest.raises(InputError, match="swav-tiny"):
@@ -144,16 +144,16 @@ def test_angles_and_rotations_are_each_others_inverse(found):
 
 @pytest.mark.parametrize("pole", [0.0, 180.0])
 @pytest.mark.parametrize("azimuth", [0.0, 77.0, 300.0])
-def test_straight_from_above_or_below_angles_still_give_the_rotation(pole, azimuth):
+def test_angles_from_above_and_below_give_the_rotation_back(pole, azimuth):
     rotation = euler_to_rotation(np.array([azimuth, pole, 40.0]))
     assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
 
 
-def test_a_viewpoint_is_pascals_in_front_of_the_object_and_beside_it():
-    """Azimuth, elevation and in-plane rotation 0: the camera at -y looks along +y, z upwards; labels count from -90."""
+def test_viewpoints_follow_the_convention_of_pascal3d():
+    """At azimuth, elevation and in-plane rotation 0, the camera is at -y and looks along +y with +z up."""
     front = euler_to_rotation(np.array([0.0, 90.0, 180.0]))
     assert front == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), abs=1e-12)
-    # 90 degrees of elevation: from above, what was away from the camera is up in the picture.
+    # From above (elevation 90 degrees), +y of the object is up in the image.
     above = euler_to_rotation(np.array([0.0, 180.0, 180.0]))
     assert above @ (0, 1, 0) == pytest.approx((0, -1, 0), abs=1e-12)
     assert above @ (0, 0, 1) == pytest.approx((0, 0, -1), abs=1e-12)
@@ -199,7 +199,7 @@ def test_predicted_angles_are_bin_and_offset():
     assert predict_angles(logits, offsets).tolist() == [[52.5, 187.5, 0.0]]
 
 
-def test_padding_gives_a_crop_its_own_aspect_again():
+def test_a_square_crop_has_the_aspect_ratio_of_the_photograph():
     frame = render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity())
     frame = replace(frame, mask=None)
     square = square_crop(object_crop(frame), 80)
@@ -217,13 +217,13 @@ def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
         icp(source, np.zeros((20, 3)))
 
 
-def test_icp_starts_where_the_first_cameras_stand(monkeypatch):
-    """The same object seen from about the same side in two worlds."""
+def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
+    """Two sequences of the same object, whose first cameras differ by a few degrees."""
     clouds = []
     monkeypatch.setattr(icp_module, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
     sides = np.array([(1.0, 0.1, 0.3), (0.95, 0.2, 0.35), (-0.2, 1.0, 0.3)])
     cameras = [look_at(side) for side in sides]
-    # As in CO3D, a world is turned so that its first camera looks the same way as that of any other.
+    # As in CO3D, the first camera has the same rotation in the world of every sequence.
     turn = cameras[0].R.T @ cameras[1].R
     placements = Sim3.identity(), Sim3(1.0, turn, np.zeros(3))
     first = render(cameras.pop(0), placements[0])
@@ -238,7 +238,7 @@ def test_icp_starts_where_the_first_cameras_stand(monkeypatch):
     truth = true_pose(first.camera, placements[0], cameras[0], placements[1])
     off = rotation_error(found.R, truth.R)
     assert np.median(distance) < 0.15 and 2 < off < 10
-    # Placed by the truth instead of by the cameras, they would lie on each other.
+    # With the true pose, both clouds coincide.
     placed = firsts[1].to_world(truth.apply(firsts[0].to_camera(source)))
     assert np.median(cKDTree(target).query(placed)[0]) < 0.05
     align(first, targets, 0, firsts, seed=0)
@@ -247,7 +247,7 @@ def test_icp_starts_where_the_first_cameras_stand(monkeypatch):
         align(replace(first, depth=None), targets, 0, firsts, seed=0)
 
 
-def test_sift_finds_a_turned_picture_in_itself():
+def test_sift_matches_an_image_with_its_rotated_copy():
     rng = np.random.default_rng(0)
     texture = cv2.resize(rng.integers(0, 255, (24, 24, 3)).astype(np.uint8), (224, 224), interpolation=cv2.INTER_CUBIC)
     camera = look_at((1, 0, 0), size=(224, 224))
@@ -269,7 +269,7 @@ def test_sift_finds_a_turned_picture_in_itself():
     assert len(Sift().describe([blank])[0].pixels) == 0
 
 
-def test_keypoints_are_lifted_onto_the_surface():
+def test_keypoints_are_unprojected_onto_the_surface():
     frame = render(look_at((1, 0.2, 0.4)), Sim3.identity())
     pixels = np.argwhere(frame.mask > 0)[::50, ::-1] + 0.5
     points = unproject_pixels(frame, pixels)
@@ -281,12 +281,12 @@ def test_keypoints_are_lifted_onto_the_surface():
 
 def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():
     rng = np.random.default_rng(0)
-    grid = (224, 224)  # a patch per pixel: nearly exact matches
+    grid = (224, 224)  # one patch per pixel, for nearly exact matches
     first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal_length=np.array([300.0, 260.0]))
     second = replace(look_at((0.9, 0.45, 0.3), size=(224, 224)), focal_length=np.array([350.0, 330.0]))
     points = rng.normal(size=(60, 3)) * 0.5
     pixels = [np.floor(camera.project(points)[0]).astype(int)[:, ::-1] for camera in (first, second)]
-    pixels[1][:15] = rng.integers(40, 180, (15, 2))  # a quarter of the matches is wrong
+    pixels[1][:15] = rng.integers(40, 180, (15, 2))  # a quarter of the matches are wrong
     image = np.zeros((224, 224, 3), np.uint8)
     frames = [Frame(image, None, None, camera) for camera in (first, second)]
     matches = Matches(pixels[0], pixels[1], np.ones(60), np.zeros(60))

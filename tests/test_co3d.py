@@ -39,7 +39,7 @@ def change_first_frame(root, **changes):
 
 
 def first(root):
-    """The entry that `change_first_frame` changes."""
+    """The annotation that `change_first_frame` changes."""
     return Co3D(root).frame("chair", "b_2", 0)
 
 
@@ -340,5 +340,5 @@ def test_opening_a_category_costs_little_more_than_its_json():
     figures = annotation_benchmark(frames=8600)
     assert figures["frames"] == 8600
     assert 1.0 < figures["json_mb"] / 8600 * 1000 < 1.3  # real entries have about 1.2 kB
-    # A tenth of the bounds for 86,000 frames (3 s, 400 MB), with room for a busy machine.
+    # A tenth of the limits for 86,000 frames (3 s, 400 MB), with a margin for a busy machine.
     assert figures["seconds"] < 1 and figures["extra_memory_mb"] < 60

@@ -1,4 +1,4 @@
-"""The check of a data folder: counts what is there, names what is not."""
+"""The check of a data folder counts its content and names the problems."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Upstream's labels brought in, checked before anything is written; labels carried to another reconstruction."""
+"""Import of published labels and pairs, and transfer of labels between data sets."""
 
 import functools
 import hashlib
@@ -34,7 +34,7 @@ def root(tmp_path):
 
 @pytest.fixture
 def clone(tmp_path, root):
-    """As upstream's repository lies on disk."""
+    """A folder with the layout of the published repository."""
     folder = tmp_path / "clone"
     for name in "ab":
         write_label(folder / "data", "chair", PoseLabel(np.eye(4), name, "a"))
@@ -76,7 +76,7 @@ def test_labels_and_pairs_come_from_a_clone(clone, root):
 
 def test_an_import_replaces_other_labels_only_on_request(clone, root):
     import_labels(clone, root)
-    import_labels(clone, root)  # the same again loses nothing
+    import_labels(clone, root)  # a repeated import changes nothing
     mine = np.eye(4)
     mine[:3, 3] = 0.1
     write_label(root, "chair", PoseLabel(mine, "b", "a"))
@@ -142,7 +142,7 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root, file, content, messa
 
 
 def locked(data):
-    """A zip file whose entries claim to need a password."""
+    """A zip file whose entries are flagged as encrypted."""
     for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         start = data.find(mark) + flags
         data = data[:start] + bytes([data[start] | 1]) + data[start + 1 :]
@@ -235,7 +235,7 @@ def moved(sequence, world: Sim3, noise: float = 0.0):
 
 
 def two_layouts(tmp_path, noise=0.0):
-    """A v1 folder with labels, and v2 with each sequence in a world of its own; the worlds."""
+    """Write a v1 folder with labels, and a v2 folder with other worlds; returns these worlds and a label."""
     sequences = {name: sequence_data(name, frames=6) for name in "ab"}
     worlds = {
         name: Sim3(0.5 + seed, Rotation.random(random_state=seed).as_matrix(), np.full(3, float(seed)))
@@ -259,7 +259,7 @@ def test_labels_are_transferred_between_worlds(tmp_path):
     np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
     assert rotation_error(labels["b"].trans[:3, :3], expected) < 1e-4
-    # The reference cloud's centre comes to lie where it lay on the other object.
+    # Both labels map the centre of the reference cloud to the same point of the other object.
     centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
     landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
     np.testing.assert_allclose(

@@ -68,7 +68,7 @@ def test_unprojected_depth_projects_onto_its_own_pixels():
 
 
 def patch_depths_one_by_one(depth, grid):
-    """What `patch_points` should find, patch by patch."""
+    """`patch_points` as a loop over patches."""
     height, width = depth.shape[0] // grid[0], depth.shape[1] // grid[1]
     for row in range(grid[0]):
         for col in range(grid[1]):

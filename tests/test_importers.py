@@ -1,4 +1,4 @@
-"""Captures in other formats, written here from rendered views: what comes in projects and measures as it did."""
+"""Captures written in every format from rendered views are read with the true cameras and depth, and imported."""
 
 import json
 from dataclasses import replace
@@ -6,8 +6,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
@@ -17,12 +19,12 @@ from zsp_lite.importers.masks import grab_cut, masks_from_box
 from zsp_lite.synthetic.export import make_object, sequence_name
 from zsp_lite.synthetic.sequences import render_sequence
 
-METRES = 0.13  # of a unit of the rendered world: the object is about 30 cm wide
+METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 
 @pytest.fixture(scope="module")
 def views():
-    """Eight views once around a teapot, in metres."""
+    """Eight views around a teapot, in metres."""
     shape = make_object("teapot", sequence_name(4, "teapot", 0), 4)
     rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
     frames = []
@@ -53,7 +55,7 @@ def write_tum(folder, frames):
         lines["rgb.txt"].append(f"{time:.6f} rgb/{time:.6f}.jpg")
         lines["depth.txt"].append(f"{time + 0.01:.6f} depth/{time + 0.01:.6f}.png")
         lines["groundtruth.txt"].append(f"{time - 0.008:.4f} " + " ".join(f"{value:.6f}" for value in values))
-    # A picture whose depth was dropped is left out.
+    # An image without depth is left out.
     lines["rgb.txt"].append("1305031199.0 rgb/none.jpg")
     for name, rows in lines.items():
         (folder / name).write_text("\n".join(rows) + "\n")
@@ -68,7 +70,7 @@ def write_nerfstudio(folder, frames):
         write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
         write_depth16(folder / f"depths/{frame.name}.png", frame.depth, 0.001)
         write_mask(folder / f"masks/{frame.name}.png", frame.mask)
-        pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL's camera: up is +y, it looks along -z
+        pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL: +y up, looking along -z
         listed.append({"file_path": f"images/{frame.name}.jpg", "depth_file_path": f"depths/{frame.name}.png",
                        "mask_path": f"masks/{frame.name}.png", "transform_matrix": pose.tolist()})  # fmt: skip
     content = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": w, "h": h, "frames": listed}
@@ -117,6 +119,12 @@ def capture(request, tmp_path, views):
     return READERS[request.param](folder, **options)
 
 
+@pytest.fixture
+def scan(tmp_path, views):
+    write_nerfstudio(tmp_path / "scan", views)
+    return READERS["nerfstudio"](tmp_path / "scan")
+
+
 def test_every_format_gives_the_true_cameras(capture, views):
     assert len(capture) == len(views)
     points = np.random.default_rng(0).normal(size=(50, 3)) * 0.1 + views[0].camera.to_world(np.array([0, 0, 1.0]))
@@ -132,17 +140,14 @@ def test_every_format_gives_the_true_depth_in_metres(capture, views):
         known = view.depth > 0
         np.testing.assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 6
-        # The pixel's point, seen again by the true camera, is that pixel.
+        # A pixel, unprojected and projected by the true camera, is the same pixel.
         y, x = np.argwhere(view.mask > 0)[::97].T
         world = captured.camera.unproject(np.stack([x, y], -1) + 0.5, frame.depth[y, x])
         np.testing.assert_allclose(view.camera.project(world)[0], np.stack([x, y], -1) + 0.5, atol=5e-3)
 
 
-def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, views):
-    folder = tmp_path / "scan"
-    folder.mkdir()
-    write_nerfstudio(folder, views)
-    done = import_capture(READERS["nerfstudio"](folder), tmp_path / "data", "teapot", "mine", max_frames=6)
+def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
+    done = import_capture(scan, tmp_path / "data", "teapot", "mine", max_frames=6)
     dataset = Co3D(tmp_path / "data")
     points, _ = dataset.point_cloud("teapot", "mine")
     assert done.frames == 6 and done.points == len(points) > 500
@@ -152,27 +157,21 @@ def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, views):
         frame = dataset.load(annotation)
         inside = (frame.mask > 0.9) & (frame.depth > 0)
         np.testing.assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
-        # The cloud lies in the object's mask in every view, and on its depth.
+        # The cloud projects into the mask of every view.
         pixels, depth = frame.camera.project(points)
         column, row = np.floor(pixels).astype(int).clip(0, np.array(frame.camera.size[::-1]) - 1).T
         assert (cv2.dilate(frame.mask, np.ones((5, 5)))[row, column] > 0.5).mean() > 0.97
         np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
 
 
-def test_an_imported_capture_is_complete_in_the_check(tmp_path, views):
-    from zsp_lite.data.check import check_folder
-
-    folder = tmp_path / "scan"
-    folder.mkdir()
-    write_nerfstudio(folder, views)
-    import_capture(READERS["nerfstudio"](folder), tmp_path / "data", "teapot", "mine")
+def test_an_imported_capture_is_complete_in_the_check(tmp_path, scan):
+    import_capture(scan, tmp_path / "data", "teapot", "mine")
     (check,) = check_folder(tmp_path / "data", deep=True)
     assert not check.problems and check.complete == 1
 
 
 def test_distortion_is_corrected(tmp_path, views):
     folder = tmp_path / "scan"
-    folder.mkdir()
     write_nerfstudio(folder, views[:1])
     content = json.loads((folder / "transforms.json").read_text()) | {
         "k1": 0.12,
@@ -182,7 +181,7 @@ def test_distortion_is_corrected(tmp_path, views):
         "k3": 0.02,
     }
     (folder / "transforms.json").write_text(json.dumps(content))
-    # A picture as the distorting lens would take it: a grid of dots, each where OpenCV projects its ray.
+    # A distorted image of a grid of dots, projected by OpenCV.
     view, camera = views[0], views[0].camera
     height, width = camera.size
     wanted = (
@@ -229,7 +228,6 @@ def test_pictures_of_unpadded_numbers_keep_their_poses(tmp_path, views):
 
 def test_masks_come_from_files_by_name(tmp_path, views):
     folder = tmp_path / "scan"
-    folder.mkdir()
     write_open3d(folder, views)
     capture = READERS["open3d"](folder)
     with pytest.raises(InputError, match="no masks of its own"):
@@ -238,7 +236,7 @@ def test_masks_come_from_files_by_name(tmp_path, views):
         write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
     with pytest.raises(InputError, match="has no mask 0000.png for the image 0000.jpg"):
         import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
-    assert not (tmp_path / "data").exists(), "nothing is half-written"
+    assert not (tmp_path / "data").exists(), "nothing is written"
     write_mask(tmp_path / "masks/0000.png", views[0].mask)
     import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
     assert Co3D(tmp_path / "data").categories() == ["teapot"]
@@ -249,8 +247,6 @@ def test_the_fused_cloud_lies_on_the_surface(views):
     seen = np.concatenate([
         view.camera.unproject(np.argwhere(view.mask > 0)[:, ::-1] + 0.5, view.depth[view.mask > 0]) for view in views
     ])  # fmt: skip
-    from scipy.spatial import cKDTree
-
     spread = seen.std(axis=0).mean()
     assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
     assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
@@ -365,7 +361,6 @@ def test_bad_boxes_and_empty_depth_are_refused(views):
 
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
     folder = tmp_path / "scan"
-    folder.mkdir()
     write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
     capture = READERS["nerfstudio"](folder)
     done = import_capture(capture, tmp_path / "data", "teapot", "mine")
@@ -375,11 +370,8 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
         import_capture(capture, tmp_path / "data", "teapot", "mine")
 
 
-def test_an_interrupted_import_can_be_repeated(tmp_path, views, monkeypatch):
-    folder = tmp_path / "scan"
-    folder.mkdir()
-    write_nerfstudio(folder, views)
-    capture, data = READERS["nerfstudio"](folder), tmp_path / "data"
+def test_an_interrupted_import_can_be_repeated(tmp_path, scan, views, monkeypatch):
+    data = tmp_path / "data"
 
     def full(*_):
         raise OSError("no space left on device")
@@ -387,8 +379,8 @@ def test_an_interrupted_import_can_be_repeated(tmp_path, views, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("zsp_lite.data.co3d.write_ply", full)
         with pytest.raises(OSError, match="no space"):
-            import_capture(capture, data, "teapot", "mine")
+            import_capture(scan, data, "teapot", "mine")
     assert not (data / "teapot" / "sequence_annotations.jgz").exists()
-    import_capture(capture, data, "teapot", "mine")
+    import_capture(scan, data, "teapot", "mine")
     assert len(Co3D(data).frames("teapot", "mine")) == len(views)
     assert not [path for path in (data / "teapot" / "mine").iterdir() if path.name.startswith(".")]

@@ -1,4 +1,4 @@
-"""Labels from picks: what is known comes back, nothing is lost, and bad picks are refused in one line."""
+"""Labelling by keypoints: labels agree with known ones, sessions survive a restart, bad picks are refused."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.export import POSES_FILE, export_categories
 
-# Where a person would click on a chair: corners of the seat, ends of the back and of legs, in canonical coordinates.
+# Keypoints of a chair in canonical coordinates: corners of the seat, ends of the back and of legs.
 KEYPOINTS = np.array(
     [(0.4, 0, 0.4), (-0.4, 0, 0.4), (0.4, 0, -0.4), (-0.4, 0.8, -0.4), (0.4, 0.8, -0.4), (0.4, -0.7, 0.4)]
 )
@@ -28,7 +28,7 @@ KEYPOINTS = np.array(
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):
-    """Three chairs, and their keypoints in each one's world."""
+    """Three chairs, and their keypoints in the world of each sequence."""
     root = tmp_path_factory.mktemp("synthetic")
     export_categories(["chair"], root, 3, 3, 11, image_size=64)
     poses = json.loads((root / "chair" / POSES_FILE).read_text())
@@ -205,7 +205,7 @@ def test_a_guess_puts_the_picks_on_the_cloud(root):
     pick_all(labelling, "best", cloud[:5] + 1e-4)
     labelling.guess("a", Sim3.identity())
     np.testing.assert_array_equal(labelling.picks("a"), cloud[:5])
-    labelling.guess("a", Sim3(1e-3, np.eye(3), np.full(3, 50.0)))  # far off: all near one point of the cloud
+    labelling.guess("a", Sim3(1e-3, np.eye(3), np.full(3, 50.0)))  # all keypoints near one point of the cloud
     assert len(np.unique(labelling.picks("a"), axis=0)) == 5
 
 
@@ -251,7 +251,7 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
 
     def pick(cloud, title):
         picked.append(title.split(":")[0])
-        # As the first camera saw it, in a window that looks along -z with y up.
+        # In the axes of the first camera, for a window that looks along -z with +y up.
         turn = np.diag([1, -1, -1]) @ labelling.dataset.camera(labelling.dataset.frames("chair", picked[-1])[0]).R
         np.testing.assert_allclose(cloud[0], target[picked[-1]] @ turn.T)
         return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
@@ -259,7 +259,7 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
     answers = iter(["Seat", "", "back", "arm", "a", "what", "R", "", "a", "q"])
     label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x))
     assert labelling.names == ("Seat", "keypoint 2", "back", "arm")
-    np.testing.assert_array_equal(labelling.picks("a"), target["a"][:4])  # in the world, whatever the window showed
+    np.testing.assert_array_equal(labelling.picks("a"), target["a"][:4])  # in world coordinates
     for reference, sequence, title in shown:
         turn = np.diag([1, -1, -1]) @ labelling.first_view(title.split(":")[0])
         np.testing.assert_allclose(sequence, target[title.split(":")[0]] @ turn.T)
@@ -278,7 +278,7 @@ def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
 def test_the_desktop_reports_bad_picks_and_asks_again(root):
     labelling, said = Labelling(root, "chair"), []
     pick_all(labelling, "best", corners())
-    labelling.put("a", np.outer(np.arange(5), (1, 2, 3)))  # on a line, from an earlier run
+    labelling.put("a", np.outer(np.arange(5), (1, 2, 3)))  # collinear, from an earlier session
     picks = iter([[0, 1, 2, 3, 3], [0, 1, 2, 3, 4]])
 
     def guess(sequence):
@@ -318,7 +318,7 @@ def test_a_window_without_a_display_is_an_input_error(root, monkeypatch):
 
 
 def test_the_method_proposes_an_alignment_with_a_confidence(tmp_path):
-    """With features that know the surface the guess is the truth; a real backbone's is as good as the method."""
+    """With features that are functions of the object coordinates, the proposal is correct."""
     from synthetic_views import CoordinateBackbone, look_at, render
 
     turned = Sim3(1.2, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.array([0.1, 0, 0.05]))

@@ -1,4 +1,4 @@
-"""The desktop's windows as they are: Open3D on a virtual screen, with xdotool for mouse and keyboard."""
+"""Open3D's windows on a virtual screen, with mouse and keyboard by xdotool."""
 
 import json
 import os
@@ -31,7 +31,7 @@ print(json.dumps(wall[picked].tolist()))
 
 @pytest.fixture
 def screen(tmp_path):
-    """The environment of a program on a screen of its own."""
+    """Environment variables of a program on a virtual screen."""
     listen, tell = os.pipe()
     command = ["Xvfb", "-displayfd", str(tell), "-screen", "0", "1400x1000x24", "-noreset"]
     with open(tmp_path / "screen.log", "w") as log, os.fdopen(listen) as number:
@@ -43,10 +43,10 @@ def screen(tmp_path):
     server.wait(timeout=60)
 
 
-def test_clicks_in_the_window_pick_points_and_can_be_taken_back(screen):
+def test_clicks_in_the_window_pick_points_and_remove_picks(screen):
     def act(*words):
         subprocess.run(["xdotool", *map(str, words)], env=screen, timeout=180, check=True, stdout=subprocess.DEVNULL)
-        time.sleep(0.5)  # what follows too closely is lost
+        time.sleep(0.5)  # events in quick succession are lost
 
     def shift_click(button):
         act("keydown", "shift")
@@ -56,7 +56,7 @@ def test_clicks_in_the_window_pick_points_and_can_be_taken_back(screen):
     program = subprocess.Popen([sys.executable, "-c", WINDOWS], env=screen, stdout=subprocess.PIPE, text=True)
     try:
         act("search", "--sync", "--onlyvisible", "--name", "keypoints of a wall")
-        time.sleep(2)  # until it has drawn
+        time.sleep(2)  # until the window is drawn
         for x, y in ((560, 400), (800, 400), (800, 600), (700, 500)):
             act("mousemove", x, y)
             shift_click(1)
@@ -68,6 +68,6 @@ def test_clicks_in_the_window_pick_points_and_can_be_taken_back(screen):
         said, _ = program.communicate(timeout=120)
     finally:
         program.kill()
-    left, right, below = json.loads(said.splitlines()[-1])  # the fourth was taken back
+    left, right, below = json.loads(said.splitlines()[-1])  # the fourth pick was removed
     assert left[0] < right[0] - 0.2 and abs(left[1] - right[1]) < 0.1
     assert below[1] < right[1] - 0.2 and abs(below[0] - right[0]) < 0.1

@@ -1,4 +1,4 @@
-"""Dense RootSIFT goes through the pipeline like any backbone."""
+"""Dense RootSIFT agrees with OpenCV's SIFT, and is used like a backbone."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ def picture() -> np.ndarray:
     return cv2.resize(noise, (224, 224), interpolation=cv2.INTER_CUBIC)
 
 
-def test_one_descriptor_of_unit_length_per_patch_all_salient(picture):
+def test_every_patch_is_salient_and_has_a_descriptor_of_unit_length(picture):
     features = RootSift()([picture, np.full((100, 150, 3), 0.5)])
     assert [f.keys.shape for f in features] == [(28, 28, 128)] * 2
     assert bool((features[0].saliency == 1).all()) and features[0].global_feature.shape == (128,)
@@ -24,8 +24,8 @@ def test_one_descriptor_of_unit_length_per_patch_all_salient(picture):
     assert bool(features[1].keys.isfinite().all())
 
 
-def test_the_patch_of_a_key_is_where_the_grid_says(picture):
-    # One keypoint at the centre of the patch in row 9, column 17, described on its own.
+def test_a_key_describes_the_patch_at_its_grid_position(picture):
+    # OpenCV's descriptor of one keypoint at the centre of the patch in row 9, column 17.
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     _, histogram = cv2.SIFT_create().compute(grey, [cv2.KeyPoint(17 * 8 + 3.5, 9 * 8 + 3.5, 24.0, 0.0)])
     root = np.sqrt(histogram[0] / histogram[0].sum())
@@ -34,7 +34,7 @@ def test_the_patch_of_a_key_is_where_the_grid_says(picture):
 
 def test_a_shifted_picture_matches_at_the_shift(picture):
     shifted = np.roll(picture, (16, 24), axis=(0, 1))  # two patches down, three to the right
-    ref, target = RootSift(keypoint_size=4.0)([picture, shifted])  # small, to stay clear of the seams
+    ref, target = RootSift(keypoint_size=4.0)([picture, shifted])  # small, because the shift is cyclic
     inner = torch.zeros(28, 28, dtype=torch.bool)
     inner[6:20, 6:20] = True
     matches = match(ref, target, k=30, ref_foreground=inner)
@@ -47,7 +47,7 @@ def test_bad_images_are_refused():
         RootSift()([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.uint8)])
 
 
-def test_all_descriptors_at_once_are_those_that_opencv_makes_one_by_one():
+def test_the_descriptors_are_those_of_opencv():
     rng = np.random.default_rng(0)
     grey = cv2.resize(rng.integers(0, 256, (28, 28)).astype(np.uint8), (224, 224), interpolation=cv2.INTER_CUBIC)
     for size, centres in ((24.0, np.arange(3.5, 224, 32)), (7.0, np.array([0.5, 100.3, 223.0]))):

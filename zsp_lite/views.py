@@ -73,8 +73,8 @@ class View:
         return np.asarray(self.foreground.cpu()) & self.patch_points[1]
 
 
-def crop_size(backbone: FeatureExtractor) -> int:
-    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224."""
+def crop_size(backbone: FeatureExtractor | None) -> int:
+    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one."""
     return getattr(backbone, "image_size", IMAGE_SIZE)
 
 

@@ -66,8 +66,8 @@ def framed_camera(vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarr
     low, high = plane.min(0), plane.max(0)
     width = (high - low).max() * margin
     centre = (low + high) / 2 + (0 if shift is None else np.asarray(shift) * width)
-    focal = size / width
-    return Camera(R, t, np.array([focal, focal]), size / 2 - centre * focal, (size, size))
+    focal_length = size / width
+    return Camera(R, t, np.full(2, focal_length), size / 2 - centre * focal_length, (size, size))
 
 
 class Scene:

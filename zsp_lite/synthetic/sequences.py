@@ -86,8 +86,8 @@ def handheld_sweep(
     room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
     allowed = (room / np.maximum(-low, high).max(0)).min()
-    focal = np.full(2, round(min(wanted, allowed), 6))
-    return [Camera(R, t, focal, principal_point, size) for R, t in poses]
+    focal_length = np.full(2, round(min(wanted, allowed), 6))
+    return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
 
 def render_sequence(shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int) -> RenderedSequence:

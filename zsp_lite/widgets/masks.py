@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.patches import Rectangle
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
@@ -26,8 +27,6 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
     height, width = frame.camera.size
     top, left, box_height, box_width = box
     figure, (axis,) = show_images([frame.rgb], ["box and mask"], size=4.2)
-    from matplotlib.patches import Rectangle
-
     shade = axis.imshow(np.zeros((height, width, 4)), extent=(0, width, height, 0), interpolation="nearest")
     outline = axis.add_patch(Rectangle((0, 0), 1, 1, fill=False, edgecolor=ORANGE, linewidth=2, linestyle="--"))
 
@@ -38,9 +37,9 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
             if bottom - top < 4 or right - left < 4:
                 raise InputError("the box is empty, expected top above bottom and left before right")
             mask = grab_cut(frame.rgb, (top, left, bottom - top, right - left)) > 0.5
-        except InputError as problem:
+        except InputError as error:
             shade.set_data(dark)
-            return str(problem)
+            return str(error)
         dark[~mask] = (0, 0, 0, 0.65)
         shade.set_data(dark)
         text = f"mask of {mask.sum():,} pixels"

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Real
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from sklearn.neighbors import NearestNeighbors
 
@@ -139,5 +140,4 @@ def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
 
 
 def _rotate_z(points: np.ndarray, degrees: float) -> np.ndarray:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    return Rotation.from_euler("z", degrees, degrees=True).apply(points)
