@@ -81,7 +81,7 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: st
     if num_heads is None:
         if dim % 64:
             raise InputError(
-                f"{name}: the number of heads is unknown, {dim} channels are no multiple of 64; pass num_heads"
+                f"{name}: the number of heads is unknown, {dim} channels are not a multiple of 64; pass num_heads"
             )
         num_heads = dim // 64
     with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them

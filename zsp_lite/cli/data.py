@@ -207,11 +207,11 @@ def transfer(source: Path, target: Path, category: str, max_residual: float, rep
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
 @click.option(
     "--box", type=four_integers, metavar="T,L,H,W",
-    help="Bounding box of the object in the first picture in pixels: top, left, height, width. GrabCut segments the "
-    "object in all pictures.",
+    help="Bounding box of the object in the first image in pixels: top, left, height, width. GrabCut segments the "
+    "object in all images.",
 )  # fmt: skip
 @click.option(
-    "--masks", type=PATH, metavar="DIR", help="Folder of mask files named like the pictures, instead of --box."
+    "--masks", type=PATH, metavar="DIR", help="Folder of mask files named like the images, instead of --box."
 )
 @click.option("--frames", type=COUNT, metavar="N", default=100, help="Maximum number of frames, evenly spaced.")
 @click.option(
