@@ -13,7 +13,8 @@ from zsp_lite.backbones import precision
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.precision import bfloat16_is_fast, choose_precision, supported_precision
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.training.train import Trainee, TrainingConfig
+from zsp_lite.training.recipe import TrainingConfig
+from zsp_lite.training.trainee import Trainee
 
 
 @pytest.fixture()
@@ -59,7 +60,7 @@ def test_a_request_for_bfloat16_falls_back_to_float32_with_a_warning_where_it_is
 @pytest.mark.parametrize("fast", [True, False])
 def test_training_runs_at_the_precision_that_is_fast(fast, monkeypatch):
     monkeypatch.setattr(precision, "bfloat16_is_fast", lambda device_type: fast)
-    model = Trainee(TrainingConfig(embed_dim=24, depth=2, num_heads=2, key_block=0))
+    model = Trainee(TrainingConfig(embed_dim=24, depth=2, num_heads=2, layer=0))
     assert model(torch.zeros(1, 3, 32, 32)).keys.dtype == (torch.bfloat16 if fast else torch.float32)
 
 

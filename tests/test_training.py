@@ -1,7 +1,6 @@
-"""The trainer: renders of one build at a time, four objectives, exact export, resumption."""
+"""Training of the backbone: renders, objectives, export and resumption."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,25 +21,26 @@ from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_variant
 from zsp_lite.synthetic.render import orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
-from zsp_lite.training.batches import MEAN, STD, _crop_grids, sample_batch
+from zsp_lite.training import ablations, distillation, recipe
+from zsp_lite.training.batches import MEAN, STD, crop_grids, sample_batch
+from zsp_lite.training.export import export_checkpoint, starting_weights
+from zsp_lite.training.loop import read_checkpoint
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
+from zsp_lite.training.recipe import CONTINUATION, Stage, TrainingConfig
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet, load_render_set, render_object, render_set
-from zsp_lite.training.train import (
-    CONTINUATION,
-    Stage,
-    Trainee,
-    TrainingConfig,
-    export_checkpoint,
-    fit_read_outs,
-    initialise,
-    starting_weights,
-    train,
-)
+from zsp_lite.training.train import train
+from zsp_lite.training.trainee import Trainee, fit_heads, initialise
 
 TINY = TrainingConfig(
-    objects=4, embed_dim=24, depth=2, num_heads=2, key_block=0,
+    objects=4, embed_dim=24, depth=2, num_heads=2, layer=0,
     stages=(Stage(2, 32, 2, 2, (0.5, 1.0), helpers=1.0), Stage(2, 32, 1, 8, (0.5, 1.0), view=1.0)),
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def float32(monkeypatch):
+    """The results must not depend on whether the processor is fast in bfloat16."""
+    monkeypatch.setattr("zsp_lite.backbones.precision.bfloat16_is_fast", lambda device_type: False)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,16 @@ def renders(folder) -> RenderSet:
     return load_render_set(render_set(folder, 4, shard=1))
 
 
+@pytest.fixture(scope="module")
+def first_run(folder, renders, tmp_path_factory):
+    """Folder of a finished run in float32."""
+    run = tmp_path_factory.mktemp("runs") / "first"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("zsp_lite.backbones.precision.bfloat16_is_fast", lambda device_type: False)
+        train(TINY, run, folder)
+    return run
+
+
 def fourier(surface, seed=0):
     """Descriptors that know the surface point exactly; background patches get noise."""
     generator = torch.Generator().manual_seed(seed)
@@ -63,11 +73,10 @@ def fourier(surface, seed=0):
     return torch.where(surface[..., :1].isnan(), noise, known)
 
 
-def test_an_object_is_rendered_the_same_twice_and_differs_from_the_next():
-    first, again, other = render_object(3), render_object(3), render_object(4)
-    for a, b in zip(first, again, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(first[0], other[0])
+def test_an_object_is_rendered_the_same_in_every_process_and_differs_from_the_next(renders):
+    for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
+        np.testing.assert_array_equal(array, rows[1])
+    assert not np.array_equal(renders.rgb[1], renders.rgb[2])
 
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
@@ -121,7 +130,7 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 
 def test_normals_turn_and_flip_with_the_crop(renders):
-    grid, turn = _crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
+    grid, turn = crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
     batch = sample_batch(renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
@@ -283,10 +292,10 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
             raise Killed
 
     options = dict(checkpoint_every=2, log_every=1)
-    whole = train(TINY, tmp_path / "whole", folder, log=lambda line: None, **options)
+    whole = train(TINY, tmp_path / "whole", folder, **options)
     with pytest.raises(Killed):
         train(TINY, tmp_path / "killed", folder, log=kill_at_three, **options)
-    resumed = train(TINY, tmp_path / "killed", folder, log=lambda line: None, **options)
+    resumed = train(TINY, tmp_path / "killed", folder, **options)
     expected, got = load_file(whole), load_file(resumed)
     assert all(torch.equal(expected[name], got[name]) for name in expected | got)
     logs = []
@@ -298,45 +307,23 @@ def test_a_killed_run_resumes_to_the_same_weights(folder, renders, tmp_path):
     assert "held_out_accuracy" in rows[-1] and np.isfinite(rows[-1]["loss"])
 
 
-def test_a_run_can_start_from_the_average_of_another(folder, renders, tmp_path):
-    quiet = dict(log=lambda line: None)
-    train(TINY, tmp_path / "first", folder, **quiet)
+def test_a_run_can_start_from_the_average_of_another(folder, first_run, tmp_path):
+    checkpoint = Path(shutil.copy(first_run / "checkpoint.pt", tmp_path))
     still = replace(TINY, learning_rate=0.0)
-    train(still, tmp_path / "second", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
-    load = dict(weights_only=True)
-    before = torch.load(tmp_path / "first" / "checkpoint.pt", **load)["average"]
-    after = torch.load(tmp_path / "second" / "checkpoint.pt", **load)["model"]
-    torch.testing.assert_close(after["backbone.pos_embed"], before["backbone.pos_embed"])
-    with pytest.raises(InputError, match="of another shape, expected one of 2 blocks, 32 wide"):
-        wider = replace(TINY, embed_dim=32)
-        train(wider, tmp_path / "third", folder, start_from=tmp_path / "first" / "checkpoint.pt", **quiet)
+    train(still, tmp_path / "second", folder, start_from=checkpoint)
+    before, after = (read_checkpoint(path)["task"] for path in (checkpoint, tmp_path / "second" / "checkpoint.pt"))
+    torch.testing.assert_close(after["model.backbone.pos_embed"], before["average.backbone.pos_embed"])
+    with pytest.raises(InputError, match="a network of another shape, expected 2 blocks, 32 wide"):
+        train(replace(TINY, embed_dim=32), tmp_path / "third", folder, start_from=checkpoint)
     with pytest.raises(InputError, match="no such file"):
-        train(TINY, tmp_path / "fourth", folder, start_from=tmp_path / "lost.pt", **quiet)
+        train(TINY, tmp_path / "fourth", folder, start_from=tmp_path / "lost.pt")
     assert not (tmp_path / "fourth").exists()
-    checkpoint = tmp_path / "first" / "checkpoint.pt"
-    train(still, tmp_path / "second", folder, start_from=checkpoint, **quiet)
-    with pytest.raises(InputError, match="first: holds a run from other weights than .*checkpoint.pt"):
-        train(TINY, tmp_path / "first", folder, start_from=checkpoint, **quiet)
     checkpoint.unlink()  # no longer needed
-    train(still, tmp_path / "second", folder, start_from=checkpoint, **quiet)
+    train(still, tmp_path / "second", folder, start_from=checkpoint)
 
 
-def test_a_run_of_the_time_before_some_settings_goes_on(folder, renders, tmp_path):
-    quiet = dict(log=lambda line: None)
-    train(TINY, tmp_path, folder, **quiet)
-    config = json.loads((tmp_path / "config.json").read_text())
-    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    del config["proportions"], config["deformation"], state["origin"]
-    torch.save(state, tmp_path / "checkpoint.pt")
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InputError, match="another configuration, deformation is 1.0, expected 0.0 or a new folder"):
-        train(replace(TINY, deformation=0.0), tmp_path, folder, **quiet)
-    train(TINY, tmp_path, folder, **quiet)
-
-
-def test_a_run_can_start_from_exported_weights(folder, renders, tmp_path):
-    quiet = dict(log=lambda line: None)
-    weights = train(TINY, tmp_path / "first", folder, **quiet)
+def test_exported_weights_give_the_same_keys_to_a_further_run(first_run):
+    weights = first_run / "zsp-tiny.safetensors"
     again = Trainee(TINY)
     assert set(again.load_state_dict(starting_weights(TINY, weights), strict=False).missing_keys) == {
         f"geometry_of_{what}.{part}" for what in ("tokens", "keys") for part in ("weight", "bias")
@@ -349,23 +336,22 @@ def test_a_run_can_start_from_exported_weights(folder, renders, tmp_path):
     torch.testing.assert_close(got.keys, expected.keys, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(got.tokens, expected.tokens, atol=1e-4, rtol=1e-4)
 
+
+def test_a_run_can_start_from_exported_weights(folder, renders, first_run, tmp_path):
+    weights = first_run / "zsp-tiny.safetensors"
     still = replace(TINY, learning_rate=0.0)
-    second = load_file(train(still, tmp_path / "second", folder, start_from=weights, **quiet))
+    second = load_file(train(still, tmp_path / "second", folder, start_from=weights))
     first = load_file(weights)
     for name in ("patch_embed.proj.weight", "pos_embed", "blocks.1.mlp.fc2.weight"):
         torch.testing.assert_close(second[name], first[name], atol=1e-3, rtol=2e-3)
     model = Trainee(still)
     model.load_state_dict(starting_weights(still, weights), strict=False)
-    fit_read_outs(model, renders, still.seed)
-    kept = torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["average"]
-    torch.testing.assert_close(kept["geometry_of_tokens.weight"], model.geometry_of_tokens.weight.data)
-
-    train(still, tmp_path / "second", folder, start_from=weights, **quiet)
-    other = tmp_path / "first" / "checkpoint.pt"
-    with pytest.raises(InputError, match="second: holds a run from other weights than .*; expected a new folder"):
-        train(still, tmp_path / "second", folder, start_from=other, **quiet)
-    weights.unlink()  # no longer needed
-    train(still, tmp_path / "second", folder, start_from=weights, **quiet)
+    fit_heads(model, renders, still.seed)
+    kept = read_checkpoint(tmp_path / "second" / "checkpoint.pt")["task"]
+    torch.testing.assert_close(kept["average.geometry_of_tokens.weight"], model.geometry_of_tokens.weight.data)
+    train(still, tmp_path / "second", folder, start_from=weights)
+    with pytest.raises(InputError, match="second/checkpoint.pt: run that started from other weights, expected a new"):
+        train(still, tmp_path / "second", folder, start_from=first_run / "checkpoint.pt")
 
 
 def test_weights_that_no_run_can_start_from_are_refused_before_a_folder_is_made(tmp_path):
@@ -392,7 +378,7 @@ def test_read_outs_of_exported_weights_are_fitted_before_they_are_trained(render
     assert model.load_state_dict(starting_weights(CONTINUATION, "zsp-tiny"), strict=False).missing_keys
     batch = sample_batch(renders, np.random.default_rng(99), 2, VIEWS, 96, (0.6, 1.0))
     on_object = ~batch.surface[..., 0].isnan()
-    fit_read_outs(model, renders, 0, side=96)
+    fit_heads(model, renders, 0, side=96)
     with torch.no_grad():
         out = model(batch.images)
         for read_out, features in (
@@ -404,34 +390,32 @@ def test_read_outs_of_exported_weights_are_fitted_before_they_are_trained(render
             assert ((found[..., 4] > 0) == on_object).float().mean() > 0.9
 
 
-def test_the_ablations_do_what_their_rows_say(folder, renders, tmp_path, monkeypatch, capsys):
-    from zsp_lite.training import ablations
-
-    few = replace(TINY, stages=(Stage(2, 32, 2, 8, (0.6, 1.0), view=1.0),))
+def test_the_ablations_do_what_their_rows_say(folder, first_run, tmp_path, monkeypatch, capsys):
+    few = replace(TINY, objects=1, learning_rate=0.03, stages=(Stage(2, 32, 1, 8, (0.6, 1.0), view=1.0),))
     settings = ("proportions", "deformation", "log_binned")
     variants = {name: replace(few, **{setting: getattr(config, setting) for setting in settings})
                 for name, config in ablations.VARIANTS.items() if config.stages == ablations.BASE.stages}  # fmt: skip
     assert len(variants) == 4  # the others differ in their stages, which are cut short here
-    for name, value in dict(BASE=few, VARIANTS=variants, SIDE=32, SHARD=1).items():
+    for name, value in dict(BASE=few, VARIANTS=variants, SIDE=48, UNSEEN=2).items():
         monkeypatch.setattr(ablations, name, value)
     monkeypatch.setattr(ablations, "keep_freed_memory", lambda: None)  # this process lives on
-    weights = train(TINY, tmp_path / "first", folder, log=lambda line: None)
-    shutil.copytree(folder, tmp_path / "out" / "renders")  # half of them are there already
-    other = str(tmp_path / "first" / "checkpoint.pt")
+    weights = first_run / "zsp-tiny.safetensors"
+    shutil.copytree(folder, tmp_path / "out" / "renders")  # those of two variants
+    other = str(first_run / "checkpoint.pt")
     monkeypatch.setattr("sys.argv", ["ablations", str(weights), str(tmp_path / "out"), "--also", other])
     ablations.main()
     table = capsys.readouterr().out.partition("| |")[2].splitlines()[2:]
     rows = {row.split("|")[1].strip(): [float(cell) for cell in row.split("|")[2:5]] for row in table}
-    full = ["all of it", "no average of the weights", "the keys' mean at each place removed"]
+    full = [ablations.ALL, "without averaging of the weights", "mean key of each position subtracted"]
     assert list(rows) == [f"{weights}, before", other, *full, *list(variants)[1:]]
     assert all(0 <= matches <= 100 and 0 <= view <= 100 and 0 <= iou <= 1 for matches, view, iou in rows.values())
     assert len({tuple(rows[name]) for name in full}) == 3
-    logs = {name: json.loads((tmp_path / "out" / re.sub("[^0-9a-zA-Z]", "-", name) / "log.jsonl").read_text())
+    logs = {name: json.loads((tmp_path / "out" / name.replace(" ", "-").replace(",", "") / "log.jsonl").read_text())
             for name in variants}  # fmt: skip
     assert len({log["loss"] for log in logs.values()}) == 4  # three ways to render, and bare keys
     for arguments, problem in (
         (["lost.pt", str(tmp_path / "other")], "error: lost.pt: no such file"),
-        ([other, str(tmp_path / "out")], "all-of-it: holds a run from other weights than"),
+        ([other, str(tmp_path / "out")], "all-parts/checkpoint.pt: run that started from other weights"),
     ):
         monkeypatch.setattr("sys.argv", ["ablations", *arguments])
         with pytest.raises(SystemExit) as exit:
@@ -443,12 +427,12 @@ def test_the_ablations_do_what_their_rows_say(folder, renders, tmp_path, monkeyp
 def test_a_folder_with_another_configuration_is_refused(folder, renders, tmp_path):
     (tmp_path / "config.json").write_text('{"seed": 5}')
     with pytest.raises(InputError, match="another configuration"):
-        train(TINY, tmp_path, folder, log=lambda line: None)
+        train(TINY, tmp_path, folder)
 
 
 def test_a_run_that_diverges_says_so(folder, renders, tmp_path):
-    with pytest.raises(InputError, match="step 2 has gradients of size nan; expected a lower learning rate"):
-        train(replace(TINY, learning_rate=float("inf")), tmp_path, folder, log=lambda line: None)
+    with pytest.raises(InputError, match="step 2: the gradient has norm nan, expected a lower learning rate"):
+        train(replace(TINY, learning_rate=float("inf")), tmp_path, folder)
 
 
 def test_shards_that_are_damaged_or_of_another_renderer_are_refused(tmp_path):
@@ -463,23 +447,26 @@ def test_shards_that_are_damaged_or_of_another_renderer_are_refused(tmp_path):
 
 def test_a_damaged_run_and_no_objects_are_refused_in_one_line(folder, renders, tmp_path):
     with pytest.raises(InputError, match="expected at least 1"):
-        train(replace(TINY, objects=0), tmp_path, folder, log=lambda line: None)
+        train(replace(TINY, objects=0), tmp_path, folder)
     for amount in (-0.1, float("nan")):
-        with pytest.raises(InputError, match="proportions .*, expected a finite number from 0 on"):
+        with pytest.raises(InputError, match="proportions: expected a finite number of at least 0"):
             replace(TINY, proportions=amount)
     (tmp_path / "checkpoint.pt").write_bytes(b"cut off")
     with pytest.raises(InputError, match="checkpoint.pt: damaged"):
-        train(TINY, tmp_path, folder, log=lambda line: None)
+        train(TINY, tmp_path, folder)
     (tmp_path / "config.json").write_text('{"seed": ')
     with pytest.raises(InputError, match="config.json are not valid JSON"):
-        train(TINY, tmp_path, folder, log=lambda line: None)
+        train(TINY, tmp_path, folder)
 
 
-def test_the_command_trains_goes_on_and_distils(tmp_path, capsys, monkeypatch):
-    """Each stage of the real recipes once, on four objects."""
-    monkeypatch.setattr("zsp_lite.training.train.keep_freed_memory", lambda: None)  # this process lives on
-    renders = tmp_path / "renders"
-    common = ["--objects", "4", "--shorten", "0.0001", "--renders", str(renders)]
+def test_the_command_trains_continues_and_distils(folder, renders, tmp_path, capsys, monkeypatch):
+    """The command with tiny recipes: one step in each stage."""
+    monkeypatch.setattr("zsp_lite.training.loop.keep_freed_memory", lambda: None)  # this process lives on
+    monkeypatch.setattr(recipe, "TrainingConfig", lambda: TINY)
+    monkeypatch.setattr(recipe, "CONTINUATION", replace(TINY, stages=TINY.stages[1:]))
+    short = distillation.DistillationConfig(steps=2000, images=2, local_crops=1, outputs=8, hidden=8, bottleneck=8)
+    monkeypatch.setattr(distillation, "LONG_RUN", short)
+    common = ["--objects", "4", "--shorten", "0.0005", "--renders", str(folder)]
 
     def run(name, *options):
         cli.main(["train", "--out", str(tmp_path / name), *common, *options])
@@ -489,8 +476,20 @@ def test_the_command_trains_goes_on_and_distils(tmp_path, capsys, monkeypatch):
         return rows[-1], Path(weights).name
 
     first, name = run("first")
-    assert name == "zsp-tiny.safetensors" and first["step"] == len(TrainingConfig().stages) and "view" not in first
+    assert name == "zsp-tiny.safetensors" and first["step"] == 2 and first["view"] > 0
     second, _ = run("second", "--start-from", str(tmp_path / "first" / "checkpoint.pt"))
-    assert second["step"] == len(CONTINUATION.stages) and second["view"] > 0
+    assert second["step"] == 1
     third, name = run("third", "--self-distillation")
-    assert name == "dino-tiny.safetensors" and third["teacher_entropy"] > 0
+    assert name == "dino-tiny.safetensors" and third["step"] == 1 and third["teacher_entropy"] > 0
+
+
+def test_stages_follow_one_another_and_the_learning_rate_falls():
+    config = TrainingConfig()
+    assert config.steps == sum(stage.steps for stage in config.stages) == 6950
+    assert config.stage_at(0) == (config.stages[0], 0) and config.stage_at(1199)[0] is config.stages[0]
+    assert config.stage_at(1200) == (config.stages[1], 0) and config.stage_at(1550) == (config.stages[1], 0.5)
+    assert config.stage_at(6949)[0] is config.stages[-1]
+    rates = [config.learning_rate_at(step) for step in (0, 74, 150, 2000, 6949)]
+    assert rates[:4] == pytest.approx([1e-3 / 150, 0.5e-3, 1e-3, 1e-3]) and rates[4] == pytest.approx(0.7e-5, rel=1e-3)
+    with pytest.raises(InputError, match="step: expected 0 to 6949, got 6950"):
+        config.stage_at(6950)

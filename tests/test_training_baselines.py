@@ -1,12 +1,14 @@
 """The trainers of the small stand-ins: their pictures' poses are right, their losses do what the papers say."""
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import zsp_lite
 from zsp_lite.baselines.posecontrast import euler_to_rotation, load_posecontrast_tiny, rotation_to_euler
@@ -15,9 +17,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.training import object_crops as crops_module
 from zsp_lite.training import posecontrast, swav
-from zsp_lite.training.object_crops import SIZE, VIEWS, ObjectCrops, object_crops, render_object
+from zsp_lite.training.object_crops import SIZE, VIEWS, object_crops, render_object
 from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
 from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
 
@@ -26,17 +27,15 @@ WEIGHTS = Path(zsp_lite.__file__).parent / "weights"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Crops of two objects, rendered in this process."""
+    """A folder with crops of two objects."""
     folder = tmp_path_factory.mktemp("crops")
-    (folder / "crops").mkdir()
-    crops_module._shard(0, 2, folder / "crops", 0)
+    object_crops(folder / "crops", 2)
     return folder
 
 
 @pytest.fixture(scope="module")
 def crops(folder):
-    with np.load(next((folder / "crops").glob("*.npz"))) as file:
-        return ObjectCrops(*(file[name] for name in ("rgb", "aspect", "rotation")))
+    return object_crops(folder / "crops", 2)
 
 
 def test_an_object_is_seen_from_all_sides_and_fills_its_crops(crops):
@@ -46,16 +45,16 @@ def test_an_object_is_seen_from_all_sides_and_fills_its_crops(crops):
     directions = np.degrees(np.arctan2(ahead[:, 1], ahead[:, 0])) % 360
     assert np.diff(np.sort(directions)).max() < 180
     again = render_object(0)
-    assert (again[0][0] == crops.rgb[0]).all() and (again[1][2] == crops.rotation[1]).all()
+    for array, rows in zip(again, (crops.rgb, crops.aspect, crops.rotation), strict=True):
+        np.testing.assert_array_equal(array, rows[:VIEWS])
 
 
 def test_finished_crops_are_used_again(folder, crops):
-    found = object_crops(folder / "crops", 2, workers=1)
-    assert (found.rgb == crops.rgb).all()
-    first, last = found.split(VIEWS)
+    (path,) = (folder / "crops").iterdir()
+    written = path.stat().st_mtime_ns
+    assert (object_crops(folder / "crops", 2).rgb == crops.rgb).all() and path.stat().st_mtime_ns == written
+    first, last = crops.split(VIEWS)
     assert len(first) == len(last) == VIEWS and (last.rgb == crops.rgb[VIEWS:]).all()
-    with pytest.raises(InputError, match="objects"):
-        object_crops(folder, 0)
 
 
 def test_a_turned_picture_has_a_turned_pose(crops):
@@ -119,16 +118,42 @@ def test_crops_are_two_large_and_two_small_ones():
     assert large.shape == (6, 3, config.large, config.large) and small.shape == (6, 3, config.small, config.small)
 
 
-def test_both_trainers_write_what_the_loaders_read(folder):
+def train_both(crops_folder, folder, log=lambda line: None):
+    """Runs of three steps on the crops; the folders of the two runs."""
+    for name in ("swav", "posecontrast"):
+        shutil.copytree(crops_folder / "crops", folder / name / "crops", dirs_exist_ok=True)
+    swav.train(SwavConfig(objects=2, steps=3, batch=4, prototypes=3), folder / "swav", log)
+    posecontrast.train(PoseContrastConfig(objects=2, steps=3, batch=4), folder / "posecontrast", log)
+
+
+def test_both_trainings_write_what_the_loaders_read(folder, tmp_path):
     lines = []
-    path = swav.train(SwavConfig(objects=2, steps=2, batch=4, prototypes=3), folder, lines.append)
-    assert load_swav_tiny(path)([np.zeros((224, 224, 3), np.uint8)])[0].keys.shape[:2] == (28, 28)
-    path = posecontrast.train(PoseContrastConfig(objects=2, steps=2, batch=4), folder, lines.append)
-    load_posecontrast_tiny(path)
-    row = json.loads((folder / "posecontrast-tiny.jsonl").read_text().splitlines()[-1])
-    assert row["step"] == 2 and 0 <= row["held_out_median"] <= 180 and len(lines) == 2
-    config = json.loads((folder / "swav-tiny.json").read_text())
-    assert config["steps"] == 2 and config["categories"] == list(TRAINING)
+    train_both(folder, tmp_path, lines.append)
+    model = load_swav_tiny(tmp_path / "swav" / "swav-tiny.safetensors")
+    assert model([np.zeros((224, 224, 3), np.uint8)])[0].keys.shape[:2] == (28, 28)
+    load_posecontrast_tiny(tmp_path / "posecontrast" / "posecontrast-tiny.safetensors")
+    row = json.loads((tmp_path / "posecontrast" / "log.jsonl").read_text().splitlines()[-1])
+    assert row["step"] == 3 and 0 <= row["held_out_median"] <= 180 and len(lines) == 2
+    config = json.loads((tmp_path / "swav" / "config.json").read_text())
+    assert config["steps"] == 3 and config["categories"] == list(TRAINING)
+
+
+def test_killed_trainings_resume_to_the_same_weights(folder, tmp_path, monkeypatch):
+    train_both(folder, tmp_path / "whole")
+
+    def kill_after_two(task, *args, **options):
+        for _ in range(2):
+            task.step()
+        task.save(args[0] / "checkpoint.pt")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(swav, "run", kill_after_two)
+        patch.setattr(posecontrast, "run", kill_after_two)
+        train_both(folder, tmp_path / "killed")
+    train_both(folder, tmp_path / "killed")
+    for file in ("swav/swav-tiny.safetensors", "posecontrast/posecontrast-tiny.safetensors"):
+        expected, got = load_file(tmp_path / "whole" / file), load_file(tmp_path / "killed" / file)
+        assert expected.keys() == got.keys() and all(torch.equal(expected[name], got[name]) for name in expected)
 
 
 @pytest.mark.parametrize(
@@ -154,5 +179,7 @@ def test_settings_without_a_meaning_are_refused(tmp_path):
         SwavConfig(batch=1)
     with pytest.raises(InputError, match="steps=0"):
         PoseContrastConfig(steps=0)
-    with pytest.raises(InputError, match="at least 2"):
-        posecontrast.train(PoseContrastConfig(objects=1), tmp_path)
+    with pytest.raises(InputError, match="objects=1, .* expected at least 2"):
+        PoseContrastConfig(objects=1)
+    with pytest.raises(InputError, match="objects is 0"):
+        object_crops(tmp_path, 0)

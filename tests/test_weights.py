@@ -18,7 +18,7 @@ from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.export import GENERATORS
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
-from zsp_lite.training.train import CONTINUATION
+from zsp_lite.training.recipe import CONTINUATION
 from zsp_lite.views import object_crop, patch_mask
 
 
@@ -41,8 +41,9 @@ def test_its_runs_are_of_one_network_and_their_logs_complete():
     assert len(configs) == 3
     for path in configs:
         config = json.loads(path.read_text())
-        for name in ("embed_dim", "depth", "num_heads", "key_block"):
+        for name in ("embed_dim", "depth", "num_heads"):
             assert config[name] == getattr(CONTINUATION, name)
+        assert config["key_block"] == CONTINUATION.layer
         log = path.with_name(path.name.replace("config", "log")).with_suffix(".jsonl")
         rows = [json.loads(line) for line in log.read_text().splitlines()]
         assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])

@@ -234,7 +234,8 @@ def train(
         raise InputError("--self-distillation has no second part; expected it without --start-from")
     from dataclasses import replace
 
-    from zsp_lite.training.train import CONTINUATION, TrainingConfig, keep_freed_memory
+    from zsp_lite.training.loop import keep_freed_memory
+    from zsp_lite.training.recipe import CONTINUATION, TrainingConfig
     from zsp_lite.training.train import train as train_backbone
 
     recipe = TrainingConfig() if start_from is None else CONTINUATION
@@ -246,9 +247,9 @@ def train(
         from zsp_lite.training.distillation import LONG_RUN, distil
 
         run = replace(LONG_RUN, seed=seed, steps=max(1, round(LONG_RUN.steps * shorten)))
-        written = distil(run, config, out, renders, progress=_rendering_bar)
+        written = distil(run, config, out, renders)
     else:
-        written = train_backbone(config, out, renders, progress=_rendering_bar, start_from=start_from)
+        written = train_backbone(config, out, renders, start_from=start_from)
     print(f"Written: {written}")
 
 
@@ -274,13 +275,7 @@ def train_baseline(name: str, out: Path | None, objects: int | None, steps: int 
         from zsp_lite.training.posecontrast import PoseContrastConfig as Config
         from zsp_lite.training.posecontrast import train
     given = {key: value for key, value in (("objects", objects), ("steps", steps)) if value}
-    print(f"Written: {train(Config(seed=seed, **given), out or Path('outputs') / name, progress=_rendering_bar)}")
-
-
-def _rendering_bar(shards, total: int):
-    from tqdm import tqdm
-
-    return tqdm(shards, "rendering", total, unit="shard", disable=None)
+    print(f"Written: {train(Config(seed=seed, **given), out or Path('outputs') / name)}")
 
 
 @cli.command(epilog=examples("doctor", "doctor --data path/to/co3d"))

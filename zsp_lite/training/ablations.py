@@ -1,67 +1,61 @@
-"""What each part of the training is worth: short runs that go on from the same weights, each without one part.
+"""Ablations of the training: short runs that continue from the same weights, each without one part.
 
     python -m zsp_lite.training.ablations zsp-tiny outputs/ablations
 
-renders 800 new objects in three ways, trains every variant for as many steps on 128 px crops, and prints a table of
-what is found on TRAINING-category objects that no run sees. Everything is kept in the folder and reused.
+renders 800 objects in three variants, trains every variant for the same number of steps on 128 px crops, and prints a
+table of accuracies on objects of training categories that no run has seen. Renders and runs are kept in the folder and
+reused.
 """
 
 import argparse
+import logging
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
 
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import sample_batch
-from zsp_lite.training.renders import HELD_OUT, SHARD, VIEWS, RenderSet, load_render_set, render_set
-from zsp_lite.training.train import (
-    Stage,
-    Trainee,
-    TrainingConfig,
-    held_out_accuracy,
-    keep_freed_memory,
-    starting_weights,
-    train,
-)
+from zsp_lite.training.export import starting_weights
+from zsp_lite.training.loop import keep_freed_memory, read_checkpoint
+from zsp_lite.training.recipe import Stage, TrainingConfig
+from zsp_lite.training.renders import HELD_OUT, VIEWS, RenderSet, load_render_set, render_set
+from zsp_lite.training.train import held_out_accuracy, train
+from zsp_lite.training.trainee import Trainee
 
-SIDE = 128
+SIDE = 128  # of the crops, pixels
+UNSEEN = 200  # objects for the table
 FULL = Stage(160, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
 BASE = TrainingConfig(seed=1, objects=800, learning_rate=3e-4, average=0.98, stages=(FULL,))
 
+ALL = "all parts"
 VARIANTS = {
-    "all of it": BASE,
-    "views of one deformed instance, no siblings": replace(BASE, proportions=0.0),
+    ALL: BASE,
+    "views of one deformed instance, same proportions": replace(BASE, proportions=0.0),
     "views of one rigid instance": replace(BASE, proportions=0.0, deformation=0.0),
     "no view loss": replace(BASE, stages=(replace(FULL, view=0.0),)),
-    "view loss on bare keys": replace(BASE, log_binned=False),
+    "view loss on keys without log-binning": replace(BASE, log_binned=False),
     "view loss without opposite sides": replace(BASE, stages=(replace(FULL, objects=6, views=4),)),
-    "no geometry, no attention": replace(BASE, stages=(replace(FULL, helpers=0.0),)),
+    "no geometry and attention losses": replace(BASE, stages=(replace(FULL, helpers=0.0),)),
 }
 
-
-def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
-    """The mean key at each place of the grid, over crops of training objects: what a key says about where it is."""
-    rng, total = np.random.default_rng(0), 0.0
-    for _ in range(60):
-        images = sample_batch(renders, rng, 1, VIEWS, SIDE, (0.85, 1.0)).images
-        with torch.no_grad():
-            total = total + model(images).keys.float().mean(0)
-    return total / 60
+Row = tuple[float, float, float]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
-    parser.add_argument("start_from", help="what variants go on from: checkpoint.pt, exported .safetensors, zsp-tiny")
+    parser.add_argument(
+        "start_from", help="initial weights: checkpoint.pt of a run, exported .safetensors, or zsp-tiny"
+    )
     parser.add_argument("out", type=Path, help="folder for renders and runs")
-    parser.add_argument("--also", nargs="*", default=[], help="other such weights, measured beside")
+    parser.add_argument("--also", nargs="*", default=[], help="other weights to evaluate without training")
     arguments = parser.parse_args()
+    logging.basicConfig(format="%(message)s", level=logging.INFO)
     keep_freed_memory()
     try:
-        rows = measured_rows(arguments.start_from, arguments.out, arguments.also)
+        rows = evaluate_variants(arguments.start_from, arguments.out, arguments.also)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -70,32 +64,45 @@ def main() -> None:
         print(f"| {name} | {100 * matches:.1f} | {100 * view:.1f} | {iou:.3f} |")
 
 
-def measured_rows(start_from: str, out: Path, also: list[str]) -> dict[str, tuple[float, float, float]]:
+def evaluate_variants(start_from: str, out: Path, also: list[str]) -> dict[str, Row]:
+    """Train all variants and return match accuracy, view accuracy and saliency IoU by row of the table."""
     sources = {f"{start_from}, before": start_from} | {name: name for name in also}
-    models = {name: trainee(starting_weights(BASE, source)) for name, source in sources.items()}
-    unseen = load_render_set(render_set(out / "held-out", SHARD, 0, first=HELD_OUT))
-    rows = {name: measured(model, unseen) for name, model in models.items()}
+    models = {name: _trainee(starting_weights(BASE, source)) for name, source in sources.items()}
+    unseen = load_render_set(render_set(out / "held-out", UNSEEN, seed=0, first=HELD_OUT))
+    rows = {name: _evaluate(model, unseen) for name, model in models.items()}
     for name, config in VARIANTS.items():
-        run, renders = out / "".join(letter if letter.isalnum() else "-" for letter in name), out / "renders"
-        train(config, run, renders, log=lambda line: print(line, flush=True), start_from=start_from)
-        state = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)
-        rows[name] = measured(trainee(state["average"]), unseen)
-        if name == "all of it":
-            rows["no average of the weights"] = measured(trainee(state["model"]), unseen)
-            model = trainee(state["average"])
-            some = sorted(renders.glob(f"objects-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"))
-            model.key_mean = positional_mean(model, load_render_set(some))
-            rows["the keys' mean at each place removed"] = measured(model, unseen)
+        folder, renders = out / name.replace(" ", "-").replace(",", ""), out / "renders"
+        train(config, folder, renders, start_from=start_from)
+        checkpoint = folder / "checkpoint.pt"
+        model = _trainee(starting_weights(config, checkpoint))
+        rows[name] = _evaluate(model, unseen)
+        if name == ALL:
+            state = read_checkpoint(checkpoint)["task"]
+            last = {key.removeprefix("model."): x for key, x in state.items() if key.startswith("model.")}
+            rows["without averaging of the weights"] = _evaluate(_trainee(last), unseen)
+            first_shard = f"objects-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"
+            model.key_mean = positional_mean(model, load_render_set(sorted(renders.glob(first_shard))))
+            rows["mean key of each position subtracted"] = _evaluate(model, unseen)
     return rows
 
 
-def trainee(weights: dict[str, torch.Tensor]) -> Trainee:
+@torch.no_grad()
+def positional_mean(model: Trainee, renders: RenderSet) -> torch.Tensor:
+    """Return the mean key (n, dim) at each position of the patch grid over crops of training objects."""
+    rng, total = np.random.default_rng(0), 0.0
+    for _ in range(60):
+        images = sample_batch(renders, rng, 1, VIEWS, SIDE, (0.85, 1.0)).images
+        total = total + model(images).keys.float().mean(0)
+    return total / 60
+
+
+def _trainee(weights: dict[str, torch.Tensor]) -> Trainee:
     model = Trainee(BASE)
-    model.load_state_dict(weights, strict=False)  # exported weights have no read-outs, which no figure here needs
+    model.load_state_dict(weights, strict=False)  # exported weights have no heads; the table does not need them
     return model
 
 
-def measured(model: nn.Module, unseen: RenderSet) -> tuple[float, float, float]:
+def _evaluate(model: Trainee, unseen: RenderSet) -> Row:
     return tuple(held_out_accuracy(model, unseen, SIDE, len(unseen)).values())
 
 

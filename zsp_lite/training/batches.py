@@ -10,26 +10,49 @@ from torch import Tensor
 
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet
 
-# The trainer's own input scaling; `export_checkpoint` folds it into the patch embedding, so that the shipped
-# checkpoint expects ImageNet statistics like any DINO model, and `starting_weights` takes it out again.
+# Normalisation of RGB values in [0, 1] during training. `export_checkpoint` replaces it by ImageNet's in the patch
+# embedding, and `starting_weights` reverses that.
 MEAN, STD = 0.45, 0.25
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Crops of `objects` objects x `views` views, objects outermost; n patches per crop in row-major order."""
+    """Crops of several objects, the views of an object one after the other; n patches per crop, row by row.
+
+    Attributes:
+        images: Normalised RGB images.
+        surface: Object coordinates at the centre of each patch, NaN on the background.
+        geometry: Normal in the camera frame, and depth standardised over the object, at the centre of each patch.
+        coverage: Fraction of each patch that the object covers.
+        objects: Number of objects.
+    """
 
     images: Float[Tensor, "crops 3 side side"]
-    surface: Float[Tensor, "crops n 3"]  # object coordinates at each patch, NaN on the background
-    geometry: Float[Tensor, "crops n 4"]  # camera-frame normal and standardised depth
-    coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
+    surface: Float[Tensor, "crops n 3"]
+    geometry: Float[Tensor, "crops n 4"]
+    coverage: Float[Tensor, "crops n"]
     objects: int
 
+    def to(self, device: torch.device) -> "Batch":
+        """Copy the tensors to a device."""
+        tensors = (self.images, self.surface, self.geometry, self.coverage)
+        return Batch(*(tensor.to(device) for tensor in tensors), self.objects)
 
-def _crop_grids(rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]):
-    """Sampling grids (n, side, side, 2) of random, slightly turned crops, and how directions turn with them (n, 2, 2).
 
-    All crops of an object are mirrored, or none.
+def crop_grids(
+    rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
+) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
+    """Draw random, slightly rotated crops; all crops of an object are mirrored, or none.
+
+    Args:
+        rng: Random generator.
+        n: Number of crops.
+        per_object: Consecutive crops that belong to one object.
+        side: Side of the crops in pixels.
+        scale: Smallest and largest width of a crop as a fraction of the picture's.
+
+    Returns:
+        Sampling grids for `grid_sample`, and the matrices that map image directions of the picture to the crop.
     """
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
@@ -47,8 +70,8 @@ def _crop_grids(rng: np.random.Generator, n: int, per_object: int, side: int, sc
     return grid, torch.from_numpy(turn)
 
 
-def _recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Random brightness, contrast and saturation; some images grey, some blurred; scaled for the network."""
+def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Change brightness, contrast and saturation at random, blur some images, and normalise by `MEAN` and `STD`."""
     n = len(x)
 
     def draw(low, high):
@@ -66,13 +89,26 @@ def _recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Te
 
 
 def sample_batch(
-    renders: RenderSet, rng: np.random.Generator, objects: int, views: int, side: int, scale: tuple[float, float],
-    patch_size: int = 8, members: np.ndarray | None = None,
-) -> Batch:  # fmt: skip
-    """Draw a batch of square crops of `side` pixels whose width is a fraction `scale` (low, high) of the render's.
+    renders: RenderSet,
+    rng: np.random.Generator,
+    objects: int,
+    views: int,
+    side: int,
+    scale: tuple[float, float],
+    patch_size: int = 8,
+    members: np.ndarray | None = None,
+) -> Batch:
+    """Draw a batch of random crops.
 
-    views is 8, all of them, 4, two pairs a quarter turn apart, or 2, a pair from one side. `members` fixes the
-    objects by index.
+    Args:
+        renders: Objects to draw from.
+        rng: Random generator.
+        objects: Number of objects.
+        views: Views per object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one pair).
+        side: Side of the crops in pixels.
+        scale: Smallest and largest width of a crop as a fraction of the picture's.
+        patch_size: Side of a patch in pixels.
+        members: Indices of the objects. Default: random.
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
@@ -83,7 +119,7 @@ def sample_batch(
     maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
             for m in (renders.surface, renders.geometry)]  # fmt: skip
     n, patches = objects * views, side // patch_size
-    grid, turn = _crop_grids(rng, n, views, side, scale)
+    grid, turn = crop_grids(rng, n, views, side, scale)
     images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
 
     def at(resolution):
@@ -100,4 +136,4 @@ def sample_batch(
     surface[surface < -50] = float("nan")
     geometry = sample(geometry, centres).flatten(2).transpose(1, 2)
     geometry[..., :2] = geometry[..., :2] @ turn.transpose(1, 2)
-    return Batch(_recolour(rng, images), surface, geometry, coverage, objects)
+    return Batch(recolour(rng, images), surface, geometry, coverage, objects)

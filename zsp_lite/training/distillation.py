@@ -1,15 +1,15 @@
-"""DINO: a student learns to say of any crop what a slow average of itself says of a large one (Caron et al. 2021).
+"""Self-distillation of the backbone, DINO (Caron et al. 2021).
 
-Only pixels go in: no label, no mask, no depth, no second view. Every picture is cut into two global and some local
-crops; student and teacher describe each by a distribution over K outputs that mean nothing beforehand, and the student
-is asked to agree, on all crops, with the teacher on the *other* global crop. Two answers would agree without seeing
-anything: always the same output, and all outputs alike. Centring prevents the first and invites the second,
-sharpening the other way round; `DistillationConfig` can switch each off. `Distillation` takes single steps, `distil`
-is the whole run with its log.
+Only pictures are used: no labels, masks, depth or other views. Each picture is cut into two global and several local
+crops. Student and teacher map each crop to a distribution over K outputs, and the student is trained to predict, from
+every crop, the teacher's distribution for the other global crop. The teacher is an exponential average of the student.
+
+Two trivial solutions have a small loss: the same output for every picture, and a uniform distribution. Centring of the
+teacher's logits prevents the first and favours the second; sharpening, a low teacher temperature, does the opposite.
 """
 
 import copy
-import json
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -24,30 +24,40 @@ from torch import Tensor, nn
 from zsp_lite.backbones.precision import autocast, choose_precision
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import write_atomic
-from zsp_lite.training.batches import _crop_grids as crop_grids
-from zsp_lite.training.batches import _recolour as recolour
-from zsp_lite.training.batches import sample_batch
-from zsp_lite.training.renders import DEFORMATION, PROPORTIONS, VIEWS, RenderSet, training_and_held_out
-from zsp_lite.training.train import (
-    Trainee,
-    TrainingConfig,
-    _log_until,
-    claim_folder,
-    export_checkpoint,
-    held_out_accuracy,
-    initialise,
-)
+from zsp_lite.training.batches import crop_grids, recolour
+from zsp_lite.training.export import export_checkpoint
+from zsp_lite.training.loop import Task, claim_folder, run
+from zsp_lite.training.recipe import TrainingConfig
+from zsp_lite.training.renders import training_and_held_out
+from zsp_lite.training.train import held_out_accuracy
+from zsp_lite.training.trainee import Trainee, as_trainee, initialise
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Everything that decides the result but the pictures and the backbone's first weights.
+    """Everything that determines the result of a run, except the pictures and the initial backbone.
 
-    A step takes `images` pictures and cuts 2 + `local_crops` crops out of each. Sides are pixels, scales the crops'
-    width as a fraction (low, high) of the picture's. `teacher_momentum` and `weight_decay` go from their first to their
-    second number. Without `centring` the centre stays 0; without `sharpening` the teacher's temperature is the
-    student's. InputError for numbers without a meaning.
+    Attributes:
+        seed: Seed of crops and of the random head.
+        steps: Number of steps.
+        images: Pictures per step.
+        local_crops: Local crops per picture, in addition to two global ones.
+        global_side, local_side: Sides of the crops in pixels.
+        global_scale, local_scale: Smallest and largest width of the crops as a fraction of the picture's.
+        outputs: Number K of outputs. DINO has 65,536.
+        hidden, bottleneck: Widths of the head's layers.
+        student_temperature, teacher_temperature: Temperatures of the softmax.
+        centre_momentum: Decay per step of the average of the teacher's logits.
+        teacher_momentum: Decay of the teacher's average at the first and the last step.
+        learning_rate: Largest learning rate.
+        weight_decay: AdamW's, at the first and the last step.
+        centring: If false, the centre stays 0.
+        sharpening: If false, the teacher has the student's temperature.
+
+    Raises:
+        InputError: For counts below 1 (local crops: below 0) and temperatures that are not positive.
     """
 
     seed: int = 0
@@ -58,7 +68,7 @@ class DistillationConfig:
     local_side: int = 48
     global_scale: tuple[float, float] = (0.6, 1.0)
     local_scale: tuple[float, float] = (0.25, 0.6)
-    outputs: int = 512  # DINO has 65,536
+    outputs: int = 512
     hidden: int = 256
     bottleneck: int = 64
     student_temperature: float = 0.1
@@ -74,24 +84,24 @@ class DistillationConfig:
         counts = ("steps", "images", "global_side", "local_side", "outputs", "hidden", "bottleneck")
         for name in counts:
             if getattr(self, name) < 1:
-                raise InputError(f"DistillationConfig: {name} is {getattr(self, name)}, expected at least 1")
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.local_crops < 0:
-            raise InputError(f"DistillationConfig: local_crops is {self.local_crops}, expected 0 or more")
-        if min(self.student_temperature, self.teacher_temperature) <= 0:
-            raise InputError("DistillationConfig: temperatures must be positive")
+            raise InputError(f"local_crops: expected at least 0, got {self.local_crops}")
+        for name in ("student_temperature", "teacher_temperature"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
 
 
-# Nearer to DINO's own settings: hours on a CPU.
+# Closer to DINO's own settings; takes hours on a CPU.
 LONG_RUN = DistillationConfig(
     steps=7000, images=32, outputs=4096, hidden=1024, bottleneck=256, teacher_momentum=(0.996, 1.0), learning_rate=5e-4
 )  # fmt: skip
 
 
 class Head(nn.Module):
-    """CLS output to K logits: an MLP, then cosines with K learned directions.
+    """Projection head: an MLP, then cosine similarities to K learned directions.
 
-    DINO's weight-normalised last layer with its gain fixed at 1, on a bottleneck of unit length: so no logit leaves
-    [-1, 1], and only the temperatures decide how peaked a distribution is.
+    This is DINO's weight-normalised last layer with a fixed gain of 1, so that all logits are in [-1, 1].
     """
 
     def __init__(self, dim: int, hidden: int, bottleneck: int, outputs: int):
@@ -108,7 +118,7 @@ class Head(nn.Module):
 
 
 class Network(nn.Module):
-    """Backbone and head. Only the backbone is kept afterwards."""
+    """Backbone and head. Only the backbone is exported."""
 
     def __init__(self, backbone: VisionTransformer, config: DistillationConfig):
         super().__init__()
@@ -122,7 +132,7 @@ class Network(nn.Module):
 def multi_crop(
     pictures: UInt8[np.ndarray, "batch size size 3"], rng: np.random.Generator, config: DistillationConfig
 ) -> tuple[Float[Tensor, "2 batch 3 g g"], Float[Tensor, "k batch 3 l l"]]:
-    """Two global and k local crops of every picture, each turned, flipped and coloured for itself."""
+    """Cut two global and k local crops out of each picture, each rotated, mirrored and recoloured independently."""
     rgb = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255
 
     def crops(count: int, side: int, scale: tuple[float, float]) -> Tensor:
@@ -137,15 +147,25 @@ def multi_crop(
 
 
 def distillation_loss(
-    student: Float[Tensor, "crops batch outputs"], teacher: Float[Tensor, "2 batch outputs"],
-    centre: Float[Tensor, " outputs"], student_temperature: float, teacher_temperature: float,
-) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
-    """Cross-entropy between the teacher on one global crop and the student on each other crop (DINO, eq. 3).
+    student: Float[Tensor, "crops batch outputs"],
+    teacher: Float[Tensor, "2 batch outputs"],
+    centre: Float[Tensor, " outputs"],
+    student_temperature: float,
+    teacher_temperature: float,
+) -> tuple[Tensor, dict[str, float]]:
+    """Compute the cross-entropy between the teacher's and the student's distributions of different crops (eq. 3).
 
-    The student's first two crops are the teacher's. Also returns, in nats: `teacher_entropy` of a single output; `kl`,
-    how far the student is from it (their sum is the loss); and `information`, the entropy of the batch's mean output
-    less `teacher_entropy`: what an output tells about the picture. It is 0 in either collapse, and at most log(batch)
-    where the two crops of a picture agree.
+    Args:
+        student: Logits of all crops; the first two are the global ones.
+        teacher: Logits of the global crops.
+        centre: Average of the teacher's logits, which is subtracted.
+        student_temperature, teacher_temperature: Temperatures of the softmax.
+
+    Returns:
+        The loss, and figures in nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl",
+        divergence of the student's distributions from them (loss = teacher_entropy + kl); "information", entropy of the
+        teacher's mean distribution minus teacher_entropy, which is the mutual information of output and picture: 0 for
+        both trivial solutions, at most log(batch) if both crops of a picture have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()
@@ -160,151 +180,116 @@ def distillation_loss(
 
 
 def cosine(ends: tuple[float, float], progress: float) -> float:
-    """From ends[0] to ends[1] along half a cosine; progress in [0, 1]."""
+    """Interpolate from ends[0] to ends[1] along half a cosine, for progress from 0 to 1."""
     return ends[1] + (ends[0] - ends[1]) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
-class Distillation:
-    """A run of DINO: student, teacher, centre, optimiser and how many steps are done.
+class Distillation(Task):
+    """A run of DINO; the teacher's backbone is its result.
 
-    It starts from a copy of `backbone`; the teacher's backbone is the result. A step depends only on the state, the
-    seed and the step's number, so a restored run continues as if nothing had happened.
+    Args:
+        config: Configuration.
+        backbone: Initial backbone; it is copied.
+        rgb: Pictures: several views of each of n objects.
+        measure: Computes figures of the teacher's backbone for the log.
     """
 
-    def __init__(self, config: DistillationConfig, backbone: VisionTransformer):
+    max_gradient_norm = 3.0
+
+    def __init__(
+        self,
+        config: DistillationConfig,
+        backbone: VisionTransformer,
+        rgb: UInt8[np.ndarray, "n views size size 3"],
+        measure: Callable[[VisionTransformer], dict[str, float]] = lambda backbone: {},
+    ):
+        super().__init__()
         torch.manual_seed(config.seed)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.precision = choose_precision(device.type)
-        self.config, self.steps_done = config, 0
+        self.config, self.rgb, self.measure, self.steps = config, rgb, measure, config.steps
         self.student = Network(copy.deepcopy(backbone), config).to(device).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
-        self.centre = torch.zeros(config.outputs, device=device)
+        self.register_buffer("centre", torch.zeros(config.outputs, device=device))
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
         vectors = [p for p in self.student.parameters() if p.ndim <= 1]  # biases and norms: no weight decay
-        groups = [dict(params=matrices), dict(params=vectors, weight_decay=0.0)]
-        self.optimiser = torch.optim.AdamW(groups, lr=config.learning_rate)
+        groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
 
-    def step(self, rgb: UInt8[np.ndarray, "n views size size 3"]) -> dict[str, float]:
-        """Learn from `config.images` random pictures of `RenderSet.rgb`; returns the figures of that step."""
+    def schedule(self, step: int) -> dict[str, float]:
+        progress = step / self.steps
+        self.set_learning_rate(self.config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress))
+        self.optimizer.param_groups[0]["weight_decay"] = cosine(self.config.weight_decay, progress)
+        self.student.head.directions.requires_grad_(progress >= 0.05)  # DINO fixes the last layer in the first epoch
+        return {}
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         config, device = self.config, self.centre.device
-        rng = np.random.default_rng([config.seed, 3, self.steps_done])
-        pictures = rgb[rng.integers(len(rgb), size=config.images), rng.integers(rgb.shape[1], size=config.images)]
-        large, small = (crops.to(device) for crops in multi_crop(pictures, rng, config))
-        progress = self.steps_done / config.steps
-
+        rng = np.random.default_rng([config.seed, 3, step])
+        objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
+        large, small = (crops.to(device) for crops in multi_crop(self.rgb[objects, views], rng, config))
         with autocast(device.type, self.precision):
             with torch.no_grad():
                 teacher = self.teacher(large.flatten(0, 1)).unflatten(0, large.shape[:2]).float()
             student = [self.student(crops.flatten(0, 1)).unflatten(0, crops.shape[:2]).float()
                        for crops in (large, small) if len(crops)]  # fmt: skip
+        self.teacher_mean = teacher.mean((0, 1))
         sharp = config.teacher_temperature if config.sharpening else config.student_temperature
-        loss, figures = distillation_loss(torch.cat(student), teacher, self.centre, config.student_temperature, sharp)
-        self.optimiser.zero_grad()
-        loss.backward()
-        if progress < 0.05:  # DINO holds the last layer for the first epoch: outputs first have to mean something
-            self.student.head.directions.grad = None
-        nn.utils.clip_grad_norm_(self.student.parameters(), 3.0)
-        for group in self.optimiser.param_groups:
-            group["lr"] = config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
-        self.optimiser.param_groups[0]["weight_decay"] = cosine(config.weight_decay, progress)
-        self.optimiser.step()
-        with torch.no_grad():
-            momentum = cosine(config.teacher_momentum, progress)
-            for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
-                slow.lerp_(fast, 1 - momentum)
-            if config.centring:
-                self.centre.lerp_(teacher.mean((0, 1)), 1 - config.centre_momentum)  # eq. 4
-        self.steps_done += 1
-        return dict(step=self.steps_done) | figures
+        return distillation_loss(torch.cat(student), teacher, self.centre, config.student_temperature, sharp)
 
-    def save(self, path: Path) -> None:
-        """Write all that `restore` needs; a file that is there is replaced only once the new one is whole."""
-        parts = dict(student=self.student, teacher=self.teacher, optimiser=self.optimiser)
-        state = {name: part.state_dict() for name, part in parts.items()}
-        state |= dict(
-            centre=self.centre, steps_done=self.steps_done, config=asdict(self.config), precision=self.precision
-        )
-        unfinished = Path(path).with_suffix(".part")
-        torch.save(state, unfinished)
-        unfinished.replace(path)
+    @torch.no_grad()
+    def after_step(self, step: int) -> None:
+        momentum = cosine(self.config.teacher_momentum, step / self.steps)
+        for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
+            slow.lerp_(fast, 1 - momentum)
+        if self.config.centring:
+            self.centre.lerp_(self.teacher_mean, 1 - self.config.centre_momentum)  # eq. 4
 
-    def restore(self, path: Path) -> None:
-        """Continue from a file of `save`. InputError where it is damaged or of another configuration."""
-        try:
-            state = torch.load(path, map_location=self.centre.device, weights_only=True)
-            same = state["config"] == asdict(self.config)
-        except Exception as error:  # torch raises whatever its unpickler stumbles over
-            raise InputError(f"{path}: no checkpoint of a distillation") from error
-        if not same:
-            raise InputError(f"{path}: a run of another configuration, expected one of {self.config}")
-        try:
-            for name in ("student", "teacher", "optimiser"):
-                getattr(self, name).load_state_dict(state[name])
-        except (RuntimeError, ValueError) as error:
-            raise InputError(f"{path}: a run with a backbone of another shape, expected one like this") from error
-        self.centre, self.steps_done, self.precision = state["centre"], state["steps_done"], state["precision"]
-
-
-def as_trainee(backbone: VisionTransformer, shape: TrainingConfig, renders: RenderSet, side: int = 96) -> Trainee:
-    """The backbone as the other trainer sees one, so that both are measured and exported by the same code.
-
-    The mean key, which that trainer follows from step to step, is taken from crops of `side` pixels of `renders`.
-    """
-    device = next(backbone.parameters()).device
-    trainee = Trainee(shape).to(device)
-    trainee.backbone = backbone
-    crops = sample_batch(renders, np.random.default_rng(7), min(6, len(renders)), VIEWS, side, (0.85, 1.0)).images
-    with torch.no_grad():
-        trainee.centred(backbone.forward_training(crops.to(device), trainee.key_block).keys, update_mean=True)
-    return trainee
+    def evaluate(self) -> dict[str, float]:
+        return self.measure(self.teacher.backbone)
 
 
 def distil(
-    config: DistillationConfig, shape: TrainingConfig, folder: Path, renders: Path | None = None,
-    log: Callable[[str], None] = print, progress=lambda iterable, total: iterable, checkpoint_every: int = 250,
+    config: DistillationConfig,
+    shape: TrainingConfig,
+    folder: Path,
+    renders: Path | None = None,
+    log: Callable[[str], None] = logger.info,
     log_every: int = 50,
-) -> Path:  # fmt: skip
-    """Run DINO from random weights, or resume from `folder`/checkpoint.pt, and export `folder`/dino-tiny.safetensors.
+    checkpoint_every: int = 250,
+) -> Path:
+    """Train a backbone by DINO or resume its training, and export `folder`/dino-tiny.safetensors.
 
-    Of `shape` count the backbone's size and key block, and which objects there are and how they are rendered. folder
-    receives config.json and log.jsonl, one JSON object per line: figures of `Distillation.step`, means since the line
-    before, and in every tenth line those of `held_out_accuracy` on TRAINING-category objects that no step sees.
-    `renders` is where the training set is kept or made (default `folder`/renders); `progress` wraps the rendering of
-    its shards.
-    Raises InputError where `folder` holds a run of another configuration or a damaged one.
+    Args:
+        config: Configuration of the run.
+        shape: Size of the backbone, the block that is evaluated, and the training objects; its other fields are not
+            used.
+        folder: Receives config.json, log.jsonl and checkpoint.pt (see `loop.run`) and the exported weights. A run in it
+            is resumed.
+        renders: Folder in which the renders are made or found. Default: `folder`/renders.
+        log: Called with each line of the log as readable text.
+        log_every: Steps between lines of the log; every tenth line has the figures of `held_out_accuracy`.
+        checkpoint_every: Steps between checkpoints.
+
+    Returns:
+        Path of the exported weights.
+
+    Raises:
+        InputError: If `folder` has a run with another configuration or a damaged checkpoint.
     """
     folder = Path(folder)
-    network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "key_block")}
-    rendered = dict(proportions=shape.proportions, deformation=shape.deformation)
-    settings = dict(asdict(config), objects=shape.objects, pictures_seed=shape.seed, network=network) | rendered
-    claim_folder(folder, settings, earlier=dict(proportions=PROPORTIONS, deformation=DEFORMATION))
-    training, held_out = training_and_held_out(
-        renders or folder / "renders", shape.objects, shape.seed, progress, **rendered
-    )
+    network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "layer")}
+    rendered = {"proportions": shape.proportions, "deformation": shape.deformation}
+    pictures = {"objects": shape.objects, "pictures_seed": shape.seed}
+    claim_folder(folder, asdict(config) | pictures | rendered | {"network": network})
+    training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, **rendered)
     start = Trainee(shape)
     initialise(start, training, shape.seed)
-    run = Distillation(config, start.backbone)
-    if (checkpoint := folder / "checkpoint.pt").exists():
-        run.restore(checkpoint)
-    earlier = _log_until(folder / "log.jsonl", run.steps_done)
-    write_atomic(folder / "log.jsonl", "".join(earlier).encode())
-    rows: list[dict[str, float]] = []
-    with (folder / "log.jsonl").open("a") as log_file:
-        while run.steps_done < config.steps:
-            rows.append(run.step(training.rgb))
-            step = run.steps_done
-            last = step == config.steps
-            if step % log_every == 0 or last:
-                row = dict(step=step)
-                row |= {name: round(float(np.mean([r[name] for r in rows])), 4) for name in rows[0] if name != "step"}
-                if step % (10 * log_every) == 0 or last:
-                    measured = held_out_accuracy(as_trainee(run.teacher.backbone, shape, training), held_out)
-                    row |= {name: round(value, 4) for name, value in measured.items()}
-                rows = []
-                log_file.write(json.dumps(row) + "\n")
-                log_file.flush()
-                log("  ".join(f"{name} {value}" for name, value in row.items()))
-            if step % checkpoint_every == 0 or last:
-                run.save(checkpoint)
-    trainee = as_trainee(run.teacher.backbone.cpu(), shape, training)
+
+    def measure(backbone: VisionTransformer) -> dict[str, float]:
+        return held_out_accuracy(as_trainee(backbone, shape, training), held_out)
+
+    task = Distillation(config, start.backbone, training.rgb, measure)
+    run(task, folder, log, log_every, 10 * log_every, checkpoint_every)
+    trainee = as_trainee(task.teacher.backbone.cpu(), shape, training)
     return export_checkpoint(trainee, held_out, shape, folder / "dino-tiny.safetensors")

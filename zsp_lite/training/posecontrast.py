@@ -1,13 +1,13 @@
-"""Trains "posecontrast-tiny": viewpoints of the training categories, by their pose labels (Xiao et al. 2021).
+"""Training of "posecontrast-tiny" on pose labels of the training categories (PoseContrast; Xiao et al. 2021).
 
-The loss is PoseContrast's: cross-entropy over the bins of the three angles, Huber on the offset inside the true bin,
-and a contrastive term that pushes two pictures' features apart the more, the more their poses differ.
+The loss is PoseContrast's: cross-entropy over the bins of the three angles, Huber loss of the offset within the true
+bin, and a contrastive loss in which a pair of pictures is weighted by the angle between their poses.
 """
 
-import json
+import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +29,35 @@ from zsp_lite.baselines.posecontrast import (
 )
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, rotation_error
-from zsp_lite.training.batches import MEAN, STD
-from zsp_lite.training.batches import _recolour as recolour
+from zsp_lite.synthetic.training_categories import TRAINING
+from zsp_lite.training.batches import MEAN, STD, recolour
+from zsp_lite.training.export import export_convolutional
+from zsp_lite.training.loop import Task, claim_folder, run
 from zsp_lite.training.object_crops import VIEWS, ObjectCrops, object_crops
-from zsp_lite.training.swav import export, note_config
+
+_EVALUATED = 400  # held-out pictures, at most
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class PoseContrastConfig:
-    """What decides the result.  tilt: degrees (standard deviation) by which pictures are turned in their plane."""
+    """Everything that determines the result of a run.
+
+    Attributes:
+        seed: Seed of objects, pictures and random weights.
+        objects: Number of objects, of which the last twelfth is held out.
+        steps: Number of steps.
+        batch: Pictures per step.
+        learning_rate: Largest learning rate.
+        weight_decay: AdamW's.
+        contrast: Weight of the contrastive loss.
+        temperature: Temperature of the contrastive loss.
+        tilt: Standard deviation in degrees of the random in-plane rotation of pictures.
+
+    Raises:
+        InputError: For fewer than 2 objects or pictures per step, or no step.
+    """
 
     seed: int = 0
     objects: int = 1500
@@ -50,65 +70,75 @@ class PoseContrastConfig:
     tilt: float = 7.0
 
     def __post_init__(self):
-        if min(self.objects, self.steps) < 1 or self.batch < 2:
+        if self.steps < 1 or min(self.objects, self.batch) < 2:
             raise InputError(
-                f"objects={self.objects}, steps={self.steps}, batch={self.batch}; expected at least 1, 1 and 2"
+                f"objects={self.objects}, steps={self.steps}, batch={self.batch}; expected at least 2, 1 and 2"
             )
 
 
-def train(
-    config: PoseContrastConfig,
-    folder: str | Path,
-    log: Callable[[str], None] = print,
-    progress=lambda iterable, total: iterable,
-) -> Path:
-    """Render, train, and export `folder`/posecontrast-tiny.safetensors, with its configuration and log beside it.
+class PoseContrastTraining(Task):
+    """Training of `TinyPoseContrast` on crops; the last twelfth of the objects is held out."""
 
-    The last twelfth of the objects is never trained on: the log's held_out figures are theirs. Raises InputError for
-    fewer than two objects.
+    def __init__(self, config: PoseContrastConfig, crops: ObjectCrops):
+        super().__init__()
+        torch.manual_seed(config.seed)
+        self.config, self.steps = config, config.steps
+        self.training_set, self.held_out = crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS)
+        self.model = TinyPoseContrast()
+        parameters = self.model.parameters()
+        self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
+
+    def schedule(self, step: int) -> dict[str, float]:
+        warm_up, decay = min(1.0, (step + 1) / 30), 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        self.set_learning_rate(self.config.learning_rate * warm_up * decay)
+        return {}
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        config = self.config
+        images, again, labels = sample(self.training_set, np.random.default_rng([config.seed, 4, step]), config)
+        self.model.train()
+        features = self.model.network(torch.cat([images, again]))
+        first, second = features.split(len(images))
+        viewpoint = viewpoint_loss(*self.model.estimator(first), labels)
+        contrast = pose_contrast(first, second, labels, config.temperature)
+        return viewpoint + config.contrast * contrast, {"loss": viewpoint.item(), "contrast": contrast.item()}
+
+    def evaluate(self) -> dict[str, float]:
+        return held_out_errors(self.model, self.held_out)
+
+
+def train(config: PoseContrastConfig, folder: str | Path, log: Callable[[str], None] = logger.info) -> Path:
+    """Render the training set, train or resume, and export `folder`/posecontrast-tiny.safetensors.
+
+    Args:
+        config: Configuration of the run.
+        folder: Receives renders, config.json, log.jsonl and checkpoint.pt (see `loop.run`) and the weights.
+        log: Called with each line of the log as readable text.
+
+    Returns:
+        Path of the exported weights.
     """
-    if config.objects < 2:
-        raise InputError("training has 1 object, expected at least 2: the last ones are held out")
     folder = Path(folder)
-    crops = object_crops(folder / "crops", config.objects, config.seed, progress=progress)
-    training, held_out = crops.split(max(1, len(crops) // VIEWS // 12) * VIEWS)
-    note_config(config, folder / "posecontrast-tiny.json")
-    torch.manual_seed(config.seed)
-    model = TinyPoseContrast()
-    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    with (folder / "posecontrast-tiny.jsonl").open("w") as file:
-        for step in range(config.steps):
-            rng = np.random.default_rng([config.seed, 4, step])
-            images, again, labels = sample(training, rng, config)
-            model.train()
-            features = model.network(torch.cat([images, again]))
-            first, second = features.split(len(images))
-            loss = viewpoint_loss(*model.estimator(first), labels)
-            contrast = pose_contrast(first, second, labels, config.temperature)
-            optimiser.zero_grad()
-            (loss + config.contrast * contrast).backward()
-            for group in optimiser.param_groups:
-                warm = min(1.0, (step + 1) / 30)
-                group["lr"] = config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-            optimiser.step()
-            if (step + 1) % 50 == 0 or step + 1 == config.steps:
-                row = {"step": step + 1, "loss": round(loss.item(), 4), "contrast": round(contrast.item(), 4)}
-                row |= held_out_errors(model, held_out)
-                file.write(json.dumps(row) + "\n")
-                file.flush()
-                log("  ".join(f"{name} {value}" for name, value in row.items()))
-    return export(model, folder / "posecontrast-tiny.safetensors")
+    claim_folder(folder, asdict(config) | {"categories": list(TRAINING)})
+    task = PoseContrastTraining(config, object_crops(folder / "crops", config.objects, config.seed))
+    run(task, folder, log, evaluate_every=50)
+    return export_convolutional(task.model, folder / "posecontrast-tiny.safetensors")
 
 
 def sample(
     crops: ObjectCrops, rng: np.random.Generator, config: PoseContrastConfig
 ) -> tuple[Float[Tensor, "b 3 s s"], Float[Tensor, "b 3 s s"], Float[Tensor, "b 3"]]:
-    """Pictures, each in two colourings, turned a little in their plane, and their angles (degrees, counted from 0)."""
+    """Draw a batch of pictures with a random in-plane rotation.
+
+    Returns:
+        The pictures with two independent colour changes, normalised for the network, and their azimuth, elevation and
+        in-plane rotation (see `euler_to_rotation`).
+    """
     index = rng.integers(len(crops), size=config.batch)
     images = _pictures(crops, index)
     tilt = np.radians(rng.normal(0, config.tilt, config.batch))
     c, s = np.cos(tilt), np.sin(tilt)
-    # A turn of the camera about its axis by `tilt`: what the picture shows at x, it showed at the turned-back x.
+    # The camera rotates about its axis by `tilt`: pixel x shows what was at the position x rotated back.
     back = np.stack([np.stack([c, s, 0 * c], -1), np.stack([-s, c, 0 * c], -1)], -2)
     grid = F.affine_grid(torch.from_numpy(back.astype(np.float32)), list(images.shape), align_corners=False)
     images = F.grid_sample(images, grid, align_corners=False)
@@ -123,7 +153,7 @@ def sample(
 def viewpoint_loss(
     logits: Sequence[Float[Tensor, "b _"]], offsets: Sequence[Float[Tensor, "b _"]], labels: Float[Tensor, "b 3"]
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of the true bins, and Huber on five times the offset in them."""
+    """Return the cross-entropy of the true bins plus the Huber loss of five times the offset within them."""
     chosen = [(labels[:, i] / BIN).long().clamp(0, bins - 1) for i, bins in enumerate(BINS)]
     classes = sum(F.cross_entropy(logit, bin_) for logit, bin_ in zip(logits, chosen, strict=True))
     found = torch.stack(
@@ -135,7 +165,18 @@ def viewpoint_loss(
 def pose_contrast(
     first: Float[Tensor, "b d"], second: Float[Tensor, "b d"], labels: Float[Tensor, "b 3"], temperature: float
 ) -> Float[Tensor, ""]:
-    """Pose-aware contrastive loss: another picture counts as a negative by the angle between the poses, over 180."""
+    """Compute the pose-aware contrastive loss.
+
+    With unit features f_i and f'_i of two versions of picture i, the angle d_ij between the poses of pictures i and j
+    in degrees, and temperature t, it is the mean over i of
+
+        -log(p_i / (p_i + sum_j (d_ij / 180) exp(f_i . f_j / t))),  p_i = exp(f_i . f'_i / t).
+
+    Args:
+        first, second: Features of the two versions of b pictures.
+        labels: Azimuth, elevation and in-plane rotation in degrees.
+        temperature: Temperature t.
+    """
     first, second = F.normalize(first, dim=1), F.normalize(second, dim=1)
     rotation = euler_to_rotation(labels.numpy())
     apart = torch.from_numpy(rotation_error(rotation[:, None], rotation[None])).to(first.dtype) / 180
@@ -145,10 +186,10 @@ def pose_contrast(
 
 
 @torch.no_grad()
-def held_out_errors(model: TinyPoseContrast, crops: ObjectCrops, most: int = 400) -> dict[str, float]:
-    """Median error (degrees) and Acc30 (%) of absolute poses of objects that no step has seen."""
+def held_out_errors(model: TinyPoseContrast, crops: ObjectCrops) -> dict[str, float]:
+    """Return the median error in degrees and Acc30 in per cent of absolute poses, on at most 400 crops."""
     model.eval()
-    index = np.arange(min(most, len(crops)))
+    index = np.arange(min(_EVALUATED, len(crops)))
     angles = predict_angles(*model.estimator(model.network(normalize(_pictures(crops, index)))))
     errors = rotation_error(euler_to_rotation(angles.numpy()), crops.rotation[index])
     return {"held_out_median": round(float(median(errors)), 1), "held_out_acc30": round(float(accuracy(errors, 30)), 1)}

@@ -1,6 +1,5 @@
-"""The training set: several views of one build at a time, with what a renderer knows about each."""
+"""The training set of the backbone: several views of one object at a time, with their geometry."""
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,23 +13,28 @@ from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_variant
 from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
+from zsp_lite.training.shards import render_shards
 
-VIEWS = 8
-SIZE = 192
-GRID = 48
-SHARD = 200
-APART = np.radians((5, 45))  # in azimuth, of the two views of a pair: never farther than views of two pairs
-PROPORTIONS, DEFORMATION = 0.3, 1.0  # how far the views of one build differ; see `render_object`
-HELD_OUT = 9_000_000  # the number of the first object that is never trained on
+VIEWS = 8  # per object
+SIZE = 192  # of a view, pixels
+GRID = 48  # points along each side of a view at which geometry is known
+SHARD = 200  # objects per file
+ARRAYS = ("rgb", "surface", "geometry")  # of a file
+PAIR_ANGLES = np.radians((5, 45))  # smallest and largest difference in azimuth of the two views of a pair
+PROPORTIONS, DEFORMATION = 0.3, 1.0  # differences between the views of one object; see `render_object`
+HELD_OUT = 9_000_000  # number of the first object that is never trained on
+SEED_STRIDE = 10_000_000  # objects of seed s have the numbers from s * SEED_STRIDE on
 
 
 @dataclass(frozen=True)
 class RenderSet:
-    """Views of n builds.
+    """Views of n objects.
 
-    `surface` holds the object coordinates of every fourth pixel, NaN on the background: two views of ONE build
-    correspond where these agree. They are never compared between builds. `geometry` holds the normal in the camera
-    frame and the depth, standardised over the object's pixels of that view.
+    Attributes:
+        rgb: Pictures.
+        surface: Object coordinates of every fourth pixel, NaN on the background. Two views of one object correspond
+            where these agree; they have no meaning across objects.
+        geometry: Normal in the camera frame, and depth standardised over the object's pixels of the view.
     """
 
     rgb: UInt8[np.ndarray, "n views size size 3"]
@@ -42,20 +46,27 @@ class RenderSet:
 
 
 def render_object(
-    seed: int, generators=None, proportions: float = PROPORTIONS, deformation: float = DEFORMATION
+    seed: int, proportions: float = PROPORTIONS, deformation: float = DEFORMATION
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one build; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
+    """Render one object.
 
-    Half of the builds come from the named training categories, half are random assemblies. Views come in four pairs,
-    a quarter turn from one another: the two of a pair are 5 to 45 degrees of azimuth apart, about as far as a reference
-    is from the nearest of a few target views, and never farther than two of different pairs; every side's opposite is
-    there too.
-    Every view shows a copy with other proportions (`make_variant`, by that amount), gently deformed (`deform`), now and
-    then without one of its parts, under its own materials, light and room, so that only what all views share, the
-    object's build, can tell one place from another.
+    Half of the objects are of the named training categories, half are random assemblies of parts. The views are four
+    pairs, a quarter turn apart. The two views of a pair differ by 5 to 45 degrees of azimuth, about as much as a
+    reference and the nearest of a few target views, and never more than two views of different pairs.
+
+    Each view shows another instance of the same build: with other proportions (`make_variant`), deformed (`deform`),
+    sometimes without one of its parts, with its own materials, light and background.
+
+    Args:
+        seed: Number of the object.
+        proportions: Amount by which proportions vary.
+        deformation: Amount of the deformation.
+
+    Returns:
+        The object's rows of `RenderSet.rgb`, `.surface` and `.geometry`.
     """
     rng = np.random.default_rng([seed, 0])
-    generators = list(TRAINING.values()) if generators is None else generators
+    generators = list(TRAINING.values())
     generator = generators[rng.integers(len(generators))] if rng.random() < 0.5 else random_assembly
     shape = make_shape(generator, [seed, 1])
     start = rng.uniform(0, 2 * np.pi)
@@ -65,7 +76,7 @@ def render_object(
     step = SIZE // GRID
     for view in range(VIEWS):
         if view % 2 == 0:
-            azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*APART)
+            azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(-0.05, 0.9)
         scene = _altered(shape, make_variant(generator, [seed, 1], rng, proportions), rng, deformation)
         R, t = orbit_pose(
@@ -84,9 +95,9 @@ def render_object(
 
 
 def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation: float) -> Scene:
-    """The scene of a deformed copy of `sibling` whose pixels keep the surface coordinates of `shape`."""
+    """Make a scene of a deformed `sibling` in which each pixel has the surface coordinates of `shape`."""
     if not np.array_equal(shape.faces, sibling.faces):
-        raise ValueError("a sibling has other parts than its object: its generator chose them by a proportion")
+        raise ValueError("the variant of an object has other parts than the object")
     vertices = deform(sibling, rng, deformation)
     part = shape.part[shape.faces[:, 0]]
     size = np.bincount(part)
@@ -95,49 +106,54 @@ def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation
     return Scene(replace(shape, faces=shape.faces[kept], material=shape.material[kept]), vertices)
 
 
-def _render_shard(first: int, count: int, folder: Path, seed: int, proportions: float, deformation: float) -> Path:
-    # The name says all that decides the content: what was rendered in another way is not taken for it.
-    name = f"objects-{seed}-{first:06d}-{first + count:06d}-{proportions:g}-{deformation:g}.npz"
-    path = folder / name
-    if not path.exists():
-        numbers = range(seed * 10_000_000 + first, seed * 10_000_000 + first + count)
-        rows = [render_object(number, None, proportions, deformation) for number in numbers]
-        rgb, surface, geometry = (np.stack(column) for column in zip(*rows, strict=True))
-        unfinished = path.with_suffix(".part.npz")
-        np.savez(unfinished, rgb=rgb, surface=surface, geometry=geometry)
-        unfinished.rename(path)
-    return path
+def render_set(
+    folder: Path,
+    objects: int,
+    seed: int = 0,
+    shard: int | None = None,
+    workers: int = 2,
+    first: int = 0,
+    proportions: float = PROPORTIONS,
+    deformation: float = DEFORMATION,
+) -> list[Path]:
+    """Render a training set into a folder, about 1.1 MB per object. Existing shards are reused.
 
+    Args:
+        folder: Folder of the shards; their names contain all other arguments.
+        objects: Number of objects, rounded up to whole shards.
+        seed: Seed of the set.
+        shard: Objects per shard. Default: 200, or `objects` if these are fewer.
+        workers: Number of processes (see `render_shards`).
+        first: Number of the first object.
+        proportions, deformation: See `render_object`.
 
-def render_set(folder: Path, objects: int, seed: int = 0, shard: int = SHARD, workers: int = 2,
-               progress=lambda iterable, total: iterable, first: int = 0,
-               proportions: float = PROPORTIONS, deformation: float = DEFORMATION) -> list[Path]:  # fmt: skip
-    """Render `objects` objects (rounded up to whole shards), from number `first` on, into `folder`, or reuse them.
-
-    Returns the shard paths; a killed run continues with the first missing shard. About 1.1 MB per object.
+    Returns:
+        Paths of the shards.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    starts = range(first, first + objects, shard)
-    with ProcessPoolExecutor(workers) as pool:
-        how = dict(count=shard, folder=folder, seed=seed, proportions=proportions, deformation=deformation)
-        paths = pool.map(partial(_render_shard, **how), starts)
-        return list(progress(paths, len(starts)))
+    shard = min(SHARD, objects) if shard is None else shard
+    shards = {}
+    for start in range(first, first + objects, shard):
+        name = f"objects-{seed}-{start:06d}-{start + shard:06d}-{proportions:g}-{deformation:g}.npz"
+        shards[folder / name] = range(seed * SEED_STRIDE + start, seed * SEED_STRIDE + start + shard)
+    render = partial(render_object, proportions=proportions, deformation=deformation)
+    render_shards(render, shards, ARRAYS, workers)
+    return list(shards)
 
 
 def load_render_set(paths: list[Path]) -> RenderSet:
-    """Read shards into memory, one at a time: joining them afterwards would need all of it twice.
-
-    Raises InputError where a file is no shard, or one of other sizes.
-    """
-    joined: list[np.ndarray] = []
+    """Read shards into one set. Raises InputError if a file is damaged or has arrays of other sizes."""
+    joined: list[np.ndarray] = []  # filled shard by shard: concatenation would need twice the memory
     for index, path in enumerate(paths):
-        shard = read_arrays(path, ("rgb", "surface", "geometry"), "training renders")
+        shard = read_arrays(path, ARRAYS, "training renders")
         count = len(shard[0])  # all shards have as many objects
         expected = (count, VIEWS, SIZE, SIZE, 3), (count, VIEWS, GRID, GRID, 3), (count, VIEWS, GRID, GRID, 4)
-        for name, part, shape in zip(("rgb", "surface", "geometry"), shard, expected, strict=True):
+        for name, part, shape in zip(ARRAYS, shard, expected, strict=True):
             if part.shape != shape:
-                raise InputError(f"{path}: {name} has shape {part.shape}, expected {shape}; remove it to render anew")
+                raise InputError(
+                    f"{path}: {name} has shape {part.shape}, expected {shape}; remove it to render it again"
+                )
         if not joined:
             joined = [np.empty((count * len(paths), *part.shape[1:]), part.dtype) for part in shard]
         for whole, part in zip(joined, shard, strict=True):
@@ -146,15 +162,22 @@ def load_render_set(paths: list[Path]) -> RenderSet:
 
 
 def training_and_held_out(
-    folder: Path, objects: int, seed: int = 0, progress=lambda iterable, total: iterable,
-    proportions: float = PROPORTIONS, deformation: float = DEFORMATION,
-) -> tuple[RenderSet, RenderSet]:  # fmt: skip
-    """`objects` objects to train on, and others to watch the training by: an eighth as many, at most `SHARD`.
+    folder: Path,
+    objects: int,
+    seed: int = 0,
+    proportions: float = PROPORTIONS,
+    deformation: float = DEFORMATION,
+) -> tuple[RenderSet, RenderSet]:
+    """Render or load a training set and held-out objects, an eighth as many but at most 200.
 
-    `proportions` and `deformation` are of the former; the others are always rendered alike, and have numbers that no
-    training set reaches, so runs that go on from one another can share them.
+    Args:
+        folder: See `render_set`.
+        objects: Number of training objects.
+        seed: Seed of both sets.
+        proportions, deformation: Of the training set; held-out objects have the default values. Their numbers are in no
+            training set, so runs that continue one another can use the same.
     """
     shard = min(SHARD, max(1, objects // 8))
+    training = render_set(folder, objects, seed, shard, proportions=proportions, deformation=deformation)
     held_out = render_set(folder, shard, seed, shard, first=HELD_OUT)
-    how = dict(progress=progress, proportions=proportions, deformation=deformation)
-    return load_render_set(render_set(folder, objects, seed, shard, **how)), load_render_set(held_out)
+    return load_render_set(training), load_render_set(held_out)

@@ -1,21 +1,20 @@
-"""Trains "swav-tiny": crops of one picture agree on a prototype, prototypes are used evenly (Caron et al. 2020).
+"""Training of "swav-tiny" by swapped prediction of cluster assignments (SwAV; Caron et al. 2020).
 
-No label goes in. Every picture is cut into two large and two small crops; each large crop is assigned to prototypes by
-a few Sinkhorn steps over the batch, and every other crop of that picture learns to predict the assignment.
+No labels are used. Each picture is cut into two large and two small crops. The large crops are assigned to prototypes
+by a few Sinkhorn iterations over the batch, which keep the assignments balanced; every other crop of the picture is
+trained to predict the assignment.
 """
 
-import json
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from zsp_lite.backbones.backbone import normalize
@@ -23,21 +22,40 @@ from zsp_lite.baselines.resnet import TINY, ResNet
 from zsp_lite.errors import InputError
 from zsp_lite.matchers import sinkhorn
 from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.training.batches import MEAN, STD
-from zsp_lite.training.batches import _crop_grids as crop_grids
-from zsp_lite.training.batches import _recolour as recolour
-from zsp_lite.training.object_crops import object_crops
+from zsp_lite.training.batches import MEAN, STD, crop_grids, recolour
+from zsp_lite.training.export import export_convolutional
+from zsp_lite.training.loop import Task, claim_folder, run
+from zsp_lite.training.object_crops import ObjectCrops, object_crops
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class SwavConfig:
-    """What decides the result. Sides are pixels, scales the crops' width as a fraction (low, high) of the picture's."""
+    """Everything that determines the result of a run.
+
+    Attributes:
+        seed: Seed of objects, crops and random weights.
+        objects: Number of training objects.
+        steps: Number of steps.
+        batch: Pictures per step.
+        prototypes: Number of prototypes. SwAV has 3,000 for the 1,000 classes of ImageNet.
+        large, small: Sides of the crops in pixels.
+        large_scale, small_scale: Smallest and largest width of the crops as a fraction of the picture's.
+        temperature: Temperature of the predictions.
+        regularisation: Entropic regularisation of the Sinkhorn iterations.
+        learning_rate: Largest learning rate.
+        weight_decay: AdamW's.
+
+    Raises:
+        InputError: For numbers below 1, and batches of fewer than 2 pictures.
+    """
 
     seed: int = 0
     objects: int = 1500
     steps: int = 700
     batch: int = 48
-    prototypes: int = 32  # SwAV has 3,000, for a thousand kinds of object
+    prototypes: int = 32
     large: int = 64
     small: int = 32
     large_scale: tuple[float, float] = (0.4, 1.0)
@@ -56,7 +74,7 @@ class SwavConfig:
 
 
 class Network(nn.Module):
-    """The network that is kept, and the projection and prototypes that are not."""
+    """Residual network with a projection and prototypes. Only the residual network is exported."""
 
     def __init__(self, prototypes: int, hidden: int = 256, bottleneck: int = 64):
         super().__init__()
@@ -67,12 +85,12 @@ class Network(nn.Module):
             nn.BatchNorm1d(hidden),
             nn.ReLU(),
             nn.Linear(hidden, bottleneck),
-            nn.BatchNorm1d(bottleneck, affine=False),  # or else all pictures look alike for long
+            nn.BatchNorm1d(bottleneck, affine=False),  # without it, projections of all pictures stay similar for long
         )
         self.prototypes = nn.Parameter(torch.randn(prototypes, bottleneck))
 
     def forward(self, images: Float[Tensor, "b 3 s s"]) -> Float[Tensor, "b k"]:
-        """Cosines of the pictures' projections with the prototypes."""
+        """Return the cosine similarities of the pictures' projections to the k prototypes."""
         projected = F.normalize(self.projection(self.backbone(images)), dim=1)
         return F.linear(projected, F.normalize(self.prototypes, dim=1))
 
@@ -80,12 +98,19 @@ class Network(nn.Module):
 def swapped_prediction(
     scores: Float[Tensor, "crops b k"], temperature: float, regularisation: float
 ) -> tuple[Float[Tensor, ""], float]:
-    """The loss, and how evenly prototypes are used: the entropy of the mean assignment over its largest value.
+    """Compute the swapped-prediction loss.
 
-    The first two crops are the large ones, which are assigned; every crop predicts the assignments of the others.
+    Args:
+        scores: Cosine similarities of b pictures' crops to k prototypes; the first two crops are the large ones.
+        temperature: Temperature of the predictions.
+        regularisation: Entropic regularisation of the Sinkhorn iterations.
+
+    Returns:
+        The mean cross-entropy between the assignments of each large crop and the predictions of each other crop, and
+        the entropy of the mean assignment divided by log k, which is 1 if all prototypes are used equally.
     """
     with torch.no_grad():
-        # Columns are scaled last: each picture's assignment sums to one.
+        # Each picture's assignment sums to 1, because columns are normalised last.
         assigned = torch.stack(
             [sinkhorn(-score.T.float(), regularisation, 3).T * len(score) for score in scores[:2]]
         ).to(scores.dtype)
@@ -96,64 +121,59 @@ def swapped_prediction(
     return cross[other].mean(), float(-torch.xlogy(mean, mean).sum() / math.log(len(mean)) if len(mean) > 1 else 1.0)
 
 
-def train(
-    config: SwavConfig,
-    folder: str | Path,
-    log: Callable[[str], None] = print,
-    progress=lambda iterable, total: iterable,
-) -> Path:
-    """Render, train, and export `folder`/swav-tiny.safetensors, with its configuration and log beside it."""
+class SwavTraining(Task):
+    """Training of a `Network` on crops."""
+
+    def __init__(self, config: SwavConfig, crops: ObjectCrops):
+        super().__init__()
+        torch.manual_seed(config.seed)
+        self.config, self.crops, self.steps = config, crops, config.steps
+        self.network = Network(config.prototypes)
+        parameters = self.network.parameters()
+        self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
+
+    def schedule(self, step: int) -> dict[str, float]:
+        warm_up, decay = min(1.0, (step + 1) / 20), 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        self.set_learning_rate(self.config.learning_rate * warm_up * decay)
+        self.network.prototypes.requires_grad_(step >= self.steps // 20)  # SwAV fixes them in the first epoch
+        return {}
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        config = self.config
+        rng = np.random.default_rng([config.seed, 5, step])
+        pictures = torch.from_numpy(self.crops.rgb[rng.integers(len(self.crops), size=config.batch)])
+        crops = multi_crop(pictures.permute(0, 3, 1, 2).float() / 255, rng, config)
+        scores = torch.cat([self.network(batch).unflatten(0, (2, config.batch)) for batch in crops])
+        loss, evenness = swapped_prediction(scores, config.temperature, config.regularisation)
+        return loss, {"loss": loss.item(), "evenness": evenness}
+
+
+def train(config: SwavConfig, folder: str | Path, log: Callable[[str], None] = logger.info) -> Path:
+    """Render the training set, train or resume, and export `folder`/swav-tiny.safetensors.
+
+    Args:
+        config: Configuration of the run.
+        folder: Receives renders, config.json, log.jsonl and checkpoint.pt (see `loop.run`) and the weights.
+        log: Called with each line of the log as readable text.
+
+    Returns:
+        Path of the exported weights.
+    """
     folder = Path(folder)
-    crops = object_crops(folder / "crops", config.objects, config.seed, progress=progress)
-    note_config(config, folder / "swav-tiny.json")
-    torch.manual_seed(config.seed)
-    model = Network(config.prototypes)
-    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    with (folder / "swav-tiny.jsonl").open("w") as file:
-        for step in range(config.steps):
-            rng = np.random.default_rng([config.seed, 5, step])
-            pictures = torch.from_numpy(crops.rgb[rng.integers(len(crops), size=config.batch)])
-            scores = torch.cat([
-                model(cut).unflatten(0, (2, config.batch))
-                for cut in multi_crop(pictures.permute(0, 3, 1, 2).float() / 255, rng, config)
-            ])  # fmt: skip
-            loss, evenness = swapped_prediction(scores, config.temperature, config.regularisation)
-            optimiser.zero_grad()
-            loss.backward()
-            if step < config.steps // 20:  # SwAV holds the prototypes for the first epoch
-                model.prototypes.grad = None
-            for group in optimiser.param_groups:
-                warm = min(1.0, (step + 1) / 20)
-                group["lr"] = config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-            optimiser.step()
-            if (step + 1) % 20 == 0 or step + 1 == config.steps:
-                row = {"step": step + 1, "loss": round(loss.item(), 4), "evenness": round(evenness, 4)}
-                file.write(json.dumps(row) + "\n")
-                file.flush()
-                log("  ".join(f"{name} {value}" for name, value in row.items()))
-    return export(model.backbone, folder / "swav-tiny.safetensors")
-
-
-def note_config(config: Any, path: Path) -> None:
-    """Write down what decides a training's result, and whose pictures it sees."""
-    path.write_text(json.dumps(asdict(config) | {"categories": list(TRAINING)}, indent=1) + "\n")
-
-
-def export(module: nn.Module, path: Path) -> Path:
-    """Write a network's weights in half precision; what batch norms measured stays in single, for it has any range."""
-    weights = {}
-    for name, value in module.state_dict().items():
-        if not name.endswith("num_batches_tracked"):
-            weights[name] = (value if "running_" in name else value.half()).contiguous()
-    save_file(weights, path, metadata={"name": path.stem})
-    path.chmod(0o644)  # safetensors makes files that only their owner reads
-    return path
+    claim_folder(folder, asdict(config) | {"categories": list(TRAINING)})
+    task = SwavTraining(config, object_crops(folder / "crops", config.objects, config.seed))
+    run(task, folder, log, log_every=20)
+    return export_convolutional(task.network.backbone, folder / "swav-tiny.safetensors")
 
 
 def multi_crop(
     pictures: Float[Tensor, "b 3 s s"], rng: np.random.Generator, config: SwavConfig
 ) -> list[Float[Tensor, "n 3 _ _"]]:
-    """Two large, then two small crops of every picture, each coloured for itself, ready for the network."""
+    """Cut two large and two small crops out of each picture, with independent colour changes.
+
+    Returns:
+        The large and the small crops, (2 b, 3, side, side) each, normalised for the network.
+    """
     found = []
     for side, scale in ((config.large, config.large_scale), (config.small, config.small_scale)):
         grid, _ = crop_grids(rng, 2 * len(pictures), 1, side, scale)
