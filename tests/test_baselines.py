@@ -139,7 +139,14 @@ angles = st.tuples(st.floats(0, 359.9), st.floats(1, 179), st.floats(0, 359.9))
 def test_angles_and_rotations_are_each_others_inverse(found):
     rotation = euler_to_rotation(np.array(found))
     assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
-    assert rotation_to_euler(rotation) == pytest.approx(np.array(found), abs=1e-6)
+    difference = (rotation_to_euler(rotation) - found + 180) % 360 - 180
+    assert difference == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+def test_a_tiny_negative_angle_becomes_zero():
+    rotation = euler_to_rotation(np.array([307.5, 1.0, 0.0]))  # the in-plane rotation comes back as about -1e-14
+    azimuth, _, in_plane = rotation_to_euler(rotation)
+    assert 0 <= azimuth < 360 and 0 <= in_plane < 360
 
 
 @pytest.mark.parametrize("pole", [0.0, 180.0])

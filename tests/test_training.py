@@ -406,8 +406,8 @@ def test_the_ablations_do_what_their_rows_say(folder, first_run, tmp_path, monke
     ablations.main()
     table = capsys.readouterr().out.partition("| |")[2].splitlines()[2:]
     rows = {row.split("|")[1].strip(): [float(cell) for cell in row.split("|")[2:5]] for row in table}
-    full = [ablations.ALL, "without averaging of the weights", "mean key of each position subtracted"]
-    assert list(rows) == [f"{weights}, before", other, *full, *list(variants)[1:]]
+    full = [ablations.ALL, "no averaging of weights", "mean key at each grid position removed"]
+    assert list(rows) == [f"{weights}, without further training", other, *full, *list(variants)[1:]]
     assert all(0 <= matches <= 100 and 0 <= view <= 100 and 0 <= iou <= 1 for matches, view, iou in rows.values())
     assert len({tuple(rows[name]) for name in full}) == 3
     logs = {name: json.loads((tmp_path / "out" / name.replace(" ", "-").replace(",", "") / "log.jsonl").read_text())
@@ -415,7 +415,7 @@ def test_the_ablations_do_what_their_rows_say(folder, first_run, tmp_path, monke
     assert len({log["loss"] for log in logs.values()}) == 4  # three ways to render, and bare keys
     for arguments, problem in (
         (["lost.pt", str(tmp_path / "other")], "error: lost.pt: no such file"),
-        ([other, str(tmp_path / "out")], "all-parts/checkpoint.pt: run that started from other weights"),
+        ([other, str(tmp_path / "out")], "full-training/checkpoint.pt: run that started from other weights"),
     ):
         monkeypatch.setattr("sys.argv", ["ablations", *arguments])
         with pytest.raises(SystemExit) as exit:

@@ -185,6 +185,7 @@ def rotation_to_euler(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.nda
     # SciPy's middle angle is in [0, 180], ours in [-180, 0]: the other two change by 180 degrees.
     in_plane, elevation, azimuth = zxz.T
     angles = np.stack([(azimuth + 180) % 360, 180 - elevation, in_plane % 360], axis=-1)
+    angles[angles == 360] = 0  # the remainder of a tiny negative number
     return angles.reshape(rotation.shape[:-1])
 
 

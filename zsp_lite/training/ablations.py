@@ -30,15 +30,15 @@ UNSEEN = 200  # objects for the table
 FULL = Stage(160, SIDE, 3, VIEWS, (0.6, 1.0), view=2.0)
 BASE = TrainingConfig(seed=1, objects=800, learning_rate=3e-4, average=0.98, stages=(FULL,))
 
-ALL = "all parts"
+ALL = "full training"
 VARIANTS = {
     ALL: BASE,
-    "views of one deformed instance, same proportions": replace(BASE, proportions=0.0),
-    "views of one rigid instance": replace(BASE, proportions=0.0, deformation=0.0),
+    "views of one deformed object, no variants": replace(BASE, proportions=0.0),
+    "views of one rigid object": replace(BASE, proportions=0.0, deformation=0.0),
     "no view loss": replace(BASE, stages=(replace(FULL, view=0.0),)),
-    "view loss on keys without log-binning": replace(BASE, log_binned=False),
-    "view loss without opposite sides": replace(BASE, stages=(replace(FULL, objects=6, views=4),)),
-    "no geometry and attention losses": replace(BASE, stages=(replace(FULL, helpers=0.0),)),
+    "view loss on plain keys": replace(BASE, log_binned=False),
+    "view loss without opposite views": replace(BASE, stages=(replace(FULL, objects=6, views=4),)),
+    "no geometry, no attention": replace(BASE, stages=(replace(FULL, helpers=0.0),)),
 }
 
 Row = tuple[float, float, float]
@@ -59,14 +59,14 @@ def main() -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    print("| | matches (%) | view (%) | IoU |\n|---|---|---|---|")
+    print("| | matches (%) | right view (%) | IoU of the saliency |\n|---|---|---|---|")
     for name, (matches, view, iou) in rows.items():
         print(f"| {name} | {100 * matches:.1f} | {100 * view:.1f} | {iou:.3f} |")
 
 
 def evaluate_variants(start_from: str, out: Path, also: list[str]) -> dict[str, Row]:
     """Train all variants and return match accuracy, view accuracy and saliency IoU by row of the table."""
-    sources = {f"{start_from}, before": start_from} | {name: name for name in also}
+    sources = {f"{start_from}, without further training": start_from} | {name: name for name in also}
     models = {name: _trainee(starting_weights(BASE, source)) for name, source in sources.items()}
     unseen = load_render_set(render_set(out / "held-out", UNSEEN, seed=0, first=HELD_OUT))
     rows = {name: _evaluate(model, unseen) for name, model in models.items()}
@@ -79,10 +79,10 @@ def evaluate_variants(start_from: str, out: Path, also: list[str]) -> dict[str, 
         if name == ALL:
             state = read_checkpoint(checkpoint)["task"]
             last = {key.removeprefix("model."): x for key, x in state.items() if key.startswith("model.")}
-            rows["without averaging of the weights"] = _evaluate(_trainee(last), unseen)
+            rows["no averaging of weights"] = _evaluate(_trainee(last), unseen)
             first_shard = f"objects-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"
             model.key_mean = positional_mean(model, load_render_set(sorted(renders.glob(first_shard))))
-            rows["mean key of each position subtracted"] = _evaluate(model, unseen)
+            rows["mean key at each grid position removed"] = _evaluate(model, unseen)
     return rows
 
 
