@@ -49,6 +49,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         matchers,
         matching,
         metrics,
+        minimal,
         pipeline,
         points,
         synthetic,
@@ -76,7 +77,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
 # Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
 # which `zsp-lite --help` does not need.
 _HOMES = {
-    "": "alignment best_view demo errors features matchers matching metrics pipeline points views "
+    "": "alignment best_view demo errors features matchers matching metrics minimal pipeline points views "
     "backbones baselines benchmark cli data importers io labelling synthetic training verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",

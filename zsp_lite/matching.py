@@ -291,16 +291,21 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 
 def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
-    """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
-    keys = features.keys.to(torch.float32)
-    if not binning:
-        normed = F.normalize(keys.flatten(0, 1)[torch.from_numpy(index).to(keys.device)], dim=1)
-        return (normed @ normed.T).cpu().numpy().astype(np.float64)
-    bins = bin_indices(features.grid)[:, torch.from_numpy(index)].to(keys.device)
-    pooled = average_pool(average_pool(keys, 0), 1)
-    descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
-    descriptors = F.normalize(descriptors.transpose(0, 1).flatten(1), dim=1)
-    return (descriptors @ descriptors.T).cpu().numpy().astype(np.float64)
+    """Compute the cosines between the descriptors of a few patches, which are few enough to build.
+
+    They are rounded to six decimals: greedy k-means++ has exact ties (of two points that are each other's nearest,
+    either lowers the sum of squares by the same amount), which rounding errors would break differently each time.
+    """
+    keys = features.keys.cpu().double()
+    index = torch.from_numpy(index)
+    descriptors = keys.flatten(0, 1)[index]
+    if binning:
+        bins = bin_indices(features.grid)[:, index]
+        pooled = average_pool(average_pool(keys, 0), 1)
+        descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
+        descriptors = descriptors.transpose(0, 1).flatten(1)
+    descriptors = F.normalize(descriptors, dim=1)
+    return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
