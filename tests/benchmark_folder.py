@@ -63,4 +63,8 @@ def own_method(problem):
 if __name__ == "__main__":
     from zsp_lite.benchmark.run import evaluate
 
-    evaluate(sys.argv[1], SlowBackbone(), ("ours", "ours-bv"), 6, 3, out=sys.argv[2])
+    def report(done: int, total: int) -> None:
+        print(done, flush=True)
+
+    data, out, workers = sys.argv[1:]
+    evaluate(data, SlowBackbone(), ("ours", "ours-bv"), 6, 3, out=out, progress=report, workers=int(workers))

@@ -17,6 +17,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import icp as icp_module
 from zsp_lite.baselines import posecontrast, swav
+from zsp_lite.baselines.essential_matrix import essential_rotation
 from zsp_lite.baselines.icp import align, icp
 from zsp_lite.baselines.posecontrast import (
     PoseContrast,
@@ -33,7 +34,6 @@ from zsp_lite.baselines.posecontrast import (
 from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
 from zsp_lite.baselines.sift import Keypoints, Sift, mutual_matches, unproject_pixels
 from zsp_lite.baselines.swav import load_swav, load_swav_tiny
-from zsp_lite.benchmark.essential import essential_rotation
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches

@@ -7,8 +7,9 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.benchmark import extractors
-from zsp_lite.benchmark.methods import GROUPS, METHODS
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows, read_records, resolve
+from zsp_lite.benchmark.database import read_records
+from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
+from zsp_lite.benchmark.run import evaluate, pairs_of_rows
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -23,7 +24,7 @@ ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "ic
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("rows")
     summary = evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out=out, categories=["pebble"])
-    return summary["methods"], read_records(out / "pairs.jsonl")
+    return summary["methods"], read_records(out).rows
 
 
 def test_every_row_answers_every_pair(run):
@@ -41,11 +42,9 @@ def test_with_perfect_features_every_way_to_match_and_fit_is_right(run):
 
 def test_a_row_with_the_runs_number_of_views_is_the_row_without_a_number(run):
     rows, records = run
-    five = [record["methods"] for record in records.values() if "ours" in record["methods"]]
-    assert len(five) == 6 and rows["ours-n5"] == rows["ours"]
-    assert all(found["ours-n5"]["error"] == found["ours"]["error"] for found in five)
-    three = [key for key, record in records.items() if "ours-n3" in record["methods"]]
-    assert len(three) == 6 and all(key.count(",") == 2 for key in three)
+    assert len(records["ours"]) == 6 and rows["ours-n5"] == rows["ours"]
+    assert all(records["ours-n5"][key]["error"] == found["error"] for key, found in records["ours"].items())
+    assert len(records["ours-n3"]) == 6 and all(key.count(",") == 2 for key in records["ours-n3"])
 
 
 def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
@@ -58,22 +57,21 @@ def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
         camera = estimate.target_camera
         truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
         truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ reference.camera.R.T
-        found = records[pair.key]["methods"][name]
+        found = records[name][pair.key]
         assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-9)
         assert found["view"] == estimate.view and found["inliers"] == estimate.inliers.sum()
 
 
 def test_without_depth_there_is_a_rotation_and_no_translation(run):
     _, records = run
-    found = [r["methods"]["ours-nodepth"] for r in records.values() if "ours-nodepth" in r["methods"]]
-    fitted = [one for one in found if one["note"] == ""]
+    fitted = [one for one in records["ours-nodepth"].values() if one["note"] == ""]
     assert len(fitted) >= 4 and all("translation_error" not in one and one["inliers"] >= 5 for one in fitted)
 
 
 def test_icp_starts_from_the_first_view_or_from_the_best(run):
     _, records = run
-    for found in (record["methods"] for record in records.values() if "icp" in record["methods"]):
-        assert found["icp"]["view"] == 0 and found["icp-bv"]["view"] == found["ours"]["view"]
+    for key, found in records["ours"].items():
+        assert records["icp"][key]["view"] == 0 and records["icp-bv"][key]["view"] == found["view"]
 
 
 def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):

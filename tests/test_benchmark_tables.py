@@ -14,6 +14,7 @@ from rich.console import Console
 
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.compare import compare, comparison_table, split_rows
+from zsp_lite.benchmark.database import RunFolder
 from zsp_lite.benchmark.document import with_tables
 from zsp_lite.benchmark.figures import (
     accuracy_against_views,
@@ -25,9 +26,8 @@ from zsp_lite.benchmark.figures import (
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
-from zsp_lite.benchmark.results import Results, pool, read_results, read_runs, write_results
-from zsp_lite.benchmark.storage import RunFolder
-from zsp_lite.benchmark.summary import category_of, objects_of, summarise_run, weights_of_pairs
+from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
+from zsp_lite.benchmark.summary import category_of, objects_of, weights_of_pairs
 from zsp_lite.benchmark.tables import (
     OTHER_DATA,
     THIS_RUN,
@@ -59,20 +59,21 @@ def made_up_run(out, rows=ROWS, seed=0, objects=PAIRS):
             Pair(category, names[i % objects], i, names[(i * i + 1) % objects], tuple(range(n or 5)))
             for category in CATEGORIES for i in range(PAIRS)
         ]  # fmt: skip
-    settings = {"seed": seed, "targets": 5, "methods": dict.fromkeys(rows, "x"), "backbone": "none"}
+    settings = {
+        "data": "made up", "seed": seed, "targets": 5, "methods": dict.fromkeys(rows, "x"), "backbone": "none",
+        "library": {"version": "0", "revision": None},
+    }  # fmt: skip
     with RunFolder(out, settings) as folder:
-        for name in rows:
-            for pair in pairs[name]:
-                found = {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "", "inliers": 9}
-                folder.add({
-                    "key": pair.key, "category": pair.category, "methods": {name: found}, "saliency_iou": {},
-                    "seconds_per_frame": None,
-                })  # fmt: skip
-        folder.note(command=["zsp-lite", "benchmark"])
-        data = {"root": "made up", "categories": list(CATEGORIES), "pairs": 48, "targets": 5, "seed": seed}
-        summary = summarise_run(folder.records, pairs, data, "none")
-    (out / "summary.json").write_text(json.dumps(summary))
-    return summary
+        folder.begin({"command": ["zsp-lite", "benchmark"], "rows": rows, "categories": list(CATEGORIES)})
+        folder.add(
+            {
+                "pair": pair.key, "seconds": 1.0, "timings": {}, "saliency_iou": {},
+                "results": {name: {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "",
+                                   "inliers": 9}},
+            }
+            for name in rows for pair in pairs[name]
+        )  # fmt: skip
+    return read_results(out).summary
 
 
 @pytest.fixture(scope="module")
@@ -237,12 +238,12 @@ def test_the_papers_figures_were_copied_right():
 
 def test_a_run_in_one_file_gives_the_same_tables(run, tmp_path):
     out, summary = run
-    first = write_results(read_results(out), tmp_path / "results.json.gz")
+    first = export_results(read_results(out), tmp_path / "results.json.gz")
     again = read_results(first)
-    assert again.summary == summary and again.invocations == [{"command": ["zsp-lite", "benchmark"]}]
+    assert again.summary == summary and again.invocations[0]["command"] == ["zsp-lite", "benchmark"]
     errors = read_results(out).errors("ours")
     assert again.errors("ours") == pytest.approx(errors, abs=1e-4) and list(again.errors("ours")) == list(errors)
-    assert write_results(again, tmp_path / "again.json.gz").read_bytes() == first.read_bytes()
+    assert export_results(again, tmp_path / "again.json.gz").read_bytes() == first.read_bytes()
     with pytest.raises(InputError, match="nonesuch"):
         again.errors("nonesuch")
 
@@ -317,7 +318,7 @@ def test_a_run_of_an_earlier_version_gets_its_intervals_again(run, tmp_path):
     old = json.loads(json.dumps(results.summary))
     del old["intervals"]
     old["methods"]["ours"] |= {"acc30_ci": [0, 100], "flagged": 7}
-    path = write_results(replace(results, summary=old), tmp_path / "results.json.gz")
+    path = export_results(replace(results, summary=old), tmp_path / "results.json.gz")
     again = read_results(path).summary
     assert again["methods"]["ours"]["acc30_ci"] == pytest.approx(run[1]["methods"]["ours"]["acc30_ci"])
     assert again["methods"]["ours"]["flagged"] == 7 and again["intervals"]["resampled"] == "objects"
@@ -422,7 +423,7 @@ def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     right = rng.random(200) < sure
     rows = {f"chair/{i}": {"error": 5.0 if ok else 90.0, "confidence": c} for i, (c, ok) in enumerate(zip(sure, right))}
     both = {"ours": {"chair/0": {"error": 1.0}}, "verified": rows}
-    results = read_results(write_results(Results({}, {}, [], both), tmp_path / "results.json.gz"))
+    results = read_results(export_results(Results({}, {}, [], both), tmp_path / "results.json.gz"))
     assert results.confidences("ours") == {}
     np.testing.assert_allclose(list(results.confidences("verified").values()), sure, atol=1e-4)
     figure = reliability_diagram(results)

@@ -214,7 +214,7 @@ def assert_one_line(capsys) -> str:
 
 
 def test_benchmark_list_has_every_method_and_group(capsys):
-    from zsp_lite.benchmark.run import GROUPS, METHODS
+    from zsp_lite.benchmark.methods import GROUPS, METHODS
 
     assert cli.main(["benchmark", "--list"]) == 0
     lines = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.strip()}

@@ -10,7 +10,7 @@ from safetensors import safe_open
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.pretrained import TINY
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.run import random_backbone
+from zsp_lite.benchmark.extractors import random_backbone
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs

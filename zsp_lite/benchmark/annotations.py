@@ -17,7 +17,7 @@ _FRAMES_PER_SEQUENCE = 100
 _MEASURE = """
 import json, sys, time
 from pathlib import Path
-from zsp_lite.benchmark.annotations import process_memory
+from zsp_lite.benchmark.plan import process_memory
 from zsp_lite.data.co3d import Co3D
 
 before = process_memory("VmRSS")
@@ -30,23 +30,6 @@ sequence = time.perf_counter()
 print(json.dumps({"frames": len(keys), "seconds": opened - start, "sequence_seconds": sequence - opened,
                   "memory_mb": (process_memory("VmHWM") - before) / 2**20}))
 """
-
-
-def process_memory(field: str = "VmHWM") -> int:
-    """Bytes of memory of this process: "VmHWM", the most so far, or "VmRSS", now; 0 where the system does not say.
-
-    macOS knows the most alone, Windows neither.
-    """
-    try:
-        # ru_maxrss of a child starts at its parent's size on Linux; /proc knows this process alone.
-        status = Path("/proc/self/status").read_text()
-        return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith(f"{field}:")))
-    except (OSError, StopIteration):
-        try:
-            import resource
-        except ImportError:
-            return 0
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def annotation_benchmark(frames: int = 86_000) -> dict:

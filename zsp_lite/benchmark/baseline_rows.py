@@ -38,7 +38,7 @@ def sift(problem: Problem) -> Answer:
     """ "SIFT": the view whose mutual nearest neighbours are strongest, and RANSAC on their points."""
     reference, *targets = problem.frames()
     first: Keypoints
-    first, *others = problem.described("sift")
+    first, *others = problem.descriptions("sift")
     found = [mutual_matches(first, other, _K) for other in others]
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
@@ -57,7 +57,7 @@ def sift(problem: Problem) -> Answer:
 def posecontrast(problem: Problem, features: str = "posecontrast") -> Answer:
     """ "PoseContrast": the view most alike in its feature, and what takes the one absolute rotation to the other."""
     first: Viewpoint
-    first, *others = problem.described(features)
+    first, *others = problem.descriptions(features)
     alike = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
     view = int(np.argmax(alike))
     return Answer(others[view].rotation @ first.rotation.T, view)

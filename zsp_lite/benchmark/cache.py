@@ -1,6 +1,5 @@
-"""Feature maps on disk, named by what they are features of: any run with the same backbone and pictures finds them."""
+"""Feature maps on disk, shared between runs."""
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,34 +7,44 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from zsp_lite.benchmark.extractors import fingerprint
+from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.files import write_atomic
 
 _PARTS = ("keys", "saliency", "global_feature")
+_UNCACHED = ("rootsift",)  # computed faster than read
 
 
 class FeatureCache:
-    """A folder of feature maps in full precision, so that a run with it says what one without it would.
+    """A folder of feature maps in full precision: results with it equal those without it.
 
-    A file's name is a hash of the extractor (as `fingerprints` tells it) and of the crop's pixels: what changes either
-    changes the name, and nothing has ever to be cleared but for room. Extractors that
-    are not in `fingerprints`, and descriptions that are no FeatureMap, are not kept.
+    A file's name is a hash of the extractor and of its input: the crop's pixels, and for extractors with `describe`
+    also the depth, the mask and the camera. Only results of the type FeatureMap are kept.
+
+    Args:
+        folder: The folder; made where it does not exist.
+        extractors: By name (see `extractors`).
     """
 
-    def __init__(self, folder: str | Path, fingerprints: Mapping[str, str]):
-        self.folder, self.fingerprints = Path(folder), fingerprints
+    def __init__(self, folder: str | Path, extractors: Mapping[str, Any]):
+        self.folder, self.extractors = Path(folder), extractors
+        self._fingerprints = {name: fingerprint(one) for name, one in extractors.items() if name not in _UNCACHED}
 
     def path(self, features: str, frame: Frame) -> Path:
-        digest = hashlib.sha256(self.fingerprints[features].encode())
-        digest.update(repr(frame.rgb.shape).encode() + frame.rgb.tobytes())
-        name = digest.hexdigest()
+        """Return the file of a frame's features."""
+        seen = [frame.rgb]
+        if hasattr(self.extractors[features], "describe"):
+            camera = frame.camera
+            seen += [frame.depth, frame.mask, camera.R, camera.t, camera.focal_length, camera.principal_point]
+        name = digest_of((self._fingerprints[features], seen))
         return self.folder / name[:2] / f"{name}.safetensors"
 
     def read(self, features: str, frame: Frame) -> FeatureMap | None:
-        """The kept feature map, None where there is none or its file is damaged."""
-        if features not in self.fingerprints:
+        """Return the stored features, None if there are none or their file is damaged."""
+        if features not in self._fingerprints:
             return None
         try:
             tensors = load(self.path(features, frame).read_bytes())
@@ -44,7 +53,7 @@ class FeatureCache:
             return None
 
     def write(self, features: str, frame: Frame, found: Any) -> None:
-        """Keep a feature map."""
-        if features in self.fingerprints and isinstance(found, FeatureMap):
+        """Store features of the type FeatureMap."""
+        if features in self._fingerprints and isinstance(found, FeatureMap):
             tensors = {part: getattr(found, part).cpu().contiguous() for part in _PARTS}
             write_atomic(self.path(features, frame), save(tensors))

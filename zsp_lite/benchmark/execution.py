@@ -1,61 +1,156 @@
-"""Who does the jobs: this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
+"""Evaluate chunks of pairs in this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
 
-No scheduler of our own: an executor is given all jobs at once. Jobs travel as cloudpickle's bytes, so that methods
-and backbones defined in a notebook travel with them.
+A chunk is a few pairs of one category that share frames. Workers return the records of a whole chunk: what a killed
+run loses is the chunks that were being evaluated.
 """
 
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby, islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
-from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import cv2
+from threadpoolctl import threadpool_limits
 
-from zsp_lite.benchmark.jobs import Job, one_thread_each, records_of, run_job
-from zsp_lite.benchmark.methods import import_object
-from zsp_lite.benchmark.storage import PartReader, RunFolder
+from zsp_lite.backbones.load import BackboneConfig, load_backbone
+from zsp_lite.benchmark.cache import FeatureCache
+from zsp_lite.benchmark.evaluation import evaluate_pair
+from zsp_lite.benchmark.extractors import fingerprint, make_extractors
+from zsp_lite.benchmark.methods import Method, import_object
+from zsp_lite.benchmark.store import FrameStore, torch_threads
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 
-_POLL = 0.3  # seconds between looks at what workers have finished
-_PATIENCE = 15  # seconds to wait for a scheduler
+Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
+CHUNK_SIZE = 16  # pairs
+_DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
 @dataclass(frozen=True)
-class Crew:
-    """An executor with the number of its workers, and what it raises when one of them dies. None: this process."""
+class Setup:
+    """What all chunks of a run have in common; picklable.
+
+    Attributes:
+        root: The data.
+        methods: The rows by name.
+        backbone: What `load_backbone` takes, or an extractor.
+        fingerprint: Of the backbone that a worker must find under the name; None for any.
+        cache: Folder of feature maps, or None.
+        threads: Threads of torch during feature extraction.
+        keep_hypotheses: See `evaluate_pair`.
+    """
+
+    root: str
+    methods: Mapping[str, Method]
+    backbone: Any
+    fingerprint: str | None = None
+    cache: str | None = None
+    threads: int | None = None
+    keep_hypotheses: bool = False
+
+    def extractors(self) -> dict[str, Any]:
+        """Make the extractors of the rows. Raises InputError if the backbone's name stands for another one here."""
+        backbone = self.backbone
+        if isinstance(backbone, str | BackboneConfig):
+            backbone = load_backbone(backbone)
+            if self.fingerprint not in (None, found := fingerprint(backbone)):
+                raise InputError(f"backbone {self.backbone} is {found} on a worker, expected {self.fingerprint}")
+        return make_extractors(backbone, [method.features for method in self.methods.values()])
+
+
+class Evaluator:
+    """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
+
+    def __init__(self, setup: Setup, extractors: Mapping[str, Any] | None = None):
+        self.setup, self.extractors = setup, setup.extractors() if extractors is None else extractors
+        self._dataset = Co3D(setup.root)
+        self._cache = None if setup.cache is None else FeatureCache(setup.cache, self.extractors)
+        self._store: FrameStore | None = None
+
+    def records(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
+        """Evaluate the pairs of a chunk (see `evaluate_pair`)."""
+        category = chunk[0][0].category
+        if self._store is None or self._store.category != category:
+            self._store = FrameStore(self._dataset, category, self.extractors, self._cache, self.setup.threads)
+            self._labels = read_labels(self.setup.root, category)
+        for pair, names in chunk:
+            methods = {name: self.setup.methods[name] for name in names}
+            yield evaluate_pair(pair, methods, self._store, self._labels, self.setup.keep_hypotheses)
+
+
+def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
+    """Divide pairs of one category into chunks of about `size` pairs that share frames.
+
+    Pairs are ordered by target sequence. Pairs that differ only in the number of target views stay together. Where
+    possible, so do those of a target sequence.
+
+    Args:
+        pairs: The rows to evaluate on each pair.
+        size: Number of pairs.
+    """
+
+    def sequence(pair: Pair) -> tuple:
+        return (pair.target_sequence,)
+
+    def problem(pair: Pair) -> tuple:
+        return pair.target_sequence, pair.reference_sequence, pair.reference_frame
+
+    chunks: list[Chunk] = [[]]
+    ordered = sorted(pairs, key=lambda pair: (*problem(pair), len(pair.target_frames), pair.key))
+    for _, members in groupby(ordered, sequence):
+        problems = [list(one) for _, one in groupby(members, problem)]
+        if len(chunks[-1]) + sum(map(len, problems)) > size:
+            chunks.append([])
+        for one in problems:
+            if len(chunks[-1]) >= size:
+                chunks.append([])
+            chunks[-1] += [(pair, pairs[pair]) for pair in one]
+    return [chunk for chunk in chunks if chunk]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """An executor (None: this process), the number of its workers, and what it raises when one of them dies."""
 
     executor: Executor | None
-    workers: int
+    number: int
     deaths: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
 @contextmanager
-def open_crew(executor: Executor | str | None, workers: int = 1) -> Iterator[Crew]:
-    """The crew that is asked for, sent home afterwards.
+def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[Workers]:
+    """Open an executor, and close it after the block.
 
-    executor: None for this process, or, with workers > 1, a pool of so many; "dask://HOST:PORT"; "module:Class" of an
-    executor to be made with the number of workers; or an Executor, which stays open. Raises InputError for others.
+    Args:
+        executor: None for this process or, with number > 1, a process pool; "dask://HOST:PORT"; "module:Class" of an
+            executor that is called with the number of workers; or an Executor, which stays open.
+        number: Number of workers.
+
+    Raises:
+        InputError: If the executor is none of these, or cannot be reached.
     """
-    if workers < 1:
-        raise InputError(f"workers is {workers}, expected at least 1")
-    if executor is None:
-        if workers == 1:
-            yield Crew(None, 1)
-            return
-        with _process_pool(workers) as pool:
-            yield Crew(pool, workers)
+    if number < 1:
+        raise InputError(f"workers is {number}, expected at least 1")
+    if executor is None and number == 1:
+        yield Workers(None, 1)
+    elif executor is None:
+        with _process_pool(number) as pool:
+            yield Workers(pool, number)
     elif isinstance(executor, Executor):
-        yield Crew(executor, getattr(executor, "_max_workers", workers))
+        yield Workers(executor, getattr(executor, "_max_workers", number))
     elif executor.startswith("dask://"):
-        with _dask(executor.removeprefix("dask://")) as crew:
-            yield crew
+        with _dask(executor.removeprefix("dask://")) as workers:
+            yield workers
     else:
         try:
             made = import_object(executor)
@@ -63,69 +158,92 @@ def open_crew(executor: Executor | str | None, workers: int = 1) -> Iterator[Cre
             raise InputError(
                 f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor ({error})"
             ) from error
-        with made(workers) as opened:
-            yield Crew(opened, workers)
+        with made(number) as opened:
+            yield Workers(opened, number)
 
 
-def execute(jobs: Sequence[Job], crew: Crew, folder: RunFolder, extractors: Any, finished: Callable[[], None]) -> None:
-    """Have the jobs done; every record goes to the folder at once, and `finished` is called after it.
+def evaluate_chunks(
+    setup: Setup,
+    chunks: Sequence[Chunk],
+    workers: Workers,
+    save: Callable[[list[dict[str, Any]]], None],
+    extractors: Mapping[str, Any],
+) -> None:
+    """Evaluate chunks.
 
-    extractors: a function that gives this process's own, called only where it does the work itself.
-    Raises what a method or a damaged file raised, and InputError where a worker died.
+    Args:
+        setup: What they have in common.
+        chunks: Pairs and rows.
+        workers: Who evaluates them.
+        save: Called in this process with the records of each chunk, or of each pair where this process evaluates them.
+        extractors: Those of this process.
+
+    Raises:
+        InputError: If a worker dies, a file cannot be read, or a pose label is missing.
     """
-    if crew.executor is None:
-        with one_thread_each():
-            for job in jobs:
-                for record in records_of(job, extractors()):
-                    folder.add(record)
-                    finished()
+    if workers.executor is None:
+        evaluator = Evaluator(setup, extractors)
+        with one_thread():
+            for chunk in chunks:
+                for record in evaluator.records(chunk):
+                    save([record])
         return
-    jobs = [
-        replace(job, part=str((folder.parts / f"{job.category}-{number:04d}.jsonl").resolve()))
-        for number, job in enumerate(jobs)
-    ]
-    readers = {job.part: PartReader(Path(job.part)) for job in jobs}
-    pending = {crew.executor.submit(_run_pickled, cloudpickle.dumps(job)): job for job in jobs}
+    # cloudpickle: methods and backbones that are defined in a notebook travel by value.
+    pickled, waiting, running = cloudpickle.dumps(setup), iter(chunks), set[Future]()
     try:
-        while pending:
-            over, _ = wait(pending, timeout=_POLL, return_when=FIRST_COMPLETED)
-            for job in list(pending.values()):
-                _take(readers[job.part].read(), folder, finished)
-            for future in over:
-                job = pending.pop(future)
-                _take(future.result(), folder, finished)
-                Path(job.part).unlink(missing_ok=True)
-    except crew.deaths as error:
+        while True:
+            # Two chunks per worker keep it busy; more would fill queues with copies of the backbone.
+            for chunk in islice(waiting, 2 * workers.number - len(running)):
+                running.add(workers.executor.submit(_evaluate_chunk, pickled, chunk))
+            if not running:
+                return
+            finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
+            for future in finished:
+                save(future.result())
+    except workers.deaths as error:
         raise InputError(
-            "a worker ended abruptly, perhaps for want of memory; finished pairs are kept: run again to continue, "
-            f"with fewer workers than {crew.workers}"
+            "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
+            f"with fewer workers than {workers.number}"
         ) from error
     finally:
-        for future in pending:
+        for future in running:
             future.cancel()
 
 
-def default_threads(workers: int) -> int:
-    """This machine's cores, shared out among so many workers."""
-    # What a container or a batch system leaves us may be less than the machine has.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // workers)
+def available_cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    # A container or a batch system may grant fewer than the machine has.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _take(records: Sequence[dict], folder: RunFolder, finished: Callable[[], None]) -> None:
-    for record in records:
-        if folder.add(record):
-            finished()
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Restrict all libraries to one thread within a block: more are slower on small matrices, and disturb workers."""
+    cv2_threads = cv2.getNumThreads()
+    with threadpool_limits(1), torch_threads(1):
+        cv2.setNumThreads(1)
+        try:
+            yield
+        finally:
+            cv2.setNumThreads(cv2_threads)
 
 
-def _run_pickled(job: bytes) -> list[dict]:
-    return run_job(cloudpickle.loads(job))
+_worker = threading.local()  # an executor's workers may be threads
+
+
+def _evaluate_chunk(setup: bytes, chunk: Chunk) -> list[dict[str, Any]]:
+    """Evaluate a chunk in a worker, which keeps its evaluator for the next one."""
+    if getattr(_worker, "setup", None) != setup:
+        _worker.evaluator = Evaluator(cloudpickle.loads(setup))
+        _worker.setup = setup
+    with one_thread():
+        return list(_worker.evaluator.records(chunk))
 
 
 @contextmanager
 def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     before = set(active_children())
-    # Spawned, not forked: a fork of a process whose threads have computed already may hang.
+    # Spawned, not forked: a fork of a process whose threads have already computed may hang.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker)
     try:
         yield pool
@@ -138,7 +256,7 @@ def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _start_worker() -> None:
-    """A worker leaves interrupts to its parent, and does not outlive it (a killed parent cannot send it home)."""
+    """Leave interrupts to the parent process, and end when it ends (a killed parent cannot stop its workers)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
@@ -149,19 +267,19 @@ def _start_worker() -> None:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Crew]:
+def _dask(address: str) -> Iterator[Workers]:
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker
     except ImportError as error:
         raise InputError("executor dask://: needs Dask; pip install 'zsp-lite[cluster]'") from error
     try:
-        client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_PATIENCE)
+        client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_DASK_TIMEOUT)
     except (OSError, ValueError) as error:
         raise InputError(f"executor dask://{address}: no scheduler answers there ({error})") from error
     with client:
-        workers = sum(client.nthreads().values())
-        if workers == 0:
+        number = sum(client.nthreads().values())
+        if number == 0:
             raise InputError(f"executor dask://{address}: the scheduler has no workers, expected at least one")
-        # A job depends on files, so it is no pure function of its bytes.
-        yield Crew(client.get_executor(pure=False), workers, (BrokenExecutor, KilledWorker))
+        # A chunk depends on files: equal arguments need not give equal results.
+        yield Workers(client.get_executor(pure=False), number, (BrokenExecutor, KilledWorker))

@@ -1,9 +1,9 @@
-"""What a method is given of a pair, what it may answer, and the paper's method on it with all that can be shared."""
+"""What a benchmark row is given for a pair, and what it may return."""
 
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,20 +15,28 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+from zsp_lite.pipeline import Hypothesis, PoseEstimate, ZeroShotPose
 from zsp_lite.views import View
 
-# What is found out about an answer: no detail may go by one of these names.
-MEASURED = ("error", "failed", "translation_error", "scale", "view", "note")
+# Members of a stored result; an answer's details must have other names.
+RESERVED = ("error", "failed", "translation_error", "scale", "view", "note", "hypotheses")
+# Settings of ZeroShotPose that decide the matches: rows that agree in them share the matches.
+_MATCH_SETTINGS = ("k", "kmeans", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning")
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A pose of the reference object in a target view.
+    """Pose of the reference object in one of the target views.
 
-    rotation: from the reference's camera to that of target view `view` (an index).  translation: in the target's
-    unit, and scale: where the method knows them.  note: why not to trust it, "" for no reason.  details: figures
-    worth keeping with it, such as {"inliers": 12}; "timings" in it are seconds by stage.
+    Attributes:
+        rotation: From the reference's camera to the camera of the target view.
+        view: Index of the target view.
+        translation: In the target's unit, if the method estimates it.
+        scale: If the method estimates it.
+        note: Why not to trust the pose; "" for no reason.
+        details: Numbers and texts to store with the result, such as {"inliers": 12}. "timings" in it are seconds per
+            stage.
+        hypotheses: Ranked candidate poses, of solvers that have them.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -37,13 +45,44 @@ class Answer:
     scale: float | None = None
     note: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
+    hypotheses: tuple[Hypothesis, ...] = ()
+
+
+class Row(Protocol):
+    """A row of the benchmark's tables: any callable from a `Problem` to a pose.
+
+    A row that takes the pose of the target view whose global feature is most similar to the reference's:
+
+        def most_similar(problem):
+            feature = problem.reference.features.global_feature
+            cosines = [
+                torch.cosine_similarity(feature, target.features.global_feature, dim=0) for target in problem.targets
+            ]
+            return np.eye(3), int(np.argmax(cosines))
+
+        evaluate(data, "zsp-tiny", {"ours": "ours", "most similar": most_similar}, pairs=10)
+
+    or, on the command line, `zsp-lite benchmark --methods ours,my_module:most_similar`.
+    """
+
+    def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
+        """Estimate the pose of the reference object in one of the target views.
+
+        Returns:
+            An Answer, a PoseEstimate, or a Sim3 or a rotation (3, 3), alone (target view 0) or with the view's index.
+
+        Raises:
+            InputError: If there is no pose; the pair counts as failed, with an error of 180 degrees.
+        """
+        ...
 
 
 def as_answer(found: Any) -> Answer:
-    """An Answer from what methods return: itself, a PoseEstimate, a Sim3 or a rotation (of view 0), or (pose, view).
+    """Convert what a row returns to an Answer.
 
-    Raises InputError for anything else, for a matrix that is no rotation, and for details that are named like what is
-    measured or hold more than numbers and texts.
+    Raises:
+        InputError: If it is none of the types of `Row`, its matrix is not a rotation, or its details have reserved
+            names or other values than numbers and texts.
     """
     if isinstance(found, Answer):
         return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
@@ -51,7 +90,8 @@ def as_answer(found: Any) -> Answer:
         details = {"matches": len(found.matches), "inliers": int(found.inliers.sum()), "timings": found.timings}
         if found.confidence is not None:
             details["confidence"] = round(found.confidence, 4)
-        return Answer(found.sim3.R, found.view, found.sim3.t, found.sim3.scale, found.note, details)
+        sim3 = found.sim3
+        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
@@ -69,8 +109,10 @@ def _rotation(found: Any) -> Float[np.ndarray, "3 3"]:
 
 
 def _details(details: Mapping[str, Any]) -> dict[str, Any]:
-    if taken := sorted({*MEASURED} & details.keys()):
-        raise InputError(f"method's details name {', '.join(taken)}, expected other names than {', '.join(MEASURED)}")
+    if reserved := sorted({*RESERVED} & details.keys()):
+        raise InputError(
+            f"method's details name {', '.join(reserved)}, expected other names than {', '.join(RESERVED)}"
+        )
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in details.items()}
     for name, value in plain.items():
         if name != "timings" and not isinstance(value, bool | int | float | str | None):
@@ -78,81 +120,93 @@ def _details(details: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-class Problem:
-    """One pair as a method sees it: everything but the truth.
+def frame_keys(pair: Pair) -> list[FrameKey]:
+    """Return the frames of a pair, the reference first."""
+    targets = [(pair.target_sequence, number) for number in pair.target_frames]
+    return [(pair.reference_sequence, pair.reference_frame), *targets]
 
-    pair: which frames.  seed: what draws shall start from.  reference, targets: views with the run's backbone.
-    Whatever is asked for is worked out once and kept for the pair's other methods.
+
+class Problem:
+    """One pair as a method sees it: everything but the true pose. Results are computed once and shared by all methods.
+
+    Args:
+        pair: The frames.
+        store: Where they are read and their features computed.
+
+    Attributes:
+        pair: The frames.
+        seed: Seed for the method's random draws.
+        keys: (sequence, frame number) of the reference and of each target.
     """
 
     def __init__(self, pair: Pair, store: FrameStore):
-        self.pair, self.seed, self.store = pair, pair.seed, store
-        self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame)]
-        self.keys += [(pair.target_sequence, number) for number in pair.target_frames]
+        self.pair, self.seed, self.store, self.keys = pair, pair.seed, store, frame_keys(pair)
         self._shared: dict[tuple, Any] = {}
 
     @property
     def reference(self) -> View:
+        """The reference's crop with the features of the run's backbone."""
         return self.views()[0]
 
     @property
     def targets(self) -> list[View]:
+        """The targets' crops with the features of the run's backbone."""
         return self.views()[1:]
 
     def frames(self) -> list[Frame]:
-        """Object crops of the backbone's image size, the reference's first."""
+        """Return the object crops, the reference's first, resized to the backbone's input."""
         return [self.store.frame(key) for key in self.keys]
 
     def full_frames(self) -> list[Frame]:
-        """The frames as they are on disk, read anew."""
+        """Return the uncropped frames, the reference first."""
         return [self.store.full_frame(key) for key in self.keys]
 
-    def described(self, features: str = "backbone") -> list[Any]:
-        """What an extractor says of each crop."""
+    def descriptions(self, features: str = "backbone") -> list[Any]:
+        """Return what an extractor computes from each crop (see `extractors.EXTRACTORS`)."""
         return [self.store.describe(features, key) for key in self.keys]
 
     def views(
         self, features: str = "backbone", foreground: str = "saliency", saliency_threshold: float = 0.05
     ) -> list[View]:
-        """The crops with their features and foregrounds (see `views.frame_view`)."""
+        """Return the crops with their features and foregrounds (see `views.frame_view`)."""
         return [self.store.view(features, key, foreground, saliency_threshold) for key in self.keys]
 
     def first_cameras(self) -> tuple[Camera, Camera]:
-        """The cameras of the reference's and the target's first frame in their sequences."""
+        """Return the cameras of the first frame of the reference's and the target's sequence."""
         return self.store.first_camera(self.keys[0][0]), self.store.first_camera(self.keys[1][0])
 
     def estimate(
-        self, features: str = "backbone", settings: Mapping[str, Any] | None = None, only: int | None = None
+        self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
     ) -> PoseEstimate:
-        """The paper's method with other features or settings; `only` leaves it no other target view.
+        """Run the paper's method. Estimates that differ in later stages only share the matches.
 
-        Estimates that differ in their last stages alone share the first: similarities, then matches.
+        Args:
+            features: Name of the extractor.
+            settings: Settings of `ZeroShotPose` that differ from the defaults.
+            target: Index of the only target view to use; None uses all.
         """
         settings = dict(settings or {})
-        name = (features, only, tuple(sorted(settings.items(), key=lambda item: item[0])))
+        name = (features, target, tuple(sorted(settings.items(), key=lambda item: item[0])))
         if name not in self._shared:
             solver = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
-            self._shared[name] = self._estimate(features, solver, only)
+            self._shared[name] = self._estimate(features, solver, target)
         return self._shared[name]
 
-    def _estimate(self, features: str, solver: ZeroShotPose, only: int | None) -> PoseEstimate:
-        reference, *targets = self.views(features, solver.foreground, solver.saliency_threshold)
-        keys = self.keys[1:]
-        if only is not None:
-            keys, targets = keys[only : only + 1], targets[only : only + 1]
-        # What matches depend on; estimates that agree in it share them.
-        name = tuple(getattr(solver, part) for part in (
-            "k", "kmeans", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning",
-        ))  # fmt: skip
-        comparisons, seconds = [], 0.0
-        for key, target in zip(keys, targets, strict=True):
-            shared = ("comparison", features, key, name)
-            if shared not in self._shared:
-                sim = self.store.similarity(features, self.keys[0], key, solver, reference, target)
+    def _estimate(self, features: str, solver: ZeroShotPose, target: int | None) -> PoseEstimate:
+        reference, *views = self.views(features, solver.foreground, solver.saliency_threshold)
+        targets = list(zip(self.keys[1:], views))
+        if target is not None:
+            targets = [targets[target]]
+        settings = tuple(getattr(solver, name) for name in _MATCH_SETTINGS)
+        pairs, seconds = [], 0.0
+        for key, view in targets:
+            name = ("pair", features, key, settings)
+            if name not in self._shared:
+                sim = self.store.similarity(features, self.keys[0], key, solver, reference, view)
                 start = time.perf_counter()
-                found = solver.match_pair(reference, target, sim)
-                self._shared[shared] = found, time.perf_counter() - start
-            comparison, spent = self._shared[shared]
-            comparisons.append(comparison)
-            seconds += spent
-        return solver.estimate_from_pairs(reference, targets, comparisons, {"matching": seconds})
+                matched = solver.match_pair(reference, view, sim)
+                self._shared[name] = matched, time.perf_counter() - start
+            matched, matching_seconds = self._shared[name]
+            pairs.append(matched)
+            seconds += matching_seconds
+        return solver.estimate_from_pairs(reference, [view for _, view in targets], pairs, {"matching": seconds})

@@ -148,7 +148,7 @@ def ransac_by_loop(
 # A fresh interpreter: the peak of this one remembers everything that ran before.
 _MEMORY = """
 import json
-from zsp_lite.benchmark.annotations import process_memory
+from zsp_lite.benchmark.plan import process_memory
 from zsp_lite.benchmark.profile import estimate_once
 estimate_once()
 print(json.dumps(process_memory()))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsp_lite.benchmark.formats import write_tables
-from zsp_lite.benchmark.results import RESULTS, Results, read_runs, write_results
+from zsp_lite.benchmark.results import RESULTS, Results, export_results, read_runs
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.errors import InputError
 
@@ -31,7 +31,7 @@ def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None
     results = read_runs(paths)
     out = Path(out) if out is not None else paths[0] if paths[0].is_dir() else paths[0].parent
     if len(paths) > 1 or paths[0].is_dir():
-        write_results(results, out / RESULTS)
+        export_results(results, out / RESULTS)
     write_tables(every_table(results.summary), out / "tables")
     write_figures(results, out / "figures")
     return results

@@ -1,4 +1,4 @@
-"""Read finished runs again, from a folder or from one small file to commit, and pool several of them."""
+"""Read finished and interrupted runs, export them to one small file, and pool several of them."""
 
 import gzip
 import json
@@ -9,23 +9,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.benchmark.storage import PAIRS, SETTINGS, read_invocations, read_records
-from zsp_lite.benchmark.summary import INTERVALS, summarise_rows
+from zsp_lite.benchmark.database import Records, read_records, read_settings
+from zsp_lite.benchmark.summary import INTERVALS, category_of, summarise_rows, summarise_run
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 
 logger = logging.getLogger(__name__)
 
 RESULTS = "results.json.gz"
-# Beyond these decimals an error in degrees, or a length, says nothing.
-_DECIMALS = 4
-_KEPT = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
+_DECIMALS = 4  # of degrees and lengths in an export
+_EXPORTED = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
 
 
 @dataclass(frozen=True)
 class Results:
-    """summary: what OUT/summary.json says.  settings, invocations: of the run.  rows: by name and pair key, what each
-    row found: "error" in degrees, and where it has them "translation_error", "scale", "view", "inliers", "confidence".
+    """Results of a run.
+
+    Attributes:
+        summary: The content of summary.json.
+        settings: What decided the results (see `database.check_settings`).
+        invocations: Calls of `evaluate`.
+        rows: By row and pair key, what the row found: "error" in degrees, and where it has them "translation_error",
+            "scale", "view", "inliers", "confidence", "failed", "note".
     """
 
     summary: dict[str, Any]
@@ -34,48 +39,67 @@ class Results:
     rows: dict[str, dict[str, dict[str, Any]]]
 
     def errors(self, row: str) -> dict[str, float]:
-        """Rotation errors in degrees by pair key. Raises InputError for a row that the run has not."""
+        """Return rotation errors in degrees by pair key. Raises InputError for an unknown row."""
         if row not in self.rows:
             raise InputError(f"row {row!r} is not in the run, expected one of {', '.join(self.rows)}")
         return {key: found["error"] for key, found in self.rows[row].items()}
 
     def confidences(self, row: str) -> dict[str, float]:
-        """What the row's method thinks its chances are to be within 30 degrees, by pair key, where it says so."""
+        """Return the estimated probabilities of an error below 30 degrees by pair key, where the row has them."""
         return {key: one["confidence"] for key, one in self.rows.get(row, {}).items() if "confidence" in one}
 
 
+def results_of(settings: Mapping[str, Any], records: Records) -> Results:
+    """Summarise the rows and categories of the last call of `evaluate`, as far as they are finished.
+
+    Raises:
+        InputError: If no pair is finished.
+    """
+    call = records.invocations[-1] if records.invocations else {"rows": [], "categories": []}
+    place = {category: index for index, category in enumerate(call["categories"])}
+    rows = {}
+    for name in call["rows"]:
+        found = records.rows.get(name, {})
+        keys = sorted((place[category_of(key)], key) for key in found if category_of(key) in place)
+        if keys:
+            rows[name] = {key: found[key] for _, key in keys}
+    if not rows:
+        raise InputError(f"{settings['data']}: the run has no finished pair yet")
+    data = {
+        "root": settings["data"], "categories": call["categories"], "pairs": max(map(len, rows.values())),
+        "targets": settings["targets"], "seed": settings["seed"],
+    }  # fmt: skip
+    # A backbone's fingerprint is its name and a hash.
+    backbone = settings["backbone"].rpartition(" ")[0] or settings["backbone"]
+    summary = summarise_run(rows, records.evaluations, data, backbone)
+    return Results(summary, dict(settings), records.invocations, rows)
+
+
 def read_results(path: str | Path) -> Results:
-    """A run's folder or its `results.json.gz`. Raises InputError where it is neither, or has not been summed up yet."""
+    """Read a run from its folder, also where it was interrupted, or from its exported `results.json.gz`.
+
+    Raises:
+        InputError: If it is neither, or no pair is finished.
+    """
     path = Path(path)
     if path.is_dir():
-        if not (path / "summary.json").is_file():
-            raise InputError(f"{path} holds no summary.json; run the benchmark to its end first")
-        summary = _decode(read_bytes(path / "summary.json", "summary"), path / "summary.json")
-        settings = _decode(read_bytes(path / SETTINGS, "settings"), path / SETTINGS)
-        # What the summary is of: earlier calls may have left other rows, and other categories, in the folder.
-        try:
-            asked, categories = summary["methods"], summary["data"]["categories"]
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{path / 'summary.json'}: not a run's summary ({error})") from error
-        rows: dict[str, dict[str, dict]] = {}
-        for key, record in read_records(path / PAIRS, mend=False).items():
-            for name, found in record["methods"].items():
-                if name in asked and record["category"] in categories:
-                    rows.setdefault(name, {})[key] = {part: found[part] for part in _KEPT if found.get(part, "") != ""}
-        return Results(_with_object_intervals(summary, rows), settings, read_invocations(path), rows)
-    content = _decode(_inflate(read_bytes(path, "results"), path), path)
+        records = read_records(path)
+        return results_of(read_settings(path), records)
+    try:
+        content = json.loads(gzip.decompress(read_bytes(path, "results")))
+    except (OSError, EOFError, zlib.error, ValueError) as error:
+        raise InputError(f"results {path}: not a gzip file with JSON, or damaged ({error})") from error
     try:
         keys = content["pairs"]
         rows = {
             name: {
-                keys[index]: {part: row[part][i] for part in _KEPT if row.get(part) and row[part][i] is not None}
+                keys[index]: {part: row[part][i] for part in _EXPORTED if row.get(part) and row[part][i] is not None}
                 for i, index in enumerate(row["pair"])
             }
             for name, row in content["rows"].items()
         }
-        return Results(
-            _with_object_intervals(content["summary"], rows), content["settings"], content["invocations"], rows
-        )
+        summary = _with_object_intervals(content["summary"], rows)
+        return Results(summary, content["settings"], content["invocations"], rows)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(f"results {path}: not a run's results ({error})") from error
 
@@ -87,7 +111,7 @@ def read_runs(paths: Sequence[str | Path]) -> Results:
 
 
 def pool(runs: Sequence[Results]) -> Results:
-    """Pool runs of one benchmark on different objects, such as exports with different seeds, into one.
+    """Pool runs of one benchmark on different objects, such as folders of different seeds, into one.
 
     Rows that not all of the runs have are left out. Sequences of one category and name are one object.
 
@@ -103,11 +127,11 @@ def pool(runs: Sequence[Results]) -> Results:
         raise InputError(f"runs to pool have no row in common: {'; '.join(', '.join(run.rows) for run in runs)}")
     if missing := sorted({name for run in runs for name in run.rows} - set(names)):
         logger.warning("not in all runs, left out: %s", ", ".join(missing))
-    for what in ("backbone", "targets", *(("methods", name) for name in names)):
-        found = {str(_setting(run, what)) for run in runs}
-        if len(found) > 1:
-            label = what if isinstance(what, str) else f"row {what[1]}"
-            raise InputError(f"runs to pool differ in {label}: {', '.join(sorted(found))}")
+    compared = {name: [run.settings.get(name) for run in runs] for name in ("backbone", "targets")}
+    compared |= {f"row {name}": [run.settings.get("methods", {}).get(name) for run in runs] for name in names}
+    for what, values in compared.items():
+        if len(found := sorted(set(map(str, values)))) > 1:
+            raise InputError(f"runs to pool differ in {what}: {', '.join(found)}")
     rows: dict[str, dict[str, dict]] = {}
     for name in names:
         rows[name] = {key: found for run in runs for key, found in run.rows[name].items()}
@@ -115,10 +139,9 @@ def pool(runs: Sequence[Results]) -> Results:
             raise InputError(
                 f"runs to pool share {total - len(rows[name])} pairs of row {name}, expected other objects"
             )
-    categories = list(dict.fromkeys(category for run in runs for category in run.summary["data"]["categories"]))
     data = {
         "root": ", ".join(str(run.summary["data"]["root"]) for run in runs),
-        "categories": categories,
+        "categories": list(dict.fromkeys(category for run in runs for category in run.summary["data"]["categories"])),
         "pairs": sum(run.summary["data"]["pairs"] for run in runs),
         "targets": runs[0].summary["data"]["targets"],
         "runs": len(runs),
@@ -129,32 +152,16 @@ def pool(runs: Sequence[Results]) -> Results:
     return Results(summary, runs[0].settings, [one for run in runs for one in run.invocations], rows)
 
 
-def _setting(run: Results, what: str | tuple[str, str]) -> Any:
-    if isinstance(what, str):
-        return run.settings.get(what)
-    group, name = what
-    return run.settings.get(group, {}).get(name)
-
-
-def _with_object_intervals(summary: Mapping[str, Any], rows: Mapping[str, Mapping[str, dict]]) -> dict[str, Any]:
-    """The summary; one of an earlier version, which took pairs for independent, with its intervals computed again."""
-    if summary.get("intervals") == INTERVALS or not summary.get("methods"):
-        return dict(summary)
-    fresh = summarise_rows({name: rows[name] for name in summary["methods"]})
-    for name, row in fresh["methods"].items():  # earlier versions did not keep these by pair
-        row |= {part: summary["methods"][name][part] for part in ("failed", "flagged")}
-    return {**summary, **fresh}
-
-
-def write_results(results: Results, path: str | Path) -> Path:
-    """Write a run into one file, rounded to what means something; the same run gives the same bytes."""
+def export_results(results: Results, path: str | Path) -> Path:
+    """Write a run to one compressed JSON file, rounded to four decimals; equal runs give equal bytes."""
     keys = list(dict.fromkeys(key for row in results.rows.values() for key in row))
     index = {key: i for i, key in enumerate(keys)}
     rows = {}
     for name, row in results.rows.items():
         columns: dict[str, list] = {"pair": [index[key] for key in row]}
-        for part in _KEPT:
-            column = [_rounded(found.get(part)) for found in row.values()]
+        for part in _EXPORTED:
+            # No column for parts that the row does not have; an empty note is none.
+            column = [None if found.get(part) == "" else _rounded(found.get(part)) for found in row.values()]
             if any(value is not None for value in column):
                 columns[part] = column
         rows[name] = columns
@@ -162,8 +169,7 @@ def write_results(results: Results, path: str | Path) -> Path:
         "summary": results.summary, "settings": results.settings, "invocations": results.invocations,
         "pairs": keys, "rows": rows,
     }  # fmt: skip
-    data = json.dumps(content, separators=(",", ":")).encode()
-    write_atomic(path, gzip.compress(data, mtime=0))
+    write_atomic(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
     return Path(path)
 
 
@@ -171,18 +177,11 @@ def _rounded(value: Any) -> Any:
     return round(value, _DECIMALS) if isinstance(value, float) else value
 
 
-def _inflate(data: bytes, path: Path) -> bytes:
-    try:
-        return gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"results {path}: not a gzip file, or cut off ({error})") from error
-
-
-def _decode(data: bytes, path: Path) -> Mapping[str, Any]:
-    try:
-        content = json.loads(data)
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds a {type(content).__name__}, expected an object")
-    return content
+def _with_object_intervals(summary: Mapping[str, Any], rows: Mapping[str, Mapping[str, dict]]) -> dict[str, Any]:
+    """The summary; that of an earlier version, which took pairs for independent, with new intervals."""
+    if summary.get("intervals") == INTERVALS or not summary.get("methods"):
+        return dict(summary)
+    computed = summarise_rows({name: rows[name] for name in summary["methods"]})
+    for name, row in computed["methods"].items():  # earlier versions did not export these by pair
+        row |= {part: summary["methods"][name][part] for part in ("failed", "flagged")}
+    return {**summary, **computed}

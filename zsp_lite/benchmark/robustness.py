@@ -4,6 +4,7 @@ Crops and features stay as they are, so that every row of the table sees the sam
 Lengths are in units of the object's spread, the standard deviation of its points. Damage is drawn with the pair's seed.
 """
 
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -96,9 +97,9 @@ class Damaged:
 
     def __call__(self, problem: Problem) -> PoseEstimate:
         solver = ZeroShotPose(problem.store.extractors["backbone"], **self.settings, seed=problem.seed)
-        rng = np.random.default_rng([problem.seed % 2**32, len(self.damage)])
+        rng = np.random.default_rng([problem.seed % 2**32, zlib.crc32(self.damage.encode())])
         views = []
-        for index, (key, frame, features) in enumerate(zip(problem.keys, problem.frames(), problem.described())):
+        for index, (key, frame, features) in enumerate(zip(problem.keys, problem.frames(), problem.descriptions())):
             if self.damage == "clean":
                 frame = exact(frame, problem.store.dataset.root, problem.pair.category, key[0])
             else:

@@ -1,8 +1,7 @@
-"""A category's frames and what extractors say of them, each worked out once and dropped after its last use."""
+"""Frames of one category with their features, each computed once and kept while it is among the last used."""
 
 import time
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,29 +13,34 @@ from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import View, crop_size, frame_view, object_crop
+from zsp_lite.views import IMAGE_SIZE, View, crop_size, frame_view, object_crop
 
-FrameKey = tuple[str, int]  # sequence and frame number
+FrameKey = tuple[str, int]  # sequence name and frame number
+CAPACITY = 128  # frames in memory
 
 
 @dataclass
-class Spent:
-    """How often something was done, and the seconds that it took."""
+class _Entry:
+    """A frame's object crop with what has been computed from it."""
 
-    times: int = 0
-    seconds: float = 0.0
+    crop: Frame
+    descriptions: dict[str, Any] = field(default_factory=dict)
+    views: dict[tuple, View] = field(default_factory=dict)
 
 
 @dataclass
 class FrameStore:
-    """Frames of one category and their descriptions.
+    """Frames of one category and their features.
 
-    extractors: by name; each is called on a list of images, or, where it has `describe`, on a list of frames.
-    cache: where feature maps outlive the process, or None.  threads: of torch while it describes a frame, None for as
-    many as it has.  expected: how many more pairs will use a frame; it is forgotten after the last of them.
-    spent: what reading, each extractor and the similarities have cost so far.
+    Attributes:
+        dataset: The folder in CO3D's layout.
+        category: The category.
+        extractors: By name (see `extractors`).
+        cache: Feature maps on disk, or None.
+        threads: Threads of torch during feature extraction; None leaves them as they are.
+        timings: Seconds of every frame read ("reading"), every feature extraction (the extractor's name) and every
+            comparison of two frames ("similarity"), since the last `timings.clear()`.
     """
 
     dataset: Co3D
@@ -44,72 +48,48 @@ class FrameStore:
     extractors: Mapping[str, Any]
     cache: FeatureCache | None = None
     threads: int | None = None
-    expected: Counter[FrameKey] = field(default_factory=Counter)
-    spent: dict[str, Spent] = field(default_factory=dict)
-    _frames: dict[FrameKey, Frame | InputError] = field(default_factory=dict)
-    _described: dict[FrameKey, dict[str, Any]] = field(default_factory=dict)
-    _views: dict[FrameKey, dict[tuple, View]] = field(default_factory=dict)
+    timings: dict[str, list[float]] = field(default_factory=dict)
+    _entries: dict[FrameKey, _Entry] = field(default_factory=dict)
     _similarities: dict[tuple, Float[torch.Tensor, "n1 n2"]] = field(default_factory=dict)
     _first_cameras: dict[str, Camera] = field(default_factory=dict)
 
-    def load(self, keys: Iterable[FrameKey]) -> None:
-        """Read and crop frames. A file that cannot be read is an error; one without an object fails its pairs."""
-        for key in keys:
-            if key not in self._frames:
-                with self._timed("reading"):
-                    frame = self.full_frame(key)
-                    try:
-                        self._frames[key] = object_crop(frame, crop_size(self.extractors.get("backbone")))
-                    except InputError as error:
-                        self._frames[key] = error
-
-    def release(self, keys: Iterable[FrameKey]) -> None:
-        """A pair is done with these frames."""
-        for key in keys:
-            self.expected[key] -= 1
-            if self.expected[key] <= 0:
-                for kept in (self._frames, self._described, self._views):
-                    kept.pop(key, None)
-
-    def forget_similarities(self) -> None:
-        """The pairs that follow have another reference or another target sequence."""
-        self._similarities.clear()
+    def __post_init__(self):
+        backbone = self.extractors.get("backbone")  # rows such as "icp" and "sift" need none
+        self._size = IMAGE_SIZE if backbone is None else crop_size(backbone)
 
     def full_frame(self, key: FrameKey) -> Frame:
+        """Read a frame from disk, uncropped."""
         return self.dataset.load(self.dataset.frame(self.category, *key))
 
     def frame(self, key: FrameKey) -> Frame:
-        """The object crop. Raises InputError where the frame has no object."""
-        self.load([key])
-        frame = self._frames[key]
-        if isinstance(frame, InputError):
-            raise frame
-        return frame
+        """Return a frame's object crop, resized to the backbone's input."""
+        return self._entry(key).crop
 
     def first_camera(self, sequence: str) -> Camera:
-        """The camera of a sequence's first frame."""
+        """Return the camera of a sequence's first frame."""
         if sequence not in self._first_cameras:
             self._first_cameras[sequence] = self.dataset.camera(self.dataset.frames(self.category, sequence)[0])
         return self._first_cameras[sequence]
 
     def describe(self, features: str, key: FrameKey) -> Any:
-        """What an extractor says of a frame's crop."""
-        described = self._described.setdefault(key, {})
-        if features not in described:
-            described[features] = self._extract(features, self.frame(key))
-        return described[features]
+        """Return what an extractor computes from a frame's crop."""
+        descriptions = self._entry(key).descriptions
+        if features not in descriptions:
+            descriptions[features] = self._extract(features, self.frame(key))
+        return descriptions[features]
 
-    def described(self, features: str, key: FrameKey) -> Any | None:
-        """`describe`, where that was done already."""
-        return self._described.get(key, {}).get(features)
+    def description(self, features: str, key: FrameKey) -> Any | None:
+        """Return the result of an earlier `describe`, None if there is none."""
+        return self._entry(key).descriptions.get(features)
 
     def view(self, features: str, key: FrameKey, foreground: str, saliency_threshold: float) -> View:
-        views, name = self._views.setdefault(key, {}), (features, foreground, saliency_threshold)
+        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
+        views, name = self._entry(key).views, (features, foreground, saliency_threshold)
         if name not in views:
             feature_map = self.describe(features, key)
             views[name] = frame_view(self.frame(key), feature_map, foreground, saliency_threshold)
         view = views[name]
-        # The points depend on the frame and the grid alone: what one row has worked out, others need not.
+        # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
         for other in views.values():
             if "patch_points" in vars(other) and other.features.grid == view.features.grid:
                 vars(view).setdefault("patch_points", other.patch_points)
@@ -118,19 +98,32 @@ class FrameStore:
     def similarity(
         self, features: str, reference: FrameKey, target: FrameKey, solver: ZeroShotPose, first: View, second: View
     ) -> Float[torch.Tensor, "n1 n2"]:
-        """Similarities of two frames' patches, the same for all of the solver's other settings."""
-        name = (features, solver.binning, reference, target)
+        """Return the similarities of two frames' patches; those of the last reference and target sequence are kept."""
+        problem = (reference, target[0])
+        if any(known[:2] != problem for known in self._similarities):
+            self._similarities.clear()
+        name = (*problem, features, solver.binning, target)
         if name not in self._similarities:
             with self._timed("similarity"):
                 (self._similarities[name],) = solver.similarities(first, [second])
         return self._similarities[name]
 
+    def _entry(self, key: FrameKey) -> _Entry:
+        entry = self._entries.pop(key, None)
+        if entry is None:
+            with self._timed("reading"):
+                entry = _Entry(object_crop(self.full_frame(key), self._size))
+        self._entries[key] = entry  # the last used is the last in the dictionary
+        if len(self._entries) > CAPACITY:
+            del self._entries[next(iter(self._entries))]
+        return entry
+
     def _extract(self, features: str, frame: Frame) -> Any:
         extractor = self.extractors[features]
-        if self.cache is not None and (known := self.cache.read(features, frame)) is not None:
-            return known
-        # One frame at a time: a frame's features, to their last bit, must not depend on which others came with it.
-        with self._timed(features), _torch_threads(self.threads):
+        if self.cache is not None and (cached := self.cache.read(features, frame)) is not None:
+            return cached
+        # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+        with self._timed(features), torch_threads(self.threads):
             if hasattr(extractor, "describe"):
                 (found,) = extractor.describe([frame])
             else:
@@ -140,23 +133,20 @@ class FrameStore:
         return found
 
     @contextmanager
-    def _timed(self, what: str):
+    def _timed(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        spent = self.spent.setdefault(what, Spent())
-        spent.times += 1
-        spent.seconds += time.perf_counter() - start
+        self.timings.setdefault(stage, []).append(round(time.perf_counter() - start, 5))
 
 
 @contextmanager
-def _torch_threads(threads: int | None):
-    """Let torch use so many threads for a while."""
+def torch_threads(threads: int | None) -> Iterator[None]:
+    """Set the number of torch's threads within a block; None leaves it as it is."""
     before = torch.get_num_threads()
-    if threads is None or threads == before:
-        yield
-        return
-    torch.set_num_threads(threads)
+    if threads not in (None, before):
+        torch.set_num_threads(threads)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        if threads not in (None, before):
+            torch.set_num_threads(before)

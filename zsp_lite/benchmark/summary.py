@@ -6,41 +6,64 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.pairs import Pair
 from zsp_lite.metrics import (
     mean_category_median,
-    median,
     object_weights,
     paired_difference,
     sign_test,
     summarise,
 )
 
-# What the intervals of a summary are of; summaries of earlier versions have no such member, or another one.
+# Method of the intervals; summaries of earlier versions have no such member, or another one.
 INTERVALS = {"level": 0.95, "resampled": "objects"}
 
 
 def summarise_run(
-    records: Mapping[str, dict], pairs: Mapping[str, Sequence[Pair]], data: Mapping[str, Any], backbone: str
-) -> dict:
-    """Summarise finished pairs: figures per row and category, saliency, and median seconds per stage.
+    rows: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    evaluations: Mapping[str, Sequence[Mapping[str, Any]]],
+    data: Mapping[str, Any],
+    backbone: str,
+) -> dict[str, Any]:
+    """Summarise a run.
 
     Args:
-        records: By the pairs' keys.
-        pairs: The pairs of each row, in one order for all rows of as many target views.
-        data: What the run was of.
+        rows: By row and pair key, what the row found (see `evaluate_pair`).
+        evaluations: By pair key, cost and foreground IoU of each evaluation (see `evaluate_pair`).
+        data: What was evaluated.
         backbone: Its name.
 
     Returns:
-        {"methods": see `summarise_rows`, "against_ours": see `against_ours`, "saliency_iou": mean over the frames used,
-        "timings": median seconds, "cost": seconds of the whole run, and of "ours" by itself}.
+        {"data", "backbone", "methods", "against_ours" and "intervals": see `summarise_rows`, "saliency_iou": mean over
+        the frames, by category and "mean", "timings": median seconds per stage of the first row, per frame and per
+        comparison of two frames, "cost": seconds of all rows, of "ours" alone, and their ratio}.
     """
-    results = {name: {pair.key: records[pair.key]["methods"][name] for pair in found} for name, found in pairs.items()}
-    used = [records[pair.key] for pair in dict.fromkeys(pair for found in pairs.values() for pair in found)]
-    summary = {"data": dict(data), "backbone": backbone, **summarise_rows(results), "saliency_iou": _saliency(used)}
-    summary["timings"] = _timings(used, list(next(iter(results.values())).values()))
-    if cost := _cost(records, used, pairs):
-        summary["cost"] = cost
+    keys = dict.fromkeys(key for row in rows.values() for key in row)
+    used = {key: evaluations[key] for key in keys if key in evaluations}
+    summary = {"data": dict(data), "backbone": backbone, **summarise_rows(rows), "saliency_iou": _saliency_iou(used)}
+    seconds: dict[str, list[float]] = {}
+    for one in (one for found in used.values() for one in found):
+        for stage, values in one["timings"].items():
+            seconds.setdefault(stage, []).extend(values)
+    first = [found["timings"] for found in next(iter(rows.values()), {}).values() if "timings" in found]
+    timings = {stage: float(np.median([one.get(stage, 0.0) for one in first])) for stage in (first[0] if first else ())}
+    for stage, name in (
+        ("backbone", "features_per_frame"),
+        ("reading", "reading_each"),
+        ("similarity", "similarity_each"),
+    ):
+        if stage in seconds:
+            timings[name] = float(np.median(seconds[stage]))
+    summary["timings"] = timings
+    if "ours" in rows and {"backbone", "reading", "similarity"} <= seconds.keys():
+        mean = {stage: float(np.mean(values)) for stage, values in seconds.items()}
+        frames = {frame for key in rows["ours"] for frame in frames_of(key)}
+        views = sum(len(frames_of(key)) - 1 for key in rows["ours"])
+        alone = len(frames) * (mean["reading"] + mean["backbone"]) + views * mean["similarity"]
+        alone += sum(sum(found.get("timings", {}).values()) for found in rows["ours"].values())
+        total = sum(one["seconds"] for found in used.values() for one in found)
+        summary["cost"] = {
+            "all_rows": round(total, 3), "ours_alone": round(alone, 3), "ratio": round(total / alone, 3)
+        }  # fmt: skip
     return summary
 
 
@@ -91,18 +114,25 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
 
 
 def category_of(key: str) -> str:
-    """The category that a pair's key names."""
+    """Return the category in a pair's key."""
     return key.split("/")[0]
 
 
 def objects_of(key: str) -> tuple[str, str]:
-    """The two objects, CATEGORY/SEQUENCE of the reference and of the target, that a pair's key names."""
+    """Return the two objects in a pair's key, CATEGORY/SEQUENCE of the reference and of the target."""
     category, reference, target = key.split("/")
     return f"{category}/{reference.rpartition(':')[0]}", f"{category}/{target.rpartition(':')[0]}"
 
 
+def frames_of(key: str) -> list[tuple[str, str]]:
+    """Return the frames in a pair's key, (CATEGORY/SEQUENCE, frame number), the reference first."""
+    reference, target = objects_of(key)
+    numbers = key.rpartition(":")[2].split(",")
+    return [(reference, key.split("/")[1].rpartition(":")[2]), *((target, number) for number in numbers)]
+
+
 def weights_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
-    """Bootstrap weights of the pairs with these keys, from resampled objects."""
+    """Draw bootstrap weights of the pairs with these keys, from resampled objects."""
     keys = list(keys)
     return object_weights([objects_of(key) for key in keys], [category_of(key) for key in keys])
 
@@ -118,50 +148,10 @@ def _problem(key: str) -> str:
     return key.rpartition(":")[0]
 
 
-def _saliency(records: Sequence[dict]) -> dict[str, float]:
+def _saliency_iou(evaluations: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, float]:
     by_category: dict[str, dict[str, float]] = {}
-    for record in records:
-        by_category.setdefault(record["category"], {}).update(record["saliency_iou"])
-    saliency = {category: float(np.mean(list(frames.values()))) for category, frames in by_category.items() if frames}
-    return saliency | {"mean": float(np.mean(list(saliency.values())))} if saliency else {}
-
-
-def _timings(records: Sequence[dict], first: Sequence[dict]) -> dict[str, float]:
-    """Median seconds of each stage of the first row, of describing a frame, and of comparing two."""
-    timed = [one["timings"] for one in first if "timings" in one]
-    stages = [stage for stage in (timed[0] if timed else ()) if all(stage in timing for timing in timed)]
-    timings = {stage: float(median([timing[stage] for timing in timed])) for stage in stages}
-    frame_seconds = [record["seconds_per_frame"] for record in records if record.get("seconds_per_frame")]
-    if frame_seconds:
-        timings["features_per_frame"] = float(median(frame_seconds))
-    for name in ("reading", "similarity"):
-        if (each := _seconds_each(records, name)) is not None:
-            timings[f"{name}_each"] = each
-    return timings
-
-
-def _cost(records: Mapping[str, dict], used: Sequence[dict], pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
-    """Seconds of work in all rows, and of "ours" alone, from what reading, describing, comparing and it have cost."""
-    whole = sum(record.get("seconds", 0.0) for record in used)
-    each = {name: _seconds_each(used, name) for name in ("reading", "backbone", "similarity")}
-    if "ours" not in pairs or whole == 0 or None in each.values():
-        return {}
-    ours = [records[pair.key]["methods"]["ours"] for pair in pairs["ours"]]
-    frames = {
-        (pair.category, *key)
-        for pair in pairs["ours"]
-        for key in [
-            (pair.reference_sequence, pair.reference_frame),
-            *((pair.target_sequence, number) for number in pair.target_frames),
-        ]
-    }
-    views = sum(len(pair.target_frames) for pair in pairs["ours"])
-    alone = len(frames) * (each["reading"] + each["backbone"]) + views * each["similarity"]
-    alone += sum(sum(one.get("timings", {}).values()) for one in ours)
-    return {"all_rows": round(whole, 3), "ours_alone": round(alone, 3), "ratio": round(whole / alone, 3)}
-
-
-def _seconds_each(records: Sequence[dict], name: str) -> float | None:
-    spent = [record["spent"][name] for record in records if name in record.get("spent", {})]
-    times = sum(one[0] for one in spent)
-    return sum(one[1] for one in spent) / times if times else None
+    for key, found in evaluations.items():
+        for one in found:
+            by_category.setdefault(category_of(key), {}).update(one["saliency_iou"])
+    means = {category: float(np.mean(list(frames.values()))) for category, frames in by_category.items() if frames}
+    return means | {"mean": float(np.mean(list(means.values())))} if means else {}

@@ -56,12 +56,20 @@ _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
     help="Threads per worker during feature extraction.",
 )  # fmt: skip
 @click.option("--cache", type=PATH, metavar="DIR", help="Folder that keeps features for other runs.")
+@click.option(
+    "--keep-hypotheses",
+    is_flag=True,
+    help="Store the ranked candidate poses of the verified solver, with their scores, terms and errors.",
+)
+@click.option(
+    "--allow-other-version", is_flag=True, help="Continue a run of another version of zsp-lite; run.json lists both."
+)
 @click.option("--plan", is_flag=True, help="Print the expected time, memory and disk space, and exit.")
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data: Path | None, categories: list[str] | None, pairs: int, targets: int, methods: list[str], list_only: bool,
-    seed: int, out: Path, workers: int, executor: str | None, threads: int | None, cache: Path | None, plan: bool,
-    quiet: bool, **backbone,
+    seed: int, out: Path, workers: int, executor: str | None, threads: int | None, cache: Path | None,
+    keep_hypotheses: bool, allow_other_version: bool, plan: bool, quiet: bool, **backbone,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -81,8 +89,8 @@ def benchmark(
     root = data_folders(data)[0][1]
     config = backbone_config(**backbone)
     if plan:
-        for line in plan_run(root, config, methods, pairs, targets, seed, out, categories).lines(workers):
-            print(line)
+        planned = plan_run(root, config, methods, pairs, targets, seed, out, categories, allow_other_version)
+        print("\n".join(planned.lines(workers)))
         return None
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
@@ -98,7 +106,7 @@ def benchmark(
 
         summary = evaluate(
             root, config, methods, pairs, targets, seed, out, categories, progress, executor=executor, workers=workers,
-            threads=threads, cache=cache,
+            threads=threads, cache=cache, keep_hypotheses=keep_hypotheses, allow_other_version=allow_other_version,
         )  # fmt: skip
     write_reports(out)
     if quiet:

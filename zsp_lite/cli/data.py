@@ -128,19 +128,19 @@ def check(root: Path, deep: bool, show: int) -> int:
     The exit code is 1 if there is any problem.
     """
     from rich.console import Console
+    from rich.filesize import decimal
     from rich.table import Table
     from tqdm import tqdm
 
-    from zsp_lite.benchmark.plan import size
     from zsp_lite.data.check import check_folder
 
     checks = check_folder(root, deep, lambda names: tqdm(names, "checking", disable=None))
-    table = Table(title=f"{root}: {len(checks)} categories, {size(sum(check.size for check in checks))}")
+    table = Table(title=f"{root}: {len(checks)} categories, {decimal(sum(check.size for check in checks))}")
     for column in ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk"):
         table.add_column(column, justify="left" if column in ("category", "layout") else "right", no_wrap=True)
     for check in checks:
         counts = (check.sequences, check.complete, check.labelled, check.usable, check.pairs, check.frames)
-        table.add_row(check.category, check.layout, *(f"{count:,}" for count in counts), size(check.size))
+        table.add_row(check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size))
     Console(width=max(Console().width, 100)).print(table)
     for check in checks:
         for problem in check.problems[:show]:
