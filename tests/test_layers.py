@@ -1,0 +1,123 @@
+"""The direction of imports: no module imports from a layer above its own, and no modules import each other."""
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import zsp_lite
+
+PACKAGE = Path(zsp_lite.__file__).parent
+
+# From the bottom to the top. A module imports from lower layers and from its own subpackage only. Imports inside
+# functions, which delay the loading of large libraries, follow the same rule.
+LAYERS = [
+    "errors",
+    "io alignment features matchers metrics minimal",
+    "data",
+    "matching views",
+    "best_view points",
+    "pipeline backbones",
+    "demo verified labelling importers synthetic baselines",
+    "viz training",
+    "benchmark",
+    "widgets",
+    "cli",
+    "__main__",
+]
+LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
+
+
+def read_sources() -> dict[str, str]:
+    """Read the source of every module of the package but its `__init__`, by dotted name without "zsp_lite."."""
+    sources = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
+        if name != "__init__":
+            sources[name] = path.read_text(encoding="utf-8")
+    return sources
+
+
+def imports(source: str, modules: set[str], module_level: bool = False) -> Iterator[tuple[str, int]]:
+    """Find the modules of the package that a source imports, each with its line.
+
+    `module_level` leaves out imports inside functions and for type checkers, which do not run when the module is
+    imported.
+    """
+    nodes = [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"line {node.lineno}: relative import, expected the full name"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            late = isinstance(node, ast.FunctionDef) or (
+                isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+            )
+            if not (module_level and late):
+                nodes.extend(ast.iter_child_nodes(node))
+            continue
+        for name in names:
+            name = name.removeprefix("zsp_lite.")
+            while name and name not in modules:  # a function or a class: the module that holds it
+                name = name.rpartition(".")[0]
+            if name:
+                yield name, node.lineno
+
+
+def upward_imports(sources: dict[str, str]) -> list[str]:
+    """List the imports from a higher layer, or from another name of the same layer."""
+    found = []
+    for module, source in sources.items():
+        own = module.partition(".")[0]
+        for imported, line in imports(source, set(sources)):
+            other = imported.partition(".")[0]
+            if other != own and LAYER_OF[other] >= LAYER_OF[own]:
+                found.append(f"zsp_lite.{module}, line {line}, imports zsp_lite.{imported}: {other} is not below {own}")
+    return found
+
+
+def circle(sources: dict[str, str]) -> list[str]:
+    """Find modules that import each other at module level; the first and the last of the list are equal."""
+    graph = {
+        module: {name for name, _ in imports(source, set(sources), module_level=True)} - {module}
+        for module, source in sources.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_every_module_has_a_layer():
+    names = {module.partition(".")[0] for module in read_sources()}
+    assert names == set(LAYER_OF)
+
+
+def test_no_module_imports_upwards():
+    assert upward_imports(read_sources()) == []
+
+
+def test_no_modules_import_each_other():
+    assert circle(read_sources()) == []
+
+
+def test_a_planted_upward_import_is_named():
+    sources = read_sources()
+    sources["best_view"] += "\ndef late():\n    from zsp_lite.pipeline import ZeroShotPose\n"
+    (message,) = upward_imports(sources)
+    assert (
+        "zsp_lite.best_view, line" in message
+        and "imports zsp_lite.pipeline: pipeline is not below best_view" in message
+    )
+
+
+def test_a_planted_circle_is_named():
+    sources = read_sources()
+    sources["data.cameras"] += "\nimport zsp_lite.data.frames\n"
+    assert {"data.cameras", "data.frames"} <= set(circle(sources))
+    sources["data.cameras"] = "def late():\n    import zsp_lite.data.frames\n"
+    assert circle(sources) == []
