@@ -13,8 +13,9 @@ from zsp_lite.errors import InputError
 pytest.importorskip("ipywidgets", reason="widgets need ipywidgets: pip install 'zsp-lite[notebooks]'")
 matplotlib.use("agg")
 
-from zsp_lite.widgets import common, examples  # noqa: E402
-from zsp_lite.widgets.__main__ import control_values, latency, main  # noqa: E402
+from tools import widget_examples as examples
+from tools.widget_latency import control_values, latency, main  # noqa: E402
+from zsp_lite.widgets import common  # noqa: E402
 
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
@@ -79,7 +80,7 @@ def test_the_latency_is_measured_for_each_control_and_restores_its_value():
 
 
 def test_the_command_prints_a_line_for_each_control(monkeypatch, capsys):
-    monkeypatch.setattr("zsp_lite.widgets.__main__.latency", lambda widget, clock=None: {"pairs": 200.0, "gain": 3.0})
+    monkeypatch.setattr("tools.widget_latency.latency", lambda widget, clock=None: {"pairs": 200.0, "gain": 3.0})
     with pytest.raises(SystemExit) as stop:
         main(["measured_accuracy"])
     first, second = capsys.readouterr().out.splitlines()

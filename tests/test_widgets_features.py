@@ -12,7 +12,8 @@ from zsp_lite.synthetic.ground_truth import correct_matches
 pytest.importorskip("ipywidgets", reason="widgets need ipywidgets: pip install 'zsp-lite[notebooks]'")
 matplotlib.use("agg")
 
-from zsp_lite.widgets import examples, features  # noqa: E402
+from tools import widget_examples as examples
+from zsp_lite.widgets import features  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from zsp_lite.metrics import rotation_error
 
 pytest.importorskip("anywidget", reason="the labelling widget needs anywidget: pip install 'zsp-lite[notebooks]'")
 
+from tools.widget_examples import label_poses as label_example  # noqa: E402
 from zsp_lite.widgets import cloud_view  # noqa: E402
 from zsp_lite.widgets.cloud_view import ViewBox, point_under, subsample  # noqa: E402
-from zsp_lite.widgets.examples import label_poses as label_example  # noqa: E402
 from zsp_lite.widgets.labelling import label_poses  # noqa: E402
 
 TURN = Rotation.random(random_state=4).as_matrix()

@@ -1,6 +1,6 @@
 """The widget that segments the object in a box."""
 
-from zsp_lite.widgets.examples import box_to_mask
+from tools.widget_examples import box_to_mask
 
 
 def test_the_mask_follows_the_box():

@@ -7,8 +7,8 @@ from zsp_lite.errors import InputError
 
 pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip install 'zsp-lite[notebooks]'")
 
-from zsp_lite.widgets.examples import ranked_hypotheses as example
-from zsp_lite.widgets.examples import sample_solution
+from tools.widget_examples import ranked_hypotheses as example
+from tools.widget_examples import sample_solution
 from zsp_lite.widgets.verified import ranked_hypotheses
 
 

@@ -10,7 +10,8 @@ from zsp_lite.errors import InputError
 
 pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip install 'zsp-lite[notebooks]'")
 
-from zsp_lite.widgets import examples, views
+from tools import widget_examples as examples
+from zsp_lite.widgets import views
 from zsp_lite.widgets.views import best_view, evenly_spaced, match_canvas, viewpoints_from_above
 
 

@@ -1,11 +1,12 @@
 """Checkpoint files of vision transformers in the DINO layout."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 from safetensors import safe_open
-from torch import Tensor
+from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -86,17 +87,35 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: st
         num_heads = dim // 64
     with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
         model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
-    expected = {key: tuple(x.shape) for key, x in model.state_dict().items()}
-    found = {key: tuple(x.shape) for key, x in weights.items()}
-    wrong = sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
+    load_weights(model, weights, name)
+    return model
+
+
+def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ignored: Sequence[str] = ()) -> None:
+    """Load a state dict into a module, as float32.
+
+    Args:
+        model: The module.
+        weights: The state dict.
+        name: Name for error messages.
+        ignored: Prefixes of keys that are not loaded.
+
+    Raises:
+        InputError: A key is missing, unknown or of another shape, or a weight is not of finite floats.
+    """
+    state = model.state_dict()
+    weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
+    expected, found = ({key: tuple(x.shape) for key, x in tensors.items()} for tensors in (state, weights))
+    # Older checkpoints have no counter of the batches in batch normalisation, which inference does not use.
+    counters = {key for key in expected.keys() - found.keys() if key.endswith("num_batches_tracked")}
+    wrong = sorted(key for key in (expected.keys() | found.keys()) - counters if expected.get(key) != found.get(key))
     if wrong:
         key = wrong[0]
         raise InputError(
-            f"{name}: {len(wrong)} weights do not fit the DINO layout, first {key}: "
+            f"{name}: {len(wrong)} weights do not fit the architecture, first {key}: "
             f"expected {expected.get(key, 'none')}, got {found.get(key, 'none')}"
         )
     for key, x in weights.items():
-        if not x.is_floating_point() or not bool(x.isfinite().all()):
+        if state[key].is_floating_point() and not (x.is_floating_point() and bool(x.isfinite().all())):
             raise InputError(f"{name}: {key} contains values that are not finite floats")
-    model.load_state_dict({key: x.to(torch.float32) for key, x in weights.items()}, strict=True, assign=True)
-    return model
+    model.load_state_dict({key: x.to(state[key].dtype) for key, x in weights.items()}, strict=False, assign=True)

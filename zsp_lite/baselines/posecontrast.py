@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from zsp_lite.backbones.backbone import normalize, prepare_images
-from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig, load_weights
+from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
+from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder

@@ -3,14 +3,11 @@
 Written here because no CPU build of torchvision matches the pinned torch.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-
-from zsp_lite.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -106,33 +103,3 @@ class _Block(nn.Module):
             if i < self.convolutions:
                 x = torch.relu(x)
         return torch.relu(x + shortcut)
-
-
-def load_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str, ignored: Sequence[str] = ()) -> None:
-    """Load a state dict into a module, as float32.
-
-    Args:
-        module: The module.
-        weights: The state dict.
-        name: Name for error messages.
-        ignored: Prefixes of keys that are not loaded.
-
-    Raises:
-        InputError: A key is missing, unknown or of another shape, or holds values that are not finite.
-    """
-    weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))} if ignored else dict(weights)
-    expected = {key: tuple(x.shape) for key, x in module.state_dict().items()}
-    found = {key: tuple(x.shape) for key, x in weights.items()}
-    # Older checkpoints have no counter of the batches in batch normalisation, which inference does not use.
-    counters = {key for key in expected.keys() - found.keys() if key.endswith("num_batches_tracked")}
-    wrong = sorted(key for key in (expected.keys() | found.keys()) - counters if expected.get(key) != found.get(key))
-    if wrong:
-        key = wrong[0]
-        raise InputError(
-            f"{name}: {len(wrong)} weights do not fit, first {key}: expected {expected.get(key, 'none')}, "
-            f"got {found.get(key, 'none')}"
-        )
-    for key, x in weights.items():
-        if not bool(x.isfinite().all()):
-            raise InputError(f"{name}: {key} holds values that are not finite")
-    module.load_state_dict({key: x.to(torch.float32) for key, x in weights.items()}, strict=False)

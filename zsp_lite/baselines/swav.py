@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from zsp_lite.backbones.backbone import Image, normalize, prepare_images
-from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.baselines.resnet import TINY, ResNet, load_weights
+from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
+from zsp_lite.baselines.resnet import TINY, ResNet
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.download import cache_folder, fetch

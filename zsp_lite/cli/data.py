@@ -210,9 +210,7 @@ def transfer(source: Path, target: Path, category: str, max_residual: float, rep
     help="Bounding box of the object in the first image in pixels: top, left, height, width. GrabCut segments the "
     "object in all images.",
 )  # fmt: skip
-@click.option(
-    "--masks", type=PATH, metavar="DIR", help="Folder of mask files named like the images, instead of --box."
-)
+@click.option("--masks", type=PATH, metavar="DIR", help="Folder of mask files named like the images, instead of --box.")
 @click.option("--frames", type=COUNT, metavar="N", default=100, help="Maximum number of frames, evenly spaced.")
 @click.option(
     "--intrinsics", type=four_numbers, metavar="FX,FY,CX,CY", show_default="those of the TUM benchmark",

@@ -76,7 +76,7 @@ def export_preset(
         progress: Wraps the loop over sequences, as tqdm does.
 
     Raises:
-        InputError: If the preset is unknown, and as for `export_categories`.
+        InputError: The preset is unknown, and as for `export_categories`.
     """
     if preset not in PRESETS:
         raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
@@ -122,7 +122,7 @@ def export_categories(
         progress: Wraps the loop over sequences, as tqdm does.
 
     Raises:
-        InputError: If a category or the layout is unknown, or the folder was written with other settings.
+        InputError: A category or the layout is unknown, or the folder was written with other settings.
     """
     categories = list(dict.fromkeys(name for given in categories for name in SPLITS.get(given, [given])))
     for category in categories:
@@ -176,7 +176,7 @@ def make_object(category: str, sequence: str, seed: int) -> Shape:
         seed: Seed of the export.
 
     Raises:
-        InputError: If an export with this seed has no such sequence.
+        InputError: An export with this seed has no such sequence.
     """
     index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
     if category not in GENERATORS or index < 0 or sequence != sequence_name(seed, category, index):

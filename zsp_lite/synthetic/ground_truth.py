@@ -88,7 +88,7 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
         Sequence name to pose.
 
     Raises:
-        InputError: If the folder is not a synthetic export, or a file of the export is damaged.
+        InputError: The folder is not a synthetic export, or a file of the export is damaged.
     """
     settings, poses = dataset.root / SETTINGS_FILE, dataset.root / category / POSES_FILE
     for path in (settings, poses):
@@ -118,7 +118,7 @@ def patch_coordinates(
         of the patch has depth, and the point is inside the box.
 
     Raises:
-        InputError: If the frame has no depth or no mask.
+        InputError: The frame has no depth or no mask.
     """
     if frame.depth is None or frame.mask is None:
         raise InputError(f"{frame.name or 'frame'}: expected a depth map and a mask for the coordinates of its patches")
@@ -172,7 +172,7 @@ def ground_truth_pair(dataset: Co3D, pair: Pair, grid: tuple[int, int] = (28, 28
         grid: Patches (rows, columns).
 
     Raises:
-        InputError: If the folder is not a synthetic export, or lacks a frame of the pair.
+        InputError: The folder is not a synthetic export, or lacks a frame of the pair.
     """
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)

@@ -11,7 +11,7 @@ from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
-from zsp_lite.widgets.common import interactive_figure, load_ipywidgets, slider
+from zsp_lite.widgets.common import interactive_figure, load_package, slider
 from zsp_lite.widgets.views import match_canvas
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def ransac_settings(
         truth: True rotation, if known.
 
     Raises:
-        InputError: If the numbers of matches differ, or are less than four.
+        InputError: The numbers of matches differ, or are less than four.
     """
     source, target = (np.asarray(part, np.float64) for part in points)
     if not (len(source) == len(target) == len(pixels[0]) == len(pixels[1]) >= 4):
@@ -74,7 +74,7 @@ def ransac_settings(
         text = f"{inliers.sum()} of {n} matches are inliers; scale {sim3.scale:.2f}"
         return text + (f"; rotation error {rotation_error(sim3.R, truth):.0f}°." if truth is not None else ".")
 
-    widgets = load_ipywidgets()
+    widgets = load_package()
     controls = {
         "trials": widgets.SelectionSlider(options=_TRIALS, value=1000, description="trials"),
         "threshold": slider("threshold", 0.02, 1.0, 0.2, 0.02),

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Real, UInt8
 
 from zsp_lite.errors import InputError
+from zsp_lite.widgets.common import load_package
 
 if TYPE_CHECKING:
     from anywidget import AnyWidget
@@ -38,7 +39,7 @@ class ViewBox:
         """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers.
 
         Raises:
-            InputError: If the cloud is empty, not finite, or a single point.
+            InputError: The cloud is empty, not finite, or a single point.
         """
         points = np.asarray(points, dtype=np.float64)
         if len(points) == 0 or not np.isfinite(points).all():
@@ -172,25 +173,9 @@ class CloudView:
             self.on_pick(None if found is None else self._cloud[found])
 
 
-def load_anywidget() -> Any:
-    """Return the module anywidget.
-
-    Raises:
-        InputError: If it is not installed, with the command that installs it.
-    """
-    try:
-        import anywidget
-    except ImportError as error:
-        raise InputError(
-            "clickable point clouds need anywidget, which is not installed; pip install anywidget "
-            "(or 'zsp-lite[notebooks]')"
-        ) from error
-    return anywidget
-
-
 @cache
 def _cloud_widget() -> "type[AnyWidget]":
-    anywidget = load_anywidget()
+    anywidget = load_package("anywidget")
     from traitlets import Bytes, Float, Int, List, Unicode
 
     class CloudCanvas(anywidget.AnyWidget):

@@ -7,14 +7,15 @@ How to write a widget:
 - Its `update` callback is called when a control moves. It only changes existing artists (`set_data`, `set_offsets`,
   `set_text`, `set_visible`). Expensive results are computed before, not in `update`.
 - `update` returns a caption with the numbers that the figure shows, also for readers who cannot see it or its colours.
-- The latency of a control should be at most 150 ms (`python -m zsp_lite.widgets` measures it). Keep figures below about
-  9 by 4 inches.
+- The latency of a control should be at most 150 ms (`python -m tools.widget_latency` measures it). Keep figures below
+  about 9 by 4 inches.
 - The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen by sliders, which
   work by keyboard.
 - The notebook shows a static figure as well (`show`), because widgets need a running kernel.
-- Add an example on sample data to `zsp_lite.widgets.examples`.
+- Add an example on sample data to `tools/widget_examples.py`.
 """
 
+import importlib
 from collections.abc import Callable, Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -37,24 +38,23 @@ if TYPE_CHECKING:
 _LABEL = {"description_width": "initial"}
 
 
-def load_ipywidgets() -> Any:
-    """Return the module ipywidgets.
+def load_package(name: str = "ipywidgets") -> Any:
+    """Import a package that only the notebooks need.
 
     Raises:
-        InputError: If it is not installed, with the command that installs it.
+        InputError: It is not installed; the message has the command that installs it.
     """
     try:
-        import ipywidgets
+        return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            "widgets need ipywidgets, which is not installed; pip install ipywidgets (or 'zsp-lite[notebooks]')"
+            f"this widget needs {name}, which is not installed; pip install {name} (or 'zsp-lite[notebooks]')"
         ) from error
-    return ipywidgets
 
 
 def slider(label: str, low: float, high: float, value: float, step: float = 1) -> "ValueWidget":
     """Return a slider from `low` to `high`, with integer values if all four numbers are integers."""
-    widgets = load_ipywidgets()
+    widgets = load_package()
     integer = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
     kind = widgets.IntSlider if integer else widgets.FloatSlider
     form = {} if integer else {"readout_format": f".{max(0, -int(np.floor(np.log10(step))))}f"}
@@ -68,7 +68,7 @@ def patch_slider(label: str, cells: int, value: int) -> "ValueWidget":
 
 def choice(label: str, options: list[str], value: str | None = None) -> "ValueWidget":
     """Return a menu; the initial value is the first option by default."""
-    widgets = load_ipywidgets()
+    widgets = load_package()
     return widgets.Dropdown(options=options, value=value or options[0], description=label, style=_LABEL)
 
 
@@ -88,9 +88,9 @@ def interactive_figure(
         `redraw()`.
 
     Raises:
-        InputError: If ipywidgets is not installed.
+        InputError: ipywidgets is not installed.
     """
-    widgets = load_ipywidgets()
+    widgets = load_package()
     plt.close(figure)  # otherwise the notebook shows it a second time
     canvas = FigureCanvasAgg(figure)
     picture = widgets.Image(format="png", layout={"max_width": "100%", "object_fit": "contain"})

@@ -44,7 +44,7 @@ def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, s
         (layer, facet) to features; the first token is CLS.
 
     Raises:
-        InputError: If the backbone has another layout (Hugging Face's format).
+        InputError: The backbone has another layout (Hugging Face's format).
     """
     model = backbone.model
     if not isinstance(model, VisionTransformer):

@@ -37,7 +37,7 @@ def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> "VB
         field for the name of a keypoint).
 
     Raises:
-        InputError: If ipywidgets or anywidget is not installed.
+        InputError: ipywidgets or anywidget is not installed.
     """
     return _LabellingWidget(labelling, backbone).panel.box
 

@@ -9,7 +9,7 @@ import numpy as np
 from zsp_lite.labelling.keypoints import Alignment
 from zsp_lite.labelling.session import ACCEPTED, OPEN, SKIPPED, Progress
 from zsp_lite.widgets.cloud_view import CloudView
-from zsp_lite.widgets.common import load_ipywidgets
+from zsp_lite.widgets.common import load_package
 
 NEW_KEYPOINT = -1  # value of the keypoint menu for a keypoint that is not picked yet
 
@@ -57,7 +57,7 @@ class Panel:
             on_change: Called with the name of a control after its value has changed.
             on_button: Called with the name of a button.
         """
-        widgets = load_ipywidgets()
+        widgets = load_package()
         options = [(f"{sequences[0]} (reference)", sequences[0]), *((name, name) for name in sequences[1:])]
         style = {"description_width": "initial"}
         self.views = {

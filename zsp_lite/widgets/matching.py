@@ -18,7 +18,7 @@ from zsp_lite.viz import plots
 from zsp_lite.widgets.common import (
     choice,
     interactive_figure,
-    load_ipywidgets,
+    load_package,
     patch_heatmap,
     patch_outline,
     patch_slider,
@@ -159,6 +159,6 @@ def matches(
 
     controls = {
         "matcher": choice("matcher", ["cyclical", *MATCHERS]), "k": slider("K", 5, 100, 50, 5),
-        "kmeans": load_ipywidgets().Checkbox(value=True, description="k-means on the best 2K", indent=False),
+        "kmeans": load_package().Checkbox(value=True, description="k-means on the best 2K", indent=False),
     }  # fmt: skip
     return interactive_figure(figure, controls, update, "Two objects and lines between matched patches.")

@@ -99,7 +99,7 @@ def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
         clouds: Name to point cloud, centred, z up, in scene units; about a thousand points each.
 
     Raises:
-        InputError: If there are no clouds.
+        InputError: There are no clouds.
     """
     if not clouds:
         raise InputError("no clouds, expected at least one")

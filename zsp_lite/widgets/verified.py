@@ -36,7 +36,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Sc
         weights: Weights of the solver.
 
     Raises:
-        InputError: If the number of target views is not that of the solution.
+        InputError: The number of target views is not that of the solution.
     """
     used = sorted(solution.view_order)
     if len(targets) != len(solution.view_angles):

@@ -57,7 +57,7 @@ def match_canvas(axis: Axes, first: np.ndarray, second: np.ndarray, titles: tupl
     """Draw two images (H, W, 3) side by side, prepared for the lines of matches.
 
     Raises:
-        InputError: If the images have different sizes.
+        InputError: The images have different sizes.
     """
     if first.shape != second.shape:
         raise InputError(f"images have shapes {first.shape} and {second.shape}, expected equal shapes")
@@ -95,7 +95,7 @@ def viewpoints_from_above(
         Unit vectors from the mean camera centre towards the cameras, and towards the other centres.
 
     Raises:
-        InputError: If there are fewer than three cameras, or their centres are on a line.
+        InputError: There are fewer than three cameras, or their centres are on a line.
     """
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
     mean = centres.mean(axis=0) if len(centres) else np.zeros(3)
@@ -134,7 +134,7 @@ def best_view(
         angles: True rotation in degrees between each target view and the reference.
 
     Raises:
-        InputError: If the numbers of views differ.
+        InputError: The numbers of views differ.
     """
     n = len(targets)
     if not (n == len(pairs) == len(positions[0]) == len(angles) > 0):

@@ -1,4 +1,4 @@
-"""Measure the latency of every widget: `python -m zsp_lite.widgets [NAME ...]`."""
+"""Measure the latency of every widget: `python -m tools.widget_latency [NAME ...]`, from the root of the repository."""
 
 import sys
 import time
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from tools.widget_examples import WIDGETS
 from zsp_lite.errors import InputError
-from zsp_lite.widgets.examples import WIDGETS
 
 if TYPE_CHECKING:
     from ipywidgets import ValueWidget, VBox

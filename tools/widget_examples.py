@@ -1,4 +1,4 @@
-"""Every widget on sample data, for tests and for measuring the latency."""
+"""Every widget on sample data, for the tests and for `tools/widget_latency.py`."""
 
 import shutil
 from collections.abc import Callable
