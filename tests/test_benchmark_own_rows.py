@@ -177,7 +177,7 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     "answer, told",
     [
         (Answer(2 * np.eye(3)), "not a rotation"),
-        (Answer(np.eye(3), details={"error": 1.0}), "details name error"),
+        (Answer(np.eye(3), details={"error": 1.0}), "details have reserved names: error"),
         (Answer(np.eye(3), details={"matches": np.arange(3)}), "matches is a ndarray"),
     ],
 )

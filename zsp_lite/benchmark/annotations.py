@@ -1,4 +1,4 @@
-"""What it costs to open the largest kind of category: time and memory beyond the JSON itself."""
+"""Time and memory to open a category of the size of the largest ones in CO3D."""
 
 import gzip
 import json
@@ -13,7 +13,7 @@ from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
 
 _FRAMES_PER_SEQUENCE = 100
 
-# Runs in a fresh interpreter: memory that an earlier step has freed would hide what opening needs.
+# Runs in a new process, because memory freed by earlier steps would hide the peak.
 _MEASURE = """
 import json, sys, time
 from pathlib import Path
@@ -33,12 +33,15 @@ print(json.dumps({"frames": len(keys), "seconds": opened - start, "sequence_seco
 
 
 def annotation_benchmark(frames: int = 86_000) -> dict:
-    """Open a made-up category of `frames` annotated frames in a fresh process and measure.
+    """Open a generated category in a new process and measure time and memory; needs Linux or macOS.
 
-    Returns `frames`; `seconds` to open the category (decompress and index it); `sequence_seconds` to decode
-    one sequence of it; `json_mb`, the size of the decompressed JSON; `memory_mb`, the process's peak beyond
-    what it had before; and `extra_memory_mb`, that peak less the JSON itself. A
-    megabyte is 2^20 bytes. Needs Linux or macOS.
+    Args:
+        frames: Number of annotated frames.
+
+    Returns:
+        {"frames", "seconds": to open the category (decompress and index it), "sequence_seconds": to decode one
+        sequence, "json_mb": size of the JSON, "memory_mb": increase of the peak memory, "extra_memory_mb": that
+        increase minus the size of the JSON}. A megabyte is 2^20 bytes.
     """
     with tempfile.TemporaryDirectory() as root:
         size = _write_category(Path(root), frames)
@@ -49,7 +52,7 @@ def annotation_benchmark(frames: int = 86_000) -> dict:
 
 
 def _write_category(root: Path, frames: int) -> int:
-    """Frame annotations the size of CO3D v1's, about 1.2 kB each; returns the JSON's length in bytes."""
+    """Write frame annotations of the size of CO3D v1's, about 1.2 kB each; returns the size of the JSON in bytes."""
     rng = np.random.default_rng(0)
     folder = root / "category"
     folder.mkdir()
@@ -65,7 +68,7 @@ def _write_category(root: Path, frames: int) -> int:
 
 
 def _entry(index: int, draws: list[float]) -> dict:
-    """A frame annotation with as many digits as real ones have; what its numbers say does not matter here."""
+    """Return a frame annotation with random numbers of the usual number of digits."""
     sequence, number = divmod(index, _FRAMES_PER_SEQUENCE)
     name = f"{100 + sequence // 7}_{10000 + 37 * sequence}_{20000 + 53 * sequence}"
     stem = f"category/{name}/%s/frame{number + 1:06d}%s"
@@ -86,7 +89,7 @@ def _entry(index: int, draws: list[float]) -> dict:
             "focal_length": [abs(draws[14]) + 1, abs(draws[15]) + 1],
             "principal_point": draws[16:18],
         },
-        # Members that the reader does not know, as later versions have them: they cost time to skip.
+        # Fields of later versions that the reader skips, which takes time.
         "meta": {
             "frame_type": "train_known",
             "frame_splits": [

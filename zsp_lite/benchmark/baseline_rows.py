@@ -1,4 +1,4 @@
-"""The paper's baselines as rows of the benchmark: from a problem to an answer (sec. 5.2 and supplement)."""
+"""The paper's baselines as rows of the benchmark (sec. 5.2 and supplement)."""
 
 import numpy as np
 import torch
@@ -16,12 +16,12 @@ _K = 50
 
 
 def icp(problem: Problem) -> Answer:
-    """ "ICP": the reference's camera is taken to stand where that of the first target frame stands."""
+    """Run "ICP": the reference and the first target view start with equal camera poses."""
     return _icp(problem, 0)
 
 
 def icp_best_view(problem: Problem) -> Answer:
-    """ "ICP + BV": it is taken to stand where that of the best view stands, as our method sees it."""
+    """Run "ICP + BV": the reference and the best view of the paper's method start with equal camera poses."""
     return _icp(problem, problem.estimate().view)
 
 
@@ -30,12 +30,12 @@ def _icp(problem: Problem, view: int) -> Answer:
     try:
         sim3 = align(reference, targets, view, problem.first_cameras(), problem.seed)
     except InputError as error:
-        return Answer(np.eye(3), view, note=f"pose is that of the camera it starts from: {error}")
+        return Answer(np.eye(3), view, note=f"pose is the initial one, not a fit: {error}")
     return Answer(sim3.R, view, sim3.t, sim3.scale)
 
 
 def sift(problem: Problem) -> Answer:
-    """ "SIFT": the view whose mutual nearest neighbours are strongest, and RANSAC on their points."""
+    """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
     reference, *targets = problem.frames()
     first: Keypoints
     first, *others = problem.descriptions("sift")
@@ -55,14 +55,14 @@ def sift(problem: Problem) -> Answer:
 
 
 def posecontrast(problem: Problem, features: str = "posecontrast") -> Answer:
-    """ "PoseContrast": the view most alike in its feature, and what takes the one absolute rotation to the other."""
+    """Run "PoseContrast": the relative rotation of the viewpoints of the reference and the most similar view."""
     first: Viewpoint
     first, *others = problem.descriptions(features)
-    alike = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
-    view = int(np.argmax(alike))
+    similarity = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
+    view = int(np.argmax(similarity))
     return Answer(others[view].rotation @ first.rotation.T, view)
 
 
 def posecontrast_tiny(problem: Problem) -> Answer:
-    """The same with this project's small counterpart."""
+    """Run `posecontrast` with the small network of this project."""
     return posecontrast(problem, "posecontrast-tiny")

@@ -7,7 +7,7 @@ Tables of run.sqlite; the last column of each holds JSON:
     invocations  each call of `evaluate`: command, versions, machine, rows, categories, seconds
 
 The process that started the run is the only one that writes. It holds SQLite's exclusive lock, which the operating
-system releases when the process ends, however it ends.
+system releases when the process ends.
 """
 
 import json

@@ -120,7 +120,7 @@ def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list
 
 @dataclass(frozen=True)
 class Workers:
-    """An executor (None: this process), the number of its workers, and what it raises when one of them dies."""
+    """An executor (None: this process), the number of its workers, and the exceptions raised if a worker dies."""
 
     executor: Executor | None
     number: int
@@ -174,7 +174,7 @@ def evaluate_chunks(
     Args:
         setup: What they have in common.
         chunks: Pairs and rows.
-        workers: Who evaluates them.
+        workers: Executor.
         save: Called in this process with the records of each chunk, or of each pair where this process evaluates them.
         extractors: Those of this process.
 
@@ -256,7 +256,7 @@ def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _start_worker() -> None:
-    """Leave interrupts to the parent process, and end when it ends (a killed parent cannot stop its workers)."""
+    """Ignore interrupts, which the parent process handles, and end when the parent ends, even if it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

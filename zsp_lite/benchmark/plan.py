@@ -1,4 +1,4 @@
-"""What a run would take: frames, pairs, memory and disk space, and its time from a calibration of a few seconds."""
+"""Estimate of a run before it starts: frames, pairs, memory, disk space, and time by a calibration of a few seconds."""
 
 import sys
 import time
@@ -29,18 +29,18 @@ _START_SECONDS = 6.0  # until a worker's interpreter has loaded the backbone
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run would take.
+    """Estimated cost of a run.
 
     Attributes:
         frames: Number of frames to read and extract features from.
         pairs: Number of pairs, of any number of target views.
         estimates: Number of rows over all pairs.
-        memory: Bytes per worker; 0 where the system does not tell.
+        memory: Bytes per worker; 0 if the system does not report it.
         results_bytes: Disk space of the results.
         cache_bytes: Disk space of a feature cache.
         frame_seconds: Mean time to read a frame and extract its features, with one worker.
         pair_seconds: Mean time of a pair's rows, with one worker.
-        cores: Of this machine.
+        cores: Number of cores of this machine.
         calibration: What was timed.
     """
 
@@ -140,10 +140,10 @@ def make_plan(
 
 
 def process_memory(field: str = "VmHWM") -> int:
-    """Return memory of this process in bytes, 0 where the system does not tell.
+    """Return the memory of this process in bytes, 0 if the system does not report it.
 
     Args:
-        field: "VmHWM" for the peak, "VmRSS" for the current value. macOS tells the peak only, Windows neither.
+        field: "VmHWM" for the peak, "VmRSS" for the current value. macOS reports only the peak, Windows neither.
     """
     try:
         # ru_maxrss of a child process starts at its parent's size on Linux; /proc does not.
@@ -158,7 +158,7 @@ def process_memory(field: str = "VmHWM") -> int:
 
 
 def _views(pair: Pair, names: list[str]) -> int:
-    """Target views of a pair over all rows: the time of the rows is about proportional to it."""
+    """Count the target views of a pair over all rows; the time of the rows is about proportional to it."""
     return len(pair.target_frames) * len(names)
 
 

@@ -1,4 +1,4 @@
-"""What a benchmark row is given for a pair, and what it may return."""
+"""Argument and results of a benchmark row: `Problem` and `Answer`."""
 
 import time
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class Answer:
         view: Index of the target view.
         translation: In the target's unit, if the method estimates it.
         scale: If the method estimates it.
-        note: Why not to trust the pose; "" for no reason.
+        note: Warning about the pose; "" for none.
         details: Numbers and texts to store with the result, such as {"inliers": 12}. "timings" in it are seconds per
             stage.
         hypotheses: Ranked candidate poses, of solvers that have them.
@@ -111,7 +111,7 @@ def _rotation(found: Any) -> Float[np.ndarray, "3 3"]:
 def _details(details: Mapping[str, Any]) -> dict[str, Any]:
     if reserved := sorted({*RESERVED} & details.keys()):
         raise InputError(
-            f"method's details name {', '.join(reserved)}, expected other names than {', '.join(RESERVED)}"
+            f"method's details have reserved names: {', '.join(reserved)}, expected none of {', '.join(RESERVED)}"
         )
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in details.items()}
     for name, value in plain.items():

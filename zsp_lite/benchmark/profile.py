@@ -1,7 +1,7 @@
-"""What one estimate costs, stage by stage, and what the algebra saves against the plain loops.
+"""Time and memory of one estimate by stage, and comparison of fast implementations with plain Python loops.
 
-Runs with random weights in the shape of dino_vits8: time does not depend on what they are. The images are
-noise-textured ellipsoids with masks and holed depth, so that every stage has its usual amount of work.
+The backbone is dino_vits8 with random weights, because the time does not depend on them. The images show textured
+ellipsoids with masks and incomplete depth, so that every stage has its usual amount of work.
 """
 
 import json
@@ -33,7 +33,16 @@ N_TARGETS = 5
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure. `limit` is what it has to keep: at most where `at_most`, else at least; None for none."""
+    """One measurement.
+
+    Attributes:
+        name: What was measured.
+        value: The result.
+        unit: Its unit.
+        limit: Required value, or None.
+        at_most: Whether the limit is an upper one.
+        note: Further information.
+    """
 
     name: str
     value: float
@@ -44,7 +53,7 @@ class Row:
 
     @property
     def kept(self) -> bool:
-        """Whether the figure keeps its limit (it does where there is none)."""
+        """Whether the limit is met; True without a limit."""
         if self.limit is None:
             return True
         return self.value <= self.limit if self.at_most else self.value >= self.limit
@@ -56,11 +65,11 @@ class Row:
 
 
 def profile(repeats: int = 5) -> Iterator[Row]:
-    """All measurements, each as soon as it is done; medians over `repeats` runs."""
+    """Yield all measurements; times are medians over `repeats` runs."""
     if repeats < 1:
         raise InputError(f"repeats is {repeats}, expected at least 1")
     if hasattr(os, "getloadavg"):
-        yield Row("load average before", os.getloadavg()[0], "processes", note="limits: for an idle machine")
+        yield Row("load average before", os.getloadavg()[0], "processes", note="the limits are for an idle machine")
     yield from stage_rows(repeats)
     yield verified_row(repeats)
     yield from similarity_rows(repeats)
@@ -70,10 +79,10 @@ def profile(repeats: int = 5) -> Iterator[Row]:
 
 
 def stage_rows(repeats: int = 5) -> list[Row]:
-    """Median seconds of each stage of one estimate (N = 5, K = 50), and all but the forward as a share of it."""
+    """Measure each stage of an estimate (N = 5, K = 50), and all others relative to the forward pass."""
     method = ZeroShotPose(random_vits8())
     reference, *targets = made_up_frames(1 + N_TARGETS)
-    method.estimate(reference, targets)  # the first run pays for allocations and lazy imports
+    method.estimate(reference, targets)  # the first run includes allocations and lazy imports
     runs = [method.estimate(reference, targets).timings for _ in range(repeats)]
     stages = {stage: float(np.median([run[stage] for run in runs])) for stage in runs[0]}
     rest = [sum(run.values()) / run["features"] - 1 for run in runs]
@@ -81,23 +90,23 @@ def stage_rows(repeats: int = 5) -> list[Row]:
     names = {"features": "ViT forward, 6 images"}
     rows = [Row(names.get(name, name), 1000 * value, "ms", note=threads) for name, value in stages.items()]
     share = 100 * float(np.median(rest))
-    return [*rows, Row("everything but the forward, share of it", share, "%", 25, note="N = 5, K = 50")]
+    return [*rows, Row("all other stages, relative to the forward", share, "%", 25, note="N = 5, K = 50")]
 
 
 def verified_row(repeats: int = 5) -> Row:
-    """Median milliseconds of all stages of the verified solver that follow features, similarities and matches."""
+    """Measure the verified solver without feature extraction, similarities and matching."""
     method = ZeroShotPose(random_vits8(), foreground="mask", solver="verified")
     reference, *targets = method.views(made_up_frames(1 + N_TARGETS))
     compared = [method.match_pair(reference, *one) for one in zip(targets, method.similarities(reference, targets))]
     (seconds,) = _median_seconds([lambda: method.estimate_from_pairs(reference, targets, compared)], repeats)
-    note = f"beyond features, similarities and matches; {torch.get_num_threads()} threads"
+    note = f"without features, similarities and matches; {torch.get_num_threads()} threads"
     return Row(f"verified solver, N = {N_TARGETS}", 1000 * seconds, "ms", 300, note=note)
 
 
 def similarity_rows(repeats: int = 5, tokens: int = 8) -> list[Row]:
-    """The log-binned similarity of a reference with 5 targets, against a cosine per token of materialised descriptors.
+    """Compare the log-binned similarity of a reference with 5 targets to a loop over the reference's descriptors.
 
-    The loop is timed on `tokens` of the 784 reference tokens and scaled up; making the descriptors is not counted.
+    The loop is timed on `tokens` of the 784 descriptors and scaled; computing the descriptors is not included.
     """
     generator = torch.Generator().manual_seed(0)
     keys = [torch.randn(28, 28, 384, generator=generator) for _ in range(1 + N_TARGETS)]
@@ -116,7 +125,7 @@ def similarity_rows(repeats: int = 5, tokens: int = 8) -> list[Row]:
 
 
 def ransac_rows(repeats: int = 5) -> list[Row]:
-    """RANSAC on 50 points with 60 % outliers, 1,000 trials, against a loop over the trials."""
+    """Compare RANSAC (50 points, 60 % outliers, 1,000 trials) to a loop over the trials."""
     rng = np.random.default_rng(0)
     source = rng.normal(size=(50, 3))
     target = source + 0.02 * rng.normal(size=(50, 3))
@@ -132,7 +141,7 @@ def ransac_rows(repeats: int = 5) -> list[Row]:
 def ransac_by_loop(
     source: np.ndarray, target: np.ndarray, threshold: float = 0.2, trials: int = 1000, seed: int = 0
 ) -> np.ndarray:
-    """RANSAC as one writes it down, with the same fit: sample, fit, count, keep the best.  Returns the inliers (N,)."""
+    """Run RANSAC as a plain loop over the trials; returns the inliers (N,) of the best one."""
     rng = np.random.default_rng(seed)
     best = np.zeros(len(source), dtype=bool)
     for _ in range(trials):
@@ -145,7 +154,7 @@ def ransac_by_loop(
     return best
 
 
-# A fresh interpreter: the peak of this one remembers everything that ran before.
+# Runs in a new process, because the peak of this one includes everything that ran before.
 _MEMORY = """
 import json
 from zsp_lite.benchmark.plan import process_memory
@@ -156,22 +165,22 @@ print(json.dumps(process_memory()))
 
 
 def memory_row() -> Row:
-    """Peak memory of a process that imports the library, builds dino_vits8 and makes one estimate (N = 5)."""
+    """Measure the peak memory of a process that imports the library, builds dino_vits8 and estimates one pose."""
     done = subprocess.run([sys.executable, "-c", _MEMORY], capture_output=True, text=True, check=True)
     return Row("peak memory of one estimate", json.loads(done.stdout) / 1e9, "GB", 1.5, note="whole process")
 
 
 def estimate_once() -> None:
-    """One estimate with N = 5 and a dino_vits8 of random weights."""
+    """Estimate one pose with N = 5 target views and a dino_vits8 of random weights."""
     reference, *targets = made_up_frames(1 + N_TARGETS)
     ZeroShotPose(random_vits8()).estimate(reference, targets)
 
 
 def annotation_rows(frames: int = 86_000) -> list[Row]:
-    """Opening a category of the largest kind (see `annotation_benchmark`)."""
+    """Measure the opening of a large category (see `annotation_benchmark`)."""
     found = annotation_benchmark(frames)
     what = f"category of {found['frames']:,} frames"
-    note = f"beyond the JSON's {found['json_mb']:.0f} MiB"
+    note = f"in addition to {found['json_mb']:.0f} MiB of JSON"
     return [
         Row(f"opening a {what}", found["seconds"], "s", 3),
         Row(f"memory to open a {what}", found["extra_memory_mb"], "MiB", 400, note=note),
@@ -179,14 +188,14 @@ def annotation_rows(frames: int = 86_000) -> list[Row]:
 
 
 def random_vits8() -> Backbone:
-    """The architecture of dino_vits8 with random weights, on the CPU."""
+    """Return a dino_vits8 with random weights on the CPU."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return Backbone(VisionTransformer(), "random dino_vits8", device="cpu")
 
 
 def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) -> list[Frame]:
-    """Frames of a textured ellipsoid on a plain ground, with its mask, and depth with a third of its pixels unknown."""
+    """Generate frames of a textured ellipsoid with its mask, and with depth unknown in a third of the pixels."""
     rng = np.random.default_rng(seed)
     height, width = size
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, float(width)), np.array([width, height]) / 2, size)
@@ -201,12 +210,12 @@ def made_up_frames(n: int, size: tuple[int, int] = (480, 640), seed: int = 0) ->
         holes = cv2.resize(rng.random((30, 40)), (width, height)) < 0.42
         known = np.where(inside & ~holes, depth, 0)
         mask = inside.astype(np.float32)
-        frames.append(Frame(rgb, known.astype(np.float32), mask, camera, f"made up {index}"))
+        frames.append(Frame(rgb, known.astype(np.float32), mask, camera, f"generated {index}"))
     return frames
 
 
 def _median_seconds(works: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median wall time of each; they take turns, so that whatever else the machine does meets all of them alike."""
+    """Measure median wall times. The functions alternate, so that other load affects all of them equally."""
     times = np.empty((repeats, len(works)))
     for work in works:
         work()

@@ -1,4 +1,4 @@
-"""What a run was measured with: version and git revision of the library, versions of its dependencies, machine."""
+"""Provenance of a run: version and git revision of the library, versions of its dependencies, machine."""
 
 import functools
 import hashlib

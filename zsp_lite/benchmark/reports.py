@@ -1,4 +1,4 @@
-"""All that is made of a finished run: tables, figures, and the one file to keep."""
+"""Reports of a run: tables, figures, and an export of its results."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,21 +13,21 @@ def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None
     """Write tables and figures of a run, and its `results.json.gz`.
 
     Args:
-        run: A run's folder or its `results.json.gz`, or several to be pooled.
-        out: Folder to write to; by default where the run is. Pooled runs need one.
+        run: A run's folder or its `results.json.gz`, or several, which are pooled.
+        out: Folder to write to. Default: the folder of the run; required for pooled runs.
 
     Returns:
         The run.
 
     Raises:
-        InputError: If `run` is no finished run.
+        InputError: If `run` is not a run.
     """
-    # matplotlib takes a second to import, which a benchmark with nothing to draw need not wait for.
+    # Imported here, because matplotlib takes a second to import.
     from zsp_lite.benchmark.figures import write_figures
 
     paths = [Path(run)] if isinstance(run, str | Path) else list(map(Path, run))
     if out is None and len(paths) > 1:
-        raise InputError("pooled runs: no folder given to write their tables to")
+        raise InputError("pooled runs: expected a folder for their tables")
     results = read_runs(paths)
     out = Path(out) if out is not None else paths[0] if paths[0].is_dir() else paths[0].parent
     if len(paths) > 1 or paths[0].is_dir():

@@ -178,7 +178,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _with_object_intervals(summary: Mapping[str, Any], rows: Mapping[str, Mapping[str, dict]]) -> dict[str, Any]:
-    """The summary; that of an earlier version, which took pairs for independent, with new intervals."""
+    """Return the summary; intervals of earlier versions, which treated pairs as independent, are computed again."""
     if summary.get("intervals") == INTERVALS or not summary.get("methods"):
         return dict(summary)
     computed = summarise_rows({name: rows[name] for name in summary["methods"]})

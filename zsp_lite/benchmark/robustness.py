@@ -1,7 +1,7 @@
-"""Rows that spoil what a camera gives before they solve a pair: holes, noise, wrong masks, wrong poses; or mend it.
+"""Robustness rows: estimation with corrupted depth, masks and camera poses, or with exact synthetic depth and masks.
 
-Crops and features stay as they are, so that every row of the table sees the same pictures and one thing alone changes.
-Lengths are in units of the object's spread, the standard deviation of its points. Damage is drawn with the pair's seed.
+Crops and features are not changed, so each row differs from the original one in a single property. Lengths are in units
+of the object's spread, the standard deviation of its points. Random numbers are drawn with the pair's seed.
 """
 
 import zlib
@@ -24,38 +24,38 @@ from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
 from zsp_lite.points import object_points, standard_deviation
 from zsp_lite.views import frame_view
 
-_HOLES = 0.3  # share of the known pixels that become unknown, in patches about a sixteenth of the crop wide
-_DEPTH_NOISE = 0.1  # of the spread, correlated over two pixels
-_POSE_NOISE = 1.0, 0.01  # degrees; share of the camera's distance to the object
-_WANDER = 20.0  # pixels along an outline over which a mask's error changes
+_HOLES = 0.3  # fraction of the image that becomes unknown, in regions about a sixteenth of the crop wide
+_DEPTH_NOISE = 0.1  # standard deviation in spreads; correlated over two pixels
+_POSE_NOISE = 1.0, 0.01  # degrees; fraction of the camera's distance to the object
+_WANDER = 20.0  # correlation length of a mask's error in pixels
 
 Damage = Callable[[Frame, np.random.Generator], Frame]
 
 
 def holes(frame: Frame, rng: np.random.Generator) -> Frame:
-    """Unknown depth in 30 % of the picture, beside what is unknown already."""
+    """Remove the depth in 30 % of the image, in addition to the pixels without depth."""
     unknown = _smooth(rng, frame.camera.size, 14.0)
     depth = np.where(unknown < np.quantile(unknown, _HOLES), 0, _depth(frame))
     return replace(frame, depth=depth.astype(np.float32))
 
 
 def depth_noise(frame: Frame, rng: np.random.Generator) -> Frame:
-    """Depth off by a tenth of the object's spread, r.m.s."""
+    """Add noise to the depth, with a standard deviation of a tenth of the object's spread."""
     depth = _depth(frame)
     noisy = depth + _DEPTH_NOISE * object_spread(frame) * _smooth(rng, depth.shape, 2.0)
     return replace(frame, depth=np.where(depth > 0, np.maximum(noisy, 1e-3), 0).astype(np.float32))
 
 
 def mask_error(pixels: float) -> Damage:
-    """The mask's outline off by so many of the crop's pixels, r.m.s., inwards here and outwards there."""
+    """Return a function that displaces the outline of the mask by a root mean square of `pixels` of the crop."""
 
     def damage(frame: Frame, rng: np.random.Generator) -> Frame:
         if frame.mask is None:
-            raise InputError(f"{frame.name or 'frame'}: no mask, expected one to spoil")
+            raise InputError(f"{frame.name or 'frame'}: no mask, expected one")
         inside = (frame.mask > 0.5).astype(np.uint8)
         distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
         wandered = distance + pixels * _smooth(rng, frame.camera.size, _WANDER)
-        # A mask that vanished altogether would test nothing.
+        # If no pixel is left, the mask is not changed.
         mask = (wandered > 0) if (wandered > 0).any() else inside > 0
         return replace(frame, mask=mask.astype(np.float32))
 
@@ -63,7 +63,7 @@ def mask_error(pixels: float) -> Damage:
 
 
 def pose_noise(frame: Frame, rng: np.random.Generator) -> Frame:
-    """The camera turned by one degree about a random axis, and moved by 1 % of its distance from the object."""
+    """Rotate the camera by one degree about a random axis, and move it by 1 % of its distance to the object."""
     degrees, share = _POSE_NOISE
     axis, away = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     turn, _ = cv2.Rodrigues(np.radians(degrees) * axis)
@@ -74,11 +74,11 @@ def pose_noise(frame: Frame, rng: np.random.Generator) -> Frame:
 
 
 def nothing(frame: Frame, rng: np.random.Generator) -> Frame:
-    """The frame as it is."""
+    """Return the frame unchanged."""
     return frame
 
 
-# By name: what happens to the reference, and to each target. Only targets have poses that the method is told.
+# By name: the change of the reference and of each target. The methods use the camera poses of targets only.
 DAMAGES: dict[str, tuple[Damage, Damage]] = {
     "holes": (holes, holes),
     "depthnoise": (depth_noise, depth_noise),
@@ -90,7 +90,12 @@ DAMAGES: dict[str, tuple[Damage, Damage]] = {
 
 @dataclass(frozen=True)
 class Damaged:
-    """A row: `ZeroShotPose` with some settings on views that were damaged.  damage: a name in `DAMAGES`, or "clean"."""
+    """A row of the benchmark: `ZeroShotPose` on changed views.
+
+    Attributes:
+        damage: Name in `DAMAGES`, or "clean" for exact depth and masks.
+        settings: Settings of `ZeroShotPose`.
+    """
 
     damage: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -109,21 +114,22 @@ class Damaged:
 
 
 def object_spread(frame: Frame) -> float:
-    """Standard deviation, the root of the axes' mean variance, of the points seen on the object (no mask: of all)."""
+    """Compute the standard deviation of the visible points of the object; of all points if the mask has none."""
     points = object_points(frame)
     return standard_deviation(points if len(points) else object_points(replace(frame, mask=None)))
 
 
 def exact(frame: Frame, root: str | Path, category: str, sequence: str) -> Frame:
-    """A synthetic frame with the object's true depth everywhere on it, and its true mask; unknown off the object.
+    """Replace depth and mask of a synthetic frame by the exact ones; the depth of the background is unknown.
 
-    Raises InputError for a folder that `zsp-lite synth` did not make.
+    Raises:
+        InputError: The folder was not made by `zsp-lite synth`.
     """
     rays = _object_rays(str(root), category, sequence)
     camera = frame.camera
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    # Rays of unit depth: how far along them is how deep.
+    # The rays have unit depth, so the ray parameter is the depth.
     directions = camera.unproject_camera(np.stack([x, y], axis=-1), np.ones((height, width))) @ camera.R
     depth = rays(camera.centre, directions)
     mask = np.isfinite(depth)
@@ -132,13 +138,15 @@ def exact(frame: Frame, root: str | Path, category: str, sequence: str) -> Frame
 
 @lru_cache(maxsize=8)
 def _object_rays(root: str, category: str, sequence: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A function from an eye (3,) and directions (..., 3) in a sequence's world to the way to the object, (...)."""
+    """Return a function from a ray's origin (3,) and directions (..., 3) in the world to ray parameters (...)."""
     from zsp_lite.io.open3d import load_open3d
     from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
 
     settings, poses = Path(root) / SETTINGS_FILE, Path(root) / category / POSES_FILE
     if not (settings.is_file() and poses.is_file()):
-        raise InputError(f"{root}: no {SETTINGS_FILE}, expected a folder made by zsp-lite synth to know what is exact")
+        raise InputError(
+            f"{root}: no {SETTINGS_FILE}, expected a folder made by zsp-lite synth, which contains exact poses"
+        )
     seed = decode(read_bytes(settings, "settings"), dict, settings)["seed"]
     placed = decode(read_bytes(poses, "object poses"), dict, poses)[sequence]
     shape = make_object(category, sequence, seed)
@@ -157,11 +165,11 @@ def _object_rays(root: str, category: str, sequence: str) -> Callable[[np.ndarra
 
 def _depth(frame: Frame) -> Float[np.ndarray, "h w"]:
     if frame.depth is None or not (frame.depth > 0).any():
-        raise InputError(f"{frame.name or 'frame'}: no known depth, expected some to spoil")
+        raise InputError(f"{frame.name or 'frame'}: no known depth, expected at least one pixel")
     return frame.depth
 
 
 def _smooth(rng: np.random.Generator, size: tuple[int, int], width: float) -> Float[np.ndarray, "h w"]:
-    """Noise of unit variance, correlated over `width` pixels."""
+    """Return noise of unit variance, correlated over `width` pixels."""
     noise = cv2.GaussianBlur(rng.standard_normal(size).astype(np.float32), (0, 0), width, borderType=cv2.BORDER_REFLECT)
     return noise / noise.std()

@@ -65,7 +65,7 @@ def evaluate(
         out: Folder of the run; an existing run with the same settings is continued. Rows may be added.
         categories: Default: all that have pose labels.
         progress: Called with the numbers of finished and of all pairs.
-        executor: Who evaluates (see `execution.open_workers`); `root`, `cache` and a backbone's file must have the same
+        executor: Executor (see `execution.open_workers`); `root`, `cache` and a backbone's file must have the same
             path for all workers.
         workers: Number of workers.
         threads: Threads of torch per worker during feature extraction; default: the cores divided by the workers.
@@ -128,7 +128,7 @@ def plan_run(
     categories: Sequence[str] | None = None,
     allow_other_version: bool = False,
 ) -> Plan:
-    """Estimate what `evaluate` with these arguments would take from here on. Writes nothing, raises what it would."""
+    """Estimate the remaining cost of `evaluate` with these arguments. Writes nothing; raises the same errors."""
     rows = resolve(methods)
     row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
     backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone

@@ -77,7 +77,7 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
     Returns:
         {"methods": by row, over all pairs and "per_category", the figures of `metrics.summarise`, and
         "mean_category_median": the paper's way of averaging medians; "against_ours": every other row that has the same
-        problems in the same order against "ours", see `metrics.paired_difference`; "intervals": what they are of}.
+        problems in the same order against "ours", see `metrics.paired_difference`; "intervals": their method}.
         Intervals and p values come from resampled objects, except for "sign_test_p".
     """
     rows = {name: _ordered(row) for name, row in rows.items()}
