@@ -1,0 +1,68 @@
+"""Small models on disk, made by the tests themselves."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from zsp_lite.data.cameras import Camera
+from zsp_lite.synthetic.meshes import Material, TexturedMesh, plain_mesh
+from zsp_lite.synthetic.primitives import Mesh, box
+from zsp_lite.synthetic.render import framed_camera, orbit_pose
+
+# Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
+_QUAD = """mtllib {stem}.mtl
+v -1 -1 0
+v 1 -1 0
+v 1 1 0
+v -1 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+usemtl paint
+f 1/1 2/2 3/3
+f 1/1 3/3 4/4
+"""
+
+
+def write_quad(path: Path, texture: np.ndarray | None = None, colour=(1, 1, 1), opacity: float = 1.0) -> Path:
+    """Write a textured square as OBJ, MTL and PNG; `texture` is RGB or RGBA, rows from top to bottom."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_QUAD.format(stem=path.stem))
+    lines = ["newmtl paint", "Kd {} {} {}".format(*colour), "Ks 0 0 0", "Ns 1", f"d {opacity}"]
+    if texture is not None:
+        lines.append(f"map_Kd {path.stem}.png")
+        order = [2, 1, 0, 3][: texture.shape[2]]
+        cv2.imwrite(str(path.with_suffix(".png")), texture[..., order])
+    path.with_suffix(".mtl").write_text("\n".join(lines) + "\n")
+    return path
+
+
+def wedge(seat: float = 0.5) -> Mesh:
+    """An object without symmetry, like a chair: a seat, a back at the rear and one arm on the left. Front +x, up +z."""
+    parts = (box((1.2, 1.0, 0.2), (0, 0, seat)), box((0.2, 1.0, 1.2), (-0.5, 0, seat + 0.6)),
+             box((0.8, 0.15, 0.4), (0.1, 0.45, seat + 0.25)), box((0.2, 0.2, seat), (0.3, 0, seat / 2)))  # fmt: skip
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+    return Mesh(np.concatenate([part.vertices for part in parts]), faces)
+
+
+def write_wedge(path: Path, seat: float = 0.5) -> Path:
+    """Write `wedge` in the default axes of an OBJ file: front +z, up +y."""
+    mesh = wedge(seat)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [f"v {y} {z} {x}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def painted(mesh: Mesh, colour=(0.7, 0.4, 0.3, 1.0)) -> TexturedMesh:
+    return plain_mesh(mesh.vertices, mesh.faces, Material(np.array(colour)))
+
+
+def view(vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size: int = 64) -> Camera:
+    """A camera that frames the vertices; angles in degrees."""
+    pose = orbit_pose(np.radians(azimuth), np.radians(elevation), 0.05, 6.0, vertices.mean(0))
+    return framed_camera(vertices, *pose, size, margin=1.3)

@@ -1,0 +1,198 @@
+"""Model files give one record in the canonical frame; unusable ones are refused with a reason."""
+
+import numpy as np
+import pytest
+import trimesh
+from model_files import wedge, write_quad, write_wedge
+
+from zsp_lite.errors import InputError
+from zsp_lite.synthetic import meshes
+from zsp_lite.synthetic.assembly import surface_spread
+from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
+from zsp_lite.synthetic.models import ModelInfo, list_models, read_infos, turn_model
+from zsp_lite.synthetic.primitives import box, ellipsoid
+
+CHECKS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+
+
+def test_an_obj_file_gives_texture_coordinates_texture_colour_and_opacity(tmp_path):
+    mesh = read_mesh(write_quad(tmp_path / "quad.obj", CHECKS, colour=(0.5, 1, 1), opacity=0.25))
+    assert len(mesh.faces) == 2 and np.ptp(mesh.vertices, axis=0).tolist() == [2, 2, 0]
+    (material,) = mesh.materials
+    assert material.texture[..., :3].tolist() == CHECKS.tolist() and (material.texture[..., 3] == 255).all()
+    assert material.colour == pytest.approx([0.5, 1, 1, 0.25], abs=0.01)
+    corner = mesh.vertices[mesh.faces].reshape(-1, 3)
+    assert mesh.uv.reshape(-1, 2) == pytest.approx(corner[:, :2] / 2 + 0.5)  # u to the right, v up
+    assert np.abs(mesh.normals) == pytest.approx(np.broadcast_to([0, 0, 1.0], (2, 3, 3)))
+
+
+def test_dull_and_shiny_materials_differ_in_roughness_and_specular(tmp_path):
+    path = write_quad(tmp_path / "quad.obj")
+    dull = read_mesh(path).materials[0]
+    text = path.with_suffix(".mtl").read_text()
+    path.with_suffix(".mtl").write_text(text.replace("Ks 0 0 0", "Ks 1 1 1").replace("Ns 1", "Ns 500"))
+    shiny = read_mesh(path).materials[0]
+    assert shiny.roughness < 0.5 < dull.roughness and shiny.specular > dull.specular
+
+
+@pytest.mark.parametrize("extension", ["obj", "glb", "gltf", "ply", "stl"])
+def test_every_format_gives_the_same_canonical_shape(tmp_path, extension):
+    shape = wedge()
+    # From front +x, up +z to the axes that the format has by default.
+    if extension == "stl":
+        vertices = np.stack([shape.vertices[:, 1], -shape.vertices[:, 0], shape.vertices[:, 2]], 1)
+    else:
+        vertices = shape.vertices[:, [1, 2, 0]]
+    path = tmp_path / f"wedge.{extension}"
+    exported = trimesh.Trimesh(vertices, shape.faces, process=False)
+    if extension == "gltf":
+        for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(exported)).items():
+            (tmp_path / name.replace("model.gltf", "wedge.gltf")).write_bytes(data)
+    else:
+        exported.export(path)
+    mesh = canonical_mesh(read_mesh(path), ModelInfo().axes(path.suffix))
+    expected = shape.vertices - (shape.vertices.max(0) + shape.vertices.min(0)) / 2
+    expected /= surface_spread(expected, shape.faces)
+    assert np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0) == pytest.approx(
+        np.sort(expected[shape.faces].reshape(-1, 3), axis=0), abs=1e-5
+    )
+    assert surface_spread(mesh.vertices, mesh.faces) == pytest.approx(1)
+
+
+def test_a_collada_file_is_read_or_names_the_missing_package(tmp_path, monkeypatch):
+    path = tmp_path / "cube.dae"
+    try:
+        import collada  # noqa: F401
+    except ImportError:
+        path.write_text("<COLLADA/>")
+        with pytest.raises(InputError, match="needs the package pycollada"):
+            read_mesh(path)
+    else:
+        trimesh.Trimesh(*(lambda cube: (cube.vertices, cube.faces))(box((1, 2, 3)))).export(path)
+        assert np.ptp(read_mesh(path).vertices, axis=0) == pytest.approx([1, 2, 3])
+
+
+def test_parts_of_a_scene_are_placed_by_its_graph(tmp_path):
+    cube = box((1, 1, 1))
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.Trimesh(cube.vertices, cube.faces))
+    scene.add_geometry(trimesh.Trimesh(cube.vertices, cube.faces), transform=np.diag([-2.0, 1, 1, 1]) + _shift(5))
+    scene.export(tmp_path / "two.glb")
+    mesh = read_mesh(tmp_path / "two.glb")
+    assert mesh.vertices[:, 0].min() == pytest.approx(-0.5) and mesh.vertices[:, 0].max() == pytest.approx(6)
+    assert np.linalg.norm(mesh.normals, axis=-1) == pytest.approx(np.ones((24, 3)), abs=1e-5)
+
+
+def _shift(x: float) -> np.ndarray:
+    shift = np.zeros((4, 4))
+    shift[0, 3] = x
+    return shift
+
+
+def test_edges_of_a_box_stay_sharp_and_an_ellipsoid_is_smooth(tmp_path):
+    cube = box((1, 2, 3))
+    sharp = meshes.plain_mesh(cube.vertices, cube.faces, meshes.Material(np.ones(4)))
+    assert np.abs(sharp.normals).max(-1) == pytest.approx(np.ones((12, 3)))
+    ball = ellipsoid((1, 1, 1), sides=32, rings=24)
+    smooth = meshes.plain_mesh(ball.vertices, ball.faces, meshes.Material(np.ones(4)))
+    corners = ball.vertices[ball.faces]
+    along = np.abs((smooth.normals * corners).sum(-1) / np.linalg.norm(corners, axis=-1))
+    assert np.median(along) > 0.999 and np.quantile(along, 0.02) > 0.98
+
+
+def _cases(folder):
+    quad = write_quad(folder / "good.obj", CHECKS)
+    text = quad.read_text()
+    for name, content in {
+        "nothing.obj": "", "points.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "nan.obj": "v nan 0 0\n" + text,
+        "far.obj": "v 1e300 0 0\n" + text, "flat.obj": "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n",
+        "lost.obj": text.replace("good.mtl", "gone.mtl"),
+    }.items():  # fmt: skip
+        (folder / name).write_text(content)
+    write_quad(folder / "bare.obj", CHECKS)
+    (folder / "bare.png").unlink()
+    write_quad(folder / "clear.obj", opacity=0.0)
+    (folder / "damaged.glb").write_bytes(b"glTF" + bytes(50))
+    (folder / "notes.txt").write_text("not a model")
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("nothing.obj", "nothing.obj (has 0 faces|cannot be read)"),
+        ("points.obj", "points.obj (has 0 faces|cannot be read)"),
+        ("nan.obj", "vertices are not finite"),
+        ("far.obj", "vertices are not finite, or beyond 1e12"),
+        ("flat.obj", "no visible face with an area"),
+        ("clear.obj", "no visible face with an area"),
+        ("lost.obj", "lacks its material file 'gone.mtl'"),
+        ("bare.obj", "lacks its texture 'bare.png'"),
+        ("damaged.glb", "damaged.glb cannot be read"),
+        ("notes.txt", "extension '.txt', expected one of .obj"),
+        ("absent.obj", "absent.obj does not exist"),
+    ],
+)
+def test_an_unusable_model_is_refused_with_its_reason(tmp_path, name, reason):
+    _cases(tmp_path)
+    with pytest.raises(InputError, match=reason) as caught:
+        read_mesh(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_gigantic_model_is_refused(tmp_path, monkeypatch):
+    path = write_quad(tmp_path / "quad.obj")
+    monkeypatch.setattr(meshes, "MAX_FACES", 1)
+    with pytest.raises(InputError, match="has 2 faces, expected 1 to 1"):
+        read_mesh(path)
+    monkeypatch.setattr(meshes, "MAX_BYTES", 10)
+    with pytest.raises(InputError, match="bytes, expected at most 10"):
+        read_mesh(path)
+
+
+def test_orientations_are_rotations_to_front_x_and_up_z():
+    rotation = ModelInfo(front="-x", up="+y").axes(".obj")
+    assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0]) and rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
+    oblique = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
+    assert oblique @ oblique.T == pytest.approx(np.eye(3)) and np.linalg.det(oblique) == pytest.approx(1)
+    for info in (ModelInfo(front="+y", up="+y"), ModelInfo(front="ahead"), ModelInfo(up=(0, 0, 0))):
+        with pytest.raises(InputError, match="expected"):
+            info.axes(".obj")
+
+
+def test_turning_a_model_turns_its_canonical_shape_and_keeps_what_else_is_known(tmp_path):
+    write_wedge(tmp_path / "chair" / "a.obj")
+    (tmp_path / "models.json").write_text('{"chair/a": {"author": "Ann", "licence": "CC0"}}')
+    before = list_models(tmp_path)[0].read().vertices
+    info = turn_model(tmp_path, "chair/a", "up", 90)
+    after = list_models(tmp_path)[0].read().vertices
+    assert after == pytest.approx(before @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T, abs=1e-9)
+    assert read_infos(tmp_path)["chair/a"] == info and (info.author, info.licence) == ("Ann", "CC0")
+    turn_model(tmp_path, "chair/a", "up", -90)
+    turn_model(tmp_path, "chair/a", "left", 30)
+    tilted = list_models(tmp_path)[0].read().vertices  # its unit is another: the mean over the axes changes
+    assert tilted[:, 1] / np.ptp(tilted[:, 1]) == pytest.approx(before[:, 1] / np.ptp(before[:, 1]), abs=1e-6)
+    for key, axis in (("chair/b", "up"), ("chair/a", "down")):
+        with pytest.raises(InputError, match="expected one of"):
+            turn_model(tmp_path, key, axis, 90)
+
+
+def test_a_folder_lists_models_in_files_and_in_folders_of_their_own(tmp_path):
+    write_wedge(tmp_path / "chair" / "plain.obj")
+    write_quad(tmp_path / "chair" / "own" / "model.obj", CHECKS)
+    write_wedge(tmp_path / "bed" / "x.OBJ")
+    assert [f"{m.category}/{m.name}" for m in list_models(tmp_path)] == ["bed/x", "chair/own", "chair/plain"]
+    (tmp_path / "models.json").write_text('{"chair/gone": {}}')
+    with pytest.raises(InputError, match="names 'chair/gone', which has no file"):
+        list_models(tmp_path)
+    (tmp_path / "models.json").write_text('{"chair/own": {"front": 3}}')
+    with pytest.raises(InputError, match="front"):
+        list_models(tmp_path)
+    (tmp_path / "models.json").unlink()
+    write_wedge(tmp_path / "chair" / "own.obj")
+    with pytest.raises(InputError, match="chair/own has two files"):
+        list_models(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        list_models(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no model"):
+        list_models(tmp_path / "empty")

@@ -1,0 +1,165 @@
+"""A folder of models: `FOLDER/CATEGORY/NAME.obj` (or another extension of `EXTENSIONS`).
+
+A model that brings files of its own may have a folder of its own, `FOLDER/CATEGORY/NAME/FILE.obj`. The optional file
+`models.json` gives the orientation and the origin of each model, see `ModelInfo`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from zsp_lite.data.annotations import decode
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.synthetic.meshes import EXTENSIONS, TexturedMesh, canonical_mesh, read_mesh
+
+MODELS_FILE = "models.json"
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_Direction = str | tuple[float, float, float]
+
+
+class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Entry of `models.json` for one model; every field is optional.
+
+    Attributes:
+        front: Direction of the object's front in the axes of the file: "+x", "-x", ... "-z", or three numbers.
+        up: Direction of the object's top in the axes of the file.
+        author: Author of the model.
+        licence: Licence of the model.
+        source: Where the model comes from.
+        changes: What was changed with respect to the source.
+    """
+
+    front: _Direction | None = None
+    up: _Direction | None = None
+    author: str = ""
+    licence: str = ""
+    source: str = ""
+    changes: str = ""
+
+    def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from the axes of the file to the canonical frame (front +x, left +y, up +z).
+
+        Args:
+            extension: Extension of the model's file. Where `front` or `up` is not given, it is front +z, up +y (the
+                rule of glTF), and front -y, up +z for STL.
+
+        Raises:
+            InputError: If a direction is not one, or the two are not perpendicular.
+        """
+        front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
+        x, z = (_direction(given) for given in (self.front or front, self.up or up))
+        if abs(x @ z) > 1e-3:
+            raise InputError(f"front is {self.front or front} and up is {self.up or up}, expected perpendicular axes")
+        y = np.cross(z, x)
+        return np.stack([np.cross(y, z), y, z])
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of a folder: its category, name, file and entry of `models.json`."""
+
+    category: str
+    name: str
+    path: Path
+    info: ModelInfo
+
+    def read(self) -> TexturedMesh:
+        """Read the mesh in canonical coordinates. Raises InputError as `read_mesh` and `ModelInfo.axes` do."""
+        mesh = read_mesh(self.path)
+        try:
+            return canonical_mesh(mesh, self.info.axes(self.path.suffix))
+        except InputError as error:
+            raise InputError(f"{MODELS_FILE}, {self.category}/{self.name}: {error}") from error
+
+
+def list_models(folder: str | Path) -> list[Model]:
+    """Return the models of a folder, sorted by category and name.
+
+    Raises:
+        InputError: If the folder does not exist or holds no model, `models.json` is damaged or names a model that
+            does not exist, or two files have the same name.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"folder of models {folder} does not exist")
+    infos, models = read_infos(folder), {}
+    files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*") if path.is_file()]
+    files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*") if path.is_file()]
+    for category, name, path in sorted(files):
+        if path.suffix.lower() in EXTENSIONS:
+            key = f"{category}/{name}"
+            if key in models:
+                raise InputError(f"model {key} has two files, {models[key].path.name} and {path.name}, expected one")
+            info = infos.get(key, ModelInfo())
+            models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
+    if not models:
+        raise InputError(
+            f"{folder} holds no model, expected CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of "
+            f"{', '.join(EXTENSIONS)}"
+        )
+    if unknown := sorted(infos.keys() - models.keys()):
+        raise InputError(f"{folder / MODELS_FILE} names {unknown[0]!r}, which has no file in {folder}")
+    return [models[key] for key in sorted(models)]
+
+
+def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
+    """Return the entries of a folder's `models.json` by "CATEGORY/NAME"; empty without the file."""
+    path = Path(folder) / MODELS_FILE
+    return decode(read_bytes(path, "model list"), dict[str, ModelInfo], path) if path.is_file() else {}
+
+
+def turn_model(folder: str | Path, key: str, axis: str, degrees: float) -> ModelInfo:
+    """Turn a model in its canonical frame and store the new orientation in `models.json`.
+
+    Args:
+        folder: Folder of models.
+        key: "CATEGORY/NAME".
+        axis: Canonical axis to turn about: "front", "left" or "up".
+        degrees: Angle, counter-clockwise as seen from the tip of the axis.
+
+    Returns:
+        The new entry.
+
+    Raises:
+        InputError: If the folder has no such model, or the axis is unknown.
+    """
+    models = {f"{model.category}/{model.name}": model for model in list_models(folder)}
+    if key not in models:
+        raise InputError(f"model is {key!r}, expected one of {', '.join(models)}")
+    about = ("front", "left", "up")
+    if axis not in about:
+        raise InputError(f"axis is {axis!r}, expected one of {', '.join(about)}")
+    turn = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[about.index(axis)])[0]
+    rotation = turn @ models[key].info.axes(models[key].path.suffix)
+    info = msgspec.structs.replace(models[key].info, front=_axis_name(rotation[0]), up=_axis_name(rotation[2]))
+    infos = read_infos(folder) | {key: info}
+    encoded = msgspec.json.format(msgspec.json.encode(dict(sorted(infos.items()))), indent=1)
+    write_atomic(Path(folder) / MODELS_FILE, encoded)
+    return info
+
+
+def _direction(given: _Direction) -> np.ndarray:
+    """Return the unit vector of "+x" ... "-z" or of three numbers."""
+    if isinstance(given, str):
+        sign, axis = (given[:1], given[1:]) if given[:1] in "+-" else ("+", given)
+        if axis not in _AXES:
+            raise InputError(f"direction is {given!r}, expected +x, -x, +y, -y, +z, -z or three numbers")
+        return (-1.0 if sign == "-" else 1.0) * np.array(_AXES[axis])
+    vector = np.array(given, float)
+    length = np.linalg.norm(vector)
+    if not 1e-6 < length < np.inf:
+        raise InputError(f"direction is {given}, expected three finite numbers that are not all zero")
+    return vector / length
+
+
+def _axis_name(vector: np.ndarray) -> _Direction:
+    """Return "+x" ... "-z" where a unit vector is one of them, three numbers otherwise."""
+    axis = int(np.abs(vector).argmax())
+    if abs(vector[axis]) > 1 - 1e-9:
+        return "-+"[int(vector[axis] > 0)] + "xyz"[axis]
+    return tuple(np.round(vector, 9).tolist())
