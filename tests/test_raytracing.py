@@ -1,0 +1,176 @@
+"""The renderer's geometry is exact, and its pictures obey light, texture, holes, glass and exposure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_files import painted, view, wedge, write_quad
+
+from zsp_lite.synthetic.appearance import random_appearance
+from zsp_lite.synthetic.assembly import Shape
+from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh
+from zsp_lite.synthetic.models import ModelInfo
+from zsp_lite.synthetic.photography import CheapCamera
+from zsp_lite.synthetic.raytracing import HARD_SHADOWS, MeshScene, Quality, _pixel_rays
+from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
+from zsp_lite.synthetic.room import random_room, studio
+from zsp_lite.synthetic.textures import srgb_to_linear
+
+FAST = Quality(samples=1, shadow_rays=1, ambient_rays=0)
+
+
+def standing_quad(folder, texture, **material):
+    """A textured square, 2 x 2, that faces +x and stands on an edge."""
+    mesh = read_mesh(write_quad(folder / "quad.obj", texture, **material))
+    return canonical_mesh(mesh, ModelInfo().axes(".obj"))
+
+
+def from_the_front(mesh, size=48):
+    return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), size, margin=1.5)
+
+
+def test_object_coordinates_project_to_the_centres_of_their_pixels():
+    mesh = painted(wedge())
+    camera = view(mesh.vertices)
+    drawn = MeshScene(mesh, studio(), FAST).render(camera, 0)
+    row, col = np.nonzero(drawn.mask)
+    pixels, depth = camera.project(drawn.canonical[row, col].astype(float))
+    assert pixels == pytest.approx(np.stack([col + 0.5, row + 0.5], 1), abs=2e-3)
+    assert depth == pytest.approx(drawn.depth[row, col], abs=1e-4)
+    assert np.isnan(drawn.canonical[~drawn.mask]).all() and len(row) > 300
+
+
+def test_geometry_equals_that_of_the_procedural_renderer_for_any_number_of_samples():
+    mesh = painted(wedge())
+    shape = Shape(mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), int), mesh.material)
+    camera = view(mesh.vertices, azimuth=200)
+    ours = MeshScene(mesh, studio(), Quality(samples=2, shadow_rays=1, ambient_rays=0)).render(camera, 0)
+    other = Scene(shape).render(camera, replace(random_appearance(0), has_ground=True), 0)
+    assert (ours.mask == other.mask).all()
+    assert ours.depth[ours.mask] == pytest.approx(other.depth[ours.mask], abs=1e-5)
+    assert ours.normals == pytest.approx(other.normals, abs=1e-5)
+    floor = (ours.depth > 0) & ~ours.mask & (other.depth > 0)
+    assert floor.sum() > 500 and ours.depth[floor] == pytest.approx(other.depth[floor], rel=1e-4)
+
+
+def test_a_texture_is_upright_and_not_mirrored(tmp_path):
+    colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
+    texture = np.repeat(np.repeat(colours, 16, 0), 16, 1)
+    mesh = standing_quad(tmp_path, texture)
+    drawn = MeshScene(mesh, studio(), FAST).render(from_the_front(mesh), 0)
+    row, col = np.nonzero(drawn.mask)
+    (top, bottom), (left, right) = (np.quantile(axis, (0.25, 0.75)).astype(int) for axis in (row, col))
+    seen = drawn.rgb[np.ix_([top, bottom], [left, right])].astype(int)
+    # Red, green / blue, yellow: the brighter channels tell them apart.
+    assert (seen.argmax(-1)[0] == [0, 1]).all() and seen[1, 0].argmax() == 2 and seen[1, 1].argmin() == 2
+
+
+def test_a_hole_in_a_texture_is_a_hole_in_mask_depth_and_shadow(tmp_path):
+    texture = np.full((64, 64, 4), 255, np.uint8)
+    texture[16:48, 16:48, 3] = 0
+    mesh = standing_quad(tmp_path, texture)
+    scene = MeshScene(mesh, studio(), FAST)
+    drawn = scene.render(from_the_front(mesh), 0)
+    row, col = np.nonzero(drawn.mask)
+    middle = round(row.mean()), round(col.mean())
+    assert not drawn.mask[middle] and np.isnan(drawn.canonical[middle]).all()
+    full = (np.ptp(row) + 1) * (np.ptp(col) + 1)
+    assert drawn.mask.sum() / full == pytest.approx(0.75, abs=0.05)
+    behind = np.array([[-3.0, 0, 0], [-3.0, 0.9 * mesh.vertices[:, 1].max(), 0]], np.float32)
+    assert scene._occluded(behind, np.tile(np.float32([1, 0, 0]), (2, 1))).tolist() == [False, True]
+
+
+def test_glass_belongs_to_the_object_and_shows_what_is_behind_it(tmp_path):
+    clear, solid = (
+        MeshScene(standing_quad(tmp_path, None, colour=(0, 0, 0), opacity=opacity), studio(), FAST)
+        for opacity in (0.2, 1.0)
+    )
+    camera = from_the_front(clear.mesh)
+    through, opaque = clear.render(camera, 0), solid.render(camera, 0)
+    assert (through.mask == opaque.mask).all() and (through.depth == opaque.depth).all()
+    assert through.rgb[through.mask].mean() > opaque.rgb[opaque.mask].mean() + 40
+    assert not clear._occluded(np.float32([[-3, 0, 0]]), np.float32([[1, 0, 0]]))[0]
+
+
+def test_the_floor_is_dark_below_the_object_and_in_its_shadow():
+    mesh = painted(wedge())
+    room = studio()
+    for quality in (HARD_SHADOWS, Quality(2, 3, 8)):
+        scene = MeshScene(mesh, room, quality)
+        shadow = [-0.5, 0] - room.light[:2] / room.light[2] * 0.8  # of a point of the back, 0.8 above the floor
+        key, around = scene.lighting.floor_light(np.array([shadow, [4.0, 4.0], [0.0, 0.0]]))
+        assert key[0] < 0.3 and key[1] > 0.95
+        if quality.ambient_rays:
+            assert around[2] < 0.5 and around[1] > 0.95
+
+
+def test_soft_shadows_have_half_shades_and_hard_ones_have_none():
+    mesh = painted(wedge())
+    shades = []
+    for quality in (Quality(1, 1, 0), Quality(1, 4, 4)):
+        key = MeshScene(mesh, replace(studio(), light_radius=0.3), quality).shadow.light[..., 0]
+        shades.append(((key > 0.1) & (key < 0.9)).mean())
+    assert shades[0] == 0 and shades[1] > 0.02
+
+
+def test_more_samples_per_pixel_smooth_the_silhouette():
+    mesh = painted(wedge(), colour=(0.02, 0.02, 0.02, 1))
+    camera = view(mesh.vertices, size=48)
+    box = MeshScene(mesh, studio(), FAST)._object_box(camera)
+    errors, exact = [], None
+    for n in (8, 2, 1):
+        scene = MeshScene(mesh, studio(), Quality(n, 1, 0))
+        rays = _pixel_rays(camera, box, n)
+        _, through = scene._shade_rays(camera, rays.reshape(-1, 3))
+        rows, cols = rays.shape[0] // n, rays.shape[1] // n
+        coverage = 1 - through.reshape(rows, n, cols, n).mean((1, 3))
+        exact = coverage if exact is None else exact
+        errors.append(np.abs(coverage - exact).sum())
+    assert errors[1] < 0.6 * errors[2]
+
+
+def test_metal_reflects_with_its_own_colour_and_a_mirror_shows_more_than_a_matte_surface():
+    mesh = painted(wedge(), colour=(0.9, 0.2, 0.1, 1))
+    camera = view(mesh.vertices)
+    (material,) = mesh.materials
+    colours = {}
+    for name, changed in {
+        "matte": material,
+        "metal": replace(material, metallic=1.0, roughness=0.3),
+        "glossy": replace(material, specular=0.5, roughness=0.2),
+    }.items():
+        drawn = MeshScene(replace(mesh, materials=(changed,)), studio(), FAST).render(camera, 0)
+        colours[name] = srgb_to_linear(drawn.rgb[drawn.mask] / 255).mean(0)
+    assert colours["metal"][0] > 2 * colours["metal"][2]
+    assert colours["glossy"][2] > 1.5 * colours["matte"][2]  # the white room on the red surface
+
+
+def test_the_same_seed_gives_the_same_picture_and_vertices_may_have_colours():
+    mesh = painted(wedge())
+    camera = view(mesh.vertices)
+    room = random_room(3)
+    one, two = (MeshScene(mesh, room, Quality(2, 2, 2), seed=5).render(camera, 7).rgb for _ in range(2))
+    assert (one == two).all()
+    blue = replace(mesh, colours=mesh.colours * np.float32([0.1, 0.1, 1]), materials=(Material(np.ones(4)),))
+    drawn = MeshScene(blue, studio(), FAST).render(camera, 0)
+    assert (drawn.rgb[drawn.mask].argmax(-1) == 2).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_random_room_has_finite_light_and_a_floor_that_reflects_less_than_it_receives(seed):
+    room = random_room(seed)
+    assert np.linalg.norm(room.light) == pytest.approx(1) and room.light[2] > 0.4
+    for image in room.images:
+        assert np.isfinite(image).all() and image.min() >= 0 and image.dtype == np.float32
+    assert room.images[4].max() <= 0.85 and 0.02 < room.images[4].mean() < 0.7
+
+
+def test_the_camera_exposes_for_mid_grey_and_its_noise_is_as_given():
+    camera = CheapCamera(noise=0.03, vignetting=0.0)
+    for radiance in (0.01, 1.0, 50.0):
+        flat = np.full((64, 64, 3), radiance, np.float32)
+        picture = camera.develop(flat, camera.exposure_gain(flat), np.random.default_rng(0))
+        assert 90 < picture.mean() < 150 and 0.3 < picture.std() < 8
+    silent = replace(camera, noise=0.0, white_balance=(1.2, 1, 0.8))
+    picture = silent.develop(flat, silent.exposure_gain(flat), np.random.default_rng(0)).reshape(-1, 3)
+    assert np.ptp(picture, axis=0).max() <= 1 and picture[0, 0] > picture[0, 1] > picture[0, 2]

@@ -1,0 +1,71 @@
+"""A cheap camera: from linear radiance to an 8-bit picture."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+
+@dataclass(frozen=True, eq=False)
+class CheapCamera:
+    """Response of a camera: from linear radiance to 8-bit sRGB.
+
+    Attributes:
+        exposure: Mean luminance after automatic exposure, with 1 for white.
+        white_balance: Remaining factor of each channel after automatic white balance.
+        noise: Standard deviation of the noise at mid-grey, relative to white; shot noise and read noise.
+        blur: Standard deviation of the lens' point spread in pixels of an image of 256 pixels.
+        vignetting: Loss of light in the corners, as a fraction.
+        defocus: Blur of the background in pixels of an image of 256 pixels.
+    """
+
+    exposure: float = 0.2
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    noise: float = 0.01
+    blur: float = 0.4
+    vignetting: float = 0.1
+    defocus: float = 1.0
+
+    def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
+        """Return the factor of automatic exposure; it measures the median as well, so that a window does not rule."""
+        luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])
+        measured = 0.5 * np.median(luminance) + 0.5 * np.minimum(luminance, 4 * np.median(luminance)).mean()
+        return float(self.exposure / max(measured, 1e-6))
+
+    def develop(
+        self, radiance: Float[np.ndarray, "h w 3"], gain: float, rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the 8-bit picture of a radiance image.
+
+        Args:
+            radiance: Linear radiance.
+            gain: Factor of the exposure, from `exposure_gain`.
+            rng: Source of the noise.
+        """
+        h, w = radiance.shape[:2]
+        scale = min(h, w) / 256
+        y, x = np.linspace(-1, 1, h, dtype=np.float32)[:, None], np.linspace(-1, 1, w, dtype=np.float32)
+        falloff = 1 - self.vignetting * (x**2 + y**2) / 2
+        image = radiance.astype(np.float32) * (gain * falloff)[..., None] * np.float32(self.white_balance)
+        image = _blur(image, self.blur * scale)
+        noise = rng.standard_normal((h, w, 3), np.float32) * 0.7 + rng.standard_normal((h, w, 1), np.float32) * 0.7
+        noise = _blur(noise, 0.5 * scale) * (1 + 0.6 * scale)  # demosaicing and noise reduction smooth it
+        image = np.maximum(image + noise * self.noise * np.sqrt(np.maximum(image, 0) * 0.16 + 0.006), 0)
+        image = _tone_curve(image)
+        image = image + 0.35 * (image - _blur(image, 0.9 * scale))  # sharpening, as every such camera does
+        return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    if sigma < 0.1:
+        return image
+    blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    return blurred.reshape(image.shape)
+
+
+def _tone_curve(x: np.ndarray) -> np.ndarray:
+    """Return sRGB values of linear ones by a filmic curve (Narkowicz's fit to ACES)."""
+    x = x * 0.9
+    y = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+    return np.where(y <= 0.0031308, 12.92 * y, 1.055 * y ** (1 / 2.4) - 0.055)
