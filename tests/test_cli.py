@@ -42,7 +42,7 @@ def test_an_unknown_option_is_one_line_and_exit_code_2(command, capsys):
 def test_help_lists_every_command(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    names = "demo benchmark tables compare synth weights train train-baseline label data profile doctor".split()
+    names = "demo benchmark tables compare synth weights train train-baseline label data models profile doctor".split()
     assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
 
 

@@ -22,6 +22,7 @@ from zsp_lite.cli.common import (
     seed_option,
 )
 from zsp_lite.cli.data import data, label
+from zsp_lite.cli.models import models, print_left_out
 from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
@@ -41,7 +42,7 @@ def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (benchmark, tables, compare, profile, data, label):
+for command in (benchmark, tables, compare, profile, data, label, models):
     cli.add_command(command)
 
 
@@ -129,6 +130,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
         "synth --preset paper --out outputs/paper",
         "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
         "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
+        "synth --models path/to/models --image-size 320 --out outputs/models",
     )
 )
 @click.option(
@@ -140,21 +142,45 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     "--category", "categories", multiple=True, metavar="NAME",
     help="A category, or a whole split: training, validation or evaluation. May be repeated.",
 )  # fmt: skip
+@click.option(
+    "--models", "models_folder", type=PATH, metavar="FOLDER",
+    help="Your own textured meshes, CATEGORY/NAME.EXT with EXT one of obj, glb, gltf, ply, stl, dae: a sequence each. "
+    "See `zsp-lite models` for their orientation.",
+)  # fmt: skip
 @click.option("--sequences", type=COUNT, metavar="N", show_default="4", help="With --category: sequences per category.")
-@click.option("--frames", type=COUNT, metavar="N", show_default="24", help="With --category: frames per sequence.")
+@click.option(
+    "--frames", type=COUNT, metavar="N", show_default="24", help="With --category or --models: frames per sequence."
+)
+@click.option(
+    "--image-size", type=click.IntRange(min=32), metavar="PX", show_default="256",
+    help="With --models: shorter image side in pixels.",
+)  # fmt: skip
 @seed_option
 @click.option("--out", type=PATH, metavar="DIR", required=True, help="Folder to write.")
 def synth(
-    preset: str | None, categories: tuple[str, ...], sequences: int | None, frames: int | None, seed: int, out: Path
-) -> None:
-    """Render procedural objects into a CO3D folder; the same seed gives the same files."""
-    if bool(preset) == bool(categories):
-        raise click.UsageError("expected either --preset or --category")
+    preset: str | None, categories: tuple[str, ...], models_folder: Path | None, sequences: int | None,
+    frames: int | None, image_size: int | None, seed: int, out: Path,
+) -> None:  # fmt: skip
+    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files."""
+    if bool(preset) + bool(categories) + bool(models_folder) != 1:
+        raise click.UsageError("expected either --preset or --category or --models")
+    if image_size and not models_folder:
+        raise InputError("--image-size goes with --models; --preset and --category fix the size of the images")
     from tqdm import tqdm
 
     from zsp_lite.synthetic.export import export_categories, export_preset
 
-    if preset:
+    if models_folder:
+        if sequences:
+            raise InputError("--sequences goes with --category; --models makes one sequence per model")
+        from zsp_lite.data.co3d import Co3D
+        from zsp_lite.synthetic.model_export import export_models
+        from zsp_lite.synthetic.model_sheet import write_contact_sheet, write_label_overlay
+
+        print_left_out(export_models(models_folder, out, frames or 24, seed, image_size or 256, progress=tqdm))
+        write_contact_sheet(models_folder, out / "models.html")
+        write_label_overlay(out / "label_overlay.jpg", Co3D(out))
+    elif preset:
         if sequences or frames:
             raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
         export_preset(preset, out, seed, progress=tqdm)

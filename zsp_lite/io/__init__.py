@@ -1,1 +1,0 @@
-"""Files, downloads, PLY point clouds, and the import of Open3D."""

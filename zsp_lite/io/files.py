@@ -1,7 +1,4 @@
-"""Atomic writes, reads with errors that name the file, and checks of paths and names.
-
-The standard library has no atomic write, and the package `atomicwrites` is no longer maintained.
-"""
+"""Atomic writes, reads with errors that name the file, and checks of paths and names."""
 
 import os
 import secrets

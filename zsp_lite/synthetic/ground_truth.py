@@ -23,6 +23,7 @@ from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
 from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
+from zsp_lite.synthetic.model_export import RENDERED_FILE
 from zsp_lite.views import object_crop, patch_mask
 
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
@@ -38,6 +39,9 @@ class _Settings(msgspec.Struct):
 class _Pose(msgspec.Struct):
     trans: tuple[_Row, _Row, _Row, _Row]
     scale: float
+    # Bounding box of a model in canonical coordinates; that of a procedural object follows from its seed.
+    low: tuple[float, float, float] | None = None
+    high: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +94,21 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
     Raises:
         InputError: The folder is not a synthetic export, or a file of the export is damaged.
     """
-    settings, poses = dataset.root / SETTINGS_FILE, dataset.root / category / POSES_FILE
-    for path in (settings, poses):
+    settings, models, poses = (
+        dataset.root / name for name in (SETTINGS_FILE, RENDERED_FILE, f"{category}/{POSES_FILE}")
+    )
+    for path in (models if models.is_file() else settings, poses):
         if not path.is_file():
             raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
-    seed = decode(read_bytes(settings, "settings"), _Settings, settings).seed
+    seed = None if models.is_file() else decode(read_bytes(settings, "settings"), _Settings, settings).seed
     found = {}
     for sequence, pose in decode(read_bytes(poses, "object poses"), dict[str, _Pose], poses).items():
-        trans, vertices = np.array(pose.trans), make_object(category, sequence, seed).vertices
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        trans, low, high = np.array(pose.trans), np.array(pose.low or ()), np.array(pose.high or ())
+        if seed is not None:
+            vertices = make_object(category, sequence, seed).vertices
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+        elif len(low) != 3 or len(high) != 3:
+            raise InputError(f"{poses}, {sequence}: the bounding box `low` and `high` is missing")
         found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, low, high)
     return found
 
