@@ -122,7 +122,7 @@ def label_bytes(label: PoseLabel) -> bytes:
 
 
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """Convert a similarity between two worlds to a label: its rotation, and the translation that maps `centre` alike.
+    """Convert a similarity between two worlds to a label with the same rotation and the same image of `centre`.
 
     The translation of the similarity itself would displace an object that is not at the origin, since a label has no
     scale.
