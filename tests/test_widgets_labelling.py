@@ -187,7 +187,7 @@ def test_errors_are_one_line_in_the_widget(labelling):
     box.views["reference"].widget._handle_custom_msg(
         {"kind": "click", "at": [5.0, 5.0], "view": np.eye(3).ravel().tolist(), "reach": 0.05}, []
     )
-    assert message(box) == "There is no point of the cloud." and len(labelling.names) == 0
+    assert message(box) == "There is no point of the cloud at the click." and len(labelling.names) == 0
     click_all(box, labelling, "reference", "best", 3)
     box.controls["sequence"].value = "a"
     click(box, "sequence", corners(labelling, "a")[0])

@@ -1,4 +1,7 @@
-"""Atomic writes, reads with errors that name the file, and checks of paths and names."""
+"""Atomic writes, reads with errors that name the file, and checks of paths and names.
+
+The standard library has no atomic write, and the package `atomicwrites` is no longer maintained.
+"""
 
 import os
 import secrets

@@ -74,7 +74,7 @@ class _LabellingWidget:
     def pick(self, sequence: str, point: np.ndarray | None) -> str:
         """Add the next keypoint, or move the chosen one."""
         if point is None:
-            return "There is no point of the cloud."
+            return "There is no point of the cloud at the click."
         labelling, chosen = self.labelling, self.controls["keypoint"].value
         same = np.flatnonzero((labelling.picks(sequence) == point).all(axis=1))
         if len(same) and same[0] != chosen:
