@@ -37,7 +37,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
     counts = {name: len(found) for name, found in rows.items()}
     if len(set(counts.values())) > 1 or not counts["rgb.txt"]:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"capture {folder}: the lists have different numbers of lines or none: {found}")
+        raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers, at least 1")
     matrix = _intrinsics(folder / "intrinsics.txt")
     size, frames = None, []
     for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
