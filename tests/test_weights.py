@@ -59,10 +59,10 @@ def test_it_was_trained_on_none_of_the_categories_that_it_is_judged_by():
 
 @pytest.fixture(scope="module")
 def crops():
-    """The target views of the demo's pairs, by category."""
+    """Three target views of each of the demo's pairs, by category."""
     dataset, found = Co3D(sample_data()), {}
     for pair in demo_pairs(dataset):
-        frames = [dataset.frame(pair.category, pair.target_sequence, number) for number in pair.target_frames]
+        frames = [dataset.frame(pair.category, pair.target_sequence, number) for number in pair.target_frames[::2]]
         found.setdefault(pair.category, []).extend(object_crop(dataset.load(frame)) for frame in frames)
     return found
 
