@@ -215,4 +215,4 @@ def test_the_repr_is_one_line_with_the_size_and_what_is_known():
 
 def test_a_notebook_shows_the_picture_and_the_escaped_repr():
     shown = frame(name="<a>")._repr_html_()
-    assert shown.startswith('<img src="data:image/jpeg;base64,') and "&lt;a&gt;" in shown
+    assert '<img src="data:image/png;base64,' in shown and "&lt;a&gt;" in shown

@@ -13,7 +13,8 @@ PACKAGE = Path(zsp_lite.__file__).parent
 # functions, which delay the loading of large libraries, follow the same rule.
 LAYERS = [
     "errors",
-    "io alignment features matchers metrics minimal",
+    "io",
+    "alignment features matchers metrics minimal",
     "data",
     "matching views",
     "best_view points",

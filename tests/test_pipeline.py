@@ -1,7 +1,10 @@
 """The whole method with perfect features: what is left of the error, and how the pose behaves."""
 
+import base64
+import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,7 @@ from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, 
 from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
+from zsp_lite.io.html import picture_html
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import PoseEstimate, ZeroShotPose, match_points, view_alignment
 from zsp_lite.verified import VerifiedSolver
@@ -292,3 +296,21 @@ def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(settings
     with pytest.raises(InputError):
         ZeroShotPose(CoordinateBackbone(), **settings)
     assert ZeroShotPose(CoordinateBackbone(), k=30).k == 30
+
+
+def test_a_notebook_shows_small_pictures_above_the_text(estimate):
+    for part, pictures in ((estimate, 2), (estimate.reference_view.features, 1), (estimate.reference_view.frame, 1)):
+        shown = part._repr_html_()
+        assert repr(part).replace("'", "&#x27;").replace(">", "&gt;") in shown
+        found = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", shown)]
+        assert [cv2.imdecode(np.frombuffer(one, np.uint8), 1).shape for one in found] == [(128, 128, 3)] * pictures
+
+
+def test_a_picture_keeps_its_colours_and_aspect_and_a_map_is_stretched_to_black_and_white():
+    red = np.zeros((64, 32, 3), np.uint8)
+    red[..., 0] = 200
+    ramp = np.linspace(3, 5, 100).reshape(10, 10)
+    shown = re.findall(r"base64,([^\"]+)", picture_html("text", red, ramp))
+    first, second = (cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), 1) for data in shown)
+    assert first.shape == (128, 64, 3) and (first == [0, 0, 200]).all()
+    assert second.min() == 0 and second.max() == 255

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.errors import InputError
+from zsp_lite.io.html import picture_html
 
 Grid = tuple[int, int]  # (rows, columns) of patches
 
@@ -53,6 +54,9 @@ class FeatureMap:
             f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} with saliency > 0.05, keys of "
             f"{channels} channels, global feature of {len(self.global_feature)}, {self.keys.device})"
         )
+
+    def _repr_html_(self) -> str:
+        return picture_html(repr(self), self.saliency.float().cpu().numpy())
 
     @property
     def grid(self) -> Grid:

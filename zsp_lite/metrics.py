@@ -1,4 +1,4 @@
-"""Pose errors, and statistics of many of them (paper sec. 5.1, supplement "evaluation metrics").
+"""Pose errors, and statistics of many of them (paper sec. 5.1, supplement, "Choice of evaluation metrics").
 
 Statistics take optional weights per pair, so that a bootstrap replicate is a row of weights. Pairs that share an
 object are not independent: `object_weights` resamples objects, and its weights give the intervals of this project.

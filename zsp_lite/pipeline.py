@@ -18,6 +18,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import FeatureExtractor
+from zsp_lite.io.html import picture_html
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, key_similarities, match, similarities
 from zsp_lite.metrics import rotation_error
@@ -111,6 +112,9 @@ class PoseEstimate:
             f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})",
         ]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return picture_html(repr(self), self.reference_view.frame.rgb, self.target_views[self.view].frame.rgb)
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6).

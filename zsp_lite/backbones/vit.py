@@ -1,6 +1,6 @@
 """A vision transformer in the layout of the public DINO checkpoints (Caron et al. 2021).
 
-The method uses three outputs (Goodwin et al., section 4.1 and supplement): the *keys* of one block as patch
+The method uses three outputs (Goodwin et al., sections 4.1 and 5.3): the *keys* of one block as patch
 descriptors, the *attention* of the last block's CLS token as saliency, and the CLS output token as global feature.
 `VisionTransformer.extract` returns these three and computes nothing else.
 """

@@ -118,7 +118,7 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
         build("table_a_depth", "Supplement. Without depth", [_Block(THIS_RUN, {
             "No depth (essential matrix)": "ours-nodepth", "Ours-BV": "ours-bv", "Ours": "ours"}, _FIGURES)],
             published.DEPTH),
-        build("published_code", "The paper's way and the published code's", [_Block(THIS_RUN, {
+        build("published_code", "Start and mask of the cycles", [_Block(THIS_RUN, {
             "Cycle from the reference (paper)": "ours", "Cycle from the target (published code)": "ours-published"},
             _FIGURES)]),
     ]  # fmt: skip

@@ -3,8 +3,6 @@
 All image files are opened here.
 """
 
-import base64
-import html
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.io.html import picture_html
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +63,7 @@ class Frame:
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
 
     def _repr_html_(self) -> str:
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(self.rgb[..., ::-1]))
-        image = base64.b64encode(data).decode()
-        return f'<img src="data:image/jpeg;base64,{image}" height="160"><br>{html.escape(repr(self))}'
+        return picture_html(repr(self), self.rgb)
 
     @property
     def _label(self) -> str:
