@@ -40,13 +40,13 @@ def sheet(folder: Path, out: Path) -> None:
 )
 @click.argument("folder", type=PATH)
 @click.argument("model", metavar="CATEGORY/NAME")
-@click.option("--about", type=click.Choice(("front", "left", "up")), default="up", help="Axis to turn about.")
+@click.option("--about", type=click.Choice(("front", "left", "up")), default="up", help="Axis of the rotation.")
 @click.option(
     "--degrees", type=float, required=True, metavar="A",
     help="Angle, counter-clockwise as seen from the tip of the axis.",
 )  # fmt: skip
 def turn(folder: Path, model: str, about: str, degrees: float) -> None:
-    """Turn a model that stands wrong: writes its orientation to FOLDER/models.json."""
+    """Rotate a model: write its new orientation to FOLDER/models.json."""
     from zsp_lite.synthetic.models import turn_model
 
     info = turn_model(folder, model, about, degrees)

@@ -1,4 +1,4 @@
-"""Light of a room on the object and on its floor, and the room as a camera sees it."""
+"""Light of a room on the object and on the floor, and the radiance of the room along camera rays."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ class ShadowMap:
 
 
 class RoomLight:
-    """A room around an object: its radiance along rays, and what arrives at the object.
+    """A room around an object: its radiance along rays and its irradiance at the object.
 
     Args:
         room: Room.
@@ -109,7 +109,7 @@ class RoomLight:
         """Return the radiance of the box's faces along rays.
 
         Args:
-            origin: Origins (n, 3); moved into the box where they are outside.
+            origin: Origins (n, 3); those outside the box are moved into it.
             rays: Directions (n, 3).
             pixel: Angle between neighbouring rays in radians.
             reflections: Whether a glossy floor reflects the room.

@@ -97,7 +97,7 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         ]
     except InputError as error:
         raise InputError(f"model {path}: {error}") from error
-    except Exception as error:  # the readers of trimesh raise whatever a damaged file leads to
+    except Exception as error:  # trimesh raises many types of exceptions for damaged files
         raise InputError(f"model {path} cannot be read: {type(error).__name__}: {error}") from error
     n_faces = sum(len(part.faces) for part in parts)
     if not 0 < n_faces <= MAX_FACES:
@@ -133,7 +133,7 @@ def _require_pycollada(path: Path) -> None:
 
 
 def _missing_textures(path: Path) -> list[str]:
-    """Return what an OBJ file names and its folder lacks; trimesh reads such a file without a word."""
+    """Return the files that an OBJ file refers to and that are missing; trimesh does not report them."""
     if path.suffix.lower() != ".obj":
         return []
     missing = []

@@ -1,4 +1,4 @@
-"""Pictures to check models by eye: a contact sheet of their orientations, and an overlay of the labels."""
+"""Pictures for checking models: a contact sheet of their orientations, and an overlay of the labels."""
 
 import base64
 from collections.abc import Callable, Iterable, Sequence
@@ -106,7 +106,7 @@ def label_overlay(
 ) -> dict[str, tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4 4"], Camera]]:
     """Draw the axes of the reference object on every labelled sequence of a category, placed by the labels alone.
 
-    The frame of a sequence is the one that sees the object most nearly from the front, a little from its left.
+    The frame of a sequence is the one whose viewpoint is closest to the front, slightly from the left.
 
     Args:
         dataset: Synthetic export; the object pose of its reference sequence gives the axes.

@@ -1,6 +1,6 @@
 """A folder of models: `FOLDER/CATEGORY/NAME.obj` (or another extension of `EXTENSIONS`).
 
-A model that brings files of its own may have a folder of its own, `FOLDER/CATEGORY/NAME/FILE.obj`. The optional file
+A model with several files may have its own folder, `FOLDER/CATEGORY/NAME/FILE.obj`. The optional file
 `models.json` gives the orientation and the origin of each model, see `ModelInfo`.
 """
 
@@ -46,10 +46,10 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
 
         Args:
             extension: Extension of the model's file. Where `front` or `up` is not given, it is front +z, up +y (the
-                rule of glTF), and front -y, up +z for STL.
+                convention of glTF), and front -y, up +z for STL.
 
         Raises:
-            InputError: If a direction is not one, or the two are not perpendicular.
+            InputError: If a direction is invalid, or the two are not perpendicular.
         """
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         x, z = (_direction(given) for given in (self.front or front, self.up or up))
@@ -114,12 +114,12 @@ def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
 
 
 def turn_model(folder: str | Path, key: str, axis: str, degrees: float) -> ModelInfo:
-    """Turn a model in its canonical frame and store the new orientation in `models.json`.
+    """Rotate a model in its canonical frame and store the new orientation in `models.json`.
 
     Args:
         folder: Folder of models.
         key: "CATEGORY/NAME".
-        axis: Canonical axis to turn about: "front", "left" or "up".
+        axis: Canonical axis of the rotation: "front", "left" or "up".
         degrees: Angle, counter-clockwise as seen from the tip of the axis.
 
     Returns:
@@ -158,7 +158,7 @@ def _direction(given: _Direction) -> np.ndarray:
 
 
 def _axis_name(vector: np.ndarray) -> _Direction:
-    """Return "+x" ... "-z" where a unit vector is one of them, three numbers otherwise."""
+    """Return "+x" ... "-z" if a unit vector is one of them, otherwise three numbers."""
     axis = int(np.abs(vector).argmax())
     if abs(vector[axis]) > 1 - 1e-9:
         return "-+"[int(vector[axis] > 0)] + "xyz"[axis]

@@ -1,4 +1,4 @@
-"""A cheap camera: from linear radiance to an 8-bit picture."""
+"""Simulation of a cheap camera: conversion of linear radiance to an 8-bit image."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ class CheapCamera:
     defocus: float = 1.0
 
     def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
-        """Return the factor of automatic exposure; it measures the median as well, so that a window does not rule."""
+        """Return the factor of automatic exposure, from mean and median, which limits the effect of bright windows."""
         luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])
         measured = 0.5 * np.median(luminance) + 0.5 * np.minimum(luminance, 4 * np.median(luminance)).mean()
         return float(self.exposure / max(measured, 1e-6))
@@ -50,10 +50,10 @@ class CheapCamera:
         image = radiance.astype(np.float32) * (gain * falloff)[..., None] * np.float32(self.white_balance)
         image = _blur(image, self.blur * scale)
         noise = rng.standard_normal((h, w, 3), np.float32) * 0.7 + rng.standard_normal((h, w, 1), np.float32) * 0.7
-        noise = _blur(noise, 0.5 * scale) * (1 + 0.6 * scale)  # demosaicing and noise reduction smooth it
+        noise = _blur(noise, 0.5 * scale) * (1 + 0.6 * scale)  # smoothed by demosaicing and noise reduction
         image = np.maximum(image + noise * self.noise * np.sqrt(np.maximum(image, 0) * 0.16 + 0.006), 0)
         image = _tone_curve(image)
-        image = image + 0.35 * (image - _blur(image, 0.9 * scale))  # sharpening, as every such camera does
+        image = image + 0.35 * (image - _blur(image, 0.9 * scale))  # sharpening of the camera
         return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 

@@ -255,7 +255,7 @@ def _facade(rng: np.random.Generator, width: float, height: float) -> np.ndarray
 
 
 def studio() -> Room:
-    """Return plain, light grey surroundings with one soft light, for pictures that show a model and nothing else."""
+    """Return plain, light grey surroundings with one soft light, for pictures of single models."""
     plain = np.full((8, 8, 3), 0.55, np.float32)
     light = np.array([0.55, 0.45, 0.7])
     light /= np.linalg.norm(light)

@@ -1,4 +1,4 @@
-"""Procedural textures of floors, which repeat without seams; sRGB colours in [0, 1] where nothing else is said."""
+"""Procedural textures of floors, which repeat without seams; sRGB colours in [0, 1] unless stated otherwise."""
 
 import cv2
 import numpy as np
