@@ -70,7 +70,7 @@ def test_a_turned_picture_has_a_turned_pose(crops):
     index = np.random.default_rng(0).integers(len(crops), size=config.batch)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert rotation_error(euler_to_rotation(labels.numpy()), quarter @ crops.rotation[index]).max() < 0.01
-    plain = posecontrast._pictures(crops, index).mean(1).flatten(1)
+    plain = posecontrast._square_images(crops, index).mean(1).flatten(1)
     for pictures in (first, second):
         # x to the right becomes y downwards: clockwise on the screen.
         back = torch.rot90(pictures, 1, (2, 3)).mean(1).flatten(1)

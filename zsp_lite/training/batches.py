@@ -10,6 +10,7 @@ from torch import Tensor
 
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet
 
+PATCH_SIZE = 8  # pixels
 # Normalisation of RGB values in [0, 1] during training. `export_checkpoint` replaces it by ImageNet's in the patch
 # embedding, and `starting_weights` reverses that.
 MEAN, STD = 0.45, 0.25
@@ -49,10 +50,10 @@ def crop_grids(
         n: Number of crops.
         per_object: Consecutive crops that belong to one object.
         side: Side of the crops in pixels.
-        scale: Smallest and largest width of a crop as a fraction of the picture's.
+        scale: Smallest and largest width of a crop as a fraction of the image's.
 
     Returns:
-        Sampling grids for `grid_sample`, and the matrices that map image directions of the picture to the crop.
+        Sampling grids for `grid_sample`, and the matrices that map directions in the image to directions in the crop.
     """
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
@@ -95,7 +96,6 @@ def sample_batch(
     views: int,
     side: int,
     scale: tuple[float, float],
-    patch_size: int = 8,
     members: np.ndarray | None = None,
 ) -> Batch:
     """Draw a batch of random crops.
@@ -106,8 +106,7 @@ def sample_batch(
         objects: Number of objects.
         views: Views per object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one pair).
         side: Side of the crops in pixels.
-        scale: Smallest and largest width of a crop as a fraction of the picture's.
-        patch_size: Side of a patch in pixels.
+        scale: Smallest and largest width of a crop as a fraction of the image's.
         members: Indices of the objects. Default: random.
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
@@ -118,7 +117,7 @@ def sample_batch(
     rgb = torch.from_numpy(renders.rgb[pick].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2).float() / 255
     maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
             for m in (renders.surface, renders.geometry)]  # fmt: skip
-    n, patches = objects * views, side // patch_size
+    n, patches = objects * views, side // PATCH_SIZE
     grid, turn = crop_grids(rng, n, views, side, scale)
     images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
 

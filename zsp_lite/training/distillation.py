@@ -1,10 +1,10 @@
 """Self-distillation of the backbone, DINO (Caron et al. 2021).
 
-Only pictures are used: no labels, masks, depth or other views. Each picture is cut into two global and several local
+Only images are used: no labels, masks, depth or other views. Each image is cut into two global and several local
 crops. Student and teacher map each crop to a distribution over K outputs, and the student is trained to predict, from
 every crop, the teacher's distribution for the other global crop. The teacher is an exponential average of the student.
 
-Two trivial solutions have a small loss: the same output for every picture, and a uniform distribution. Centring of the
+Two trivial solutions have a small loss: the same output for every image, and a uniform distribution. Centring of the
 teacher's logits prevents the first and favours the second; sharpening, a low teacher temperature, does the opposite.
 """
 
@@ -37,15 +37,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Everything that determines the result of a run, except the pictures and the initial backbone.
+    """Everything that determines the result of a run, except the images and the initial backbone.
 
     Attributes:
         seed: Seed of crops and of the random head.
         steps: Number of steps.
-        images: Pictures per step.
-        local_crops: Local crops per picture, in addition to two global ones.
+        images: Images per step.
+        local_crops: Local crops per image, in addition to two global ones.
         global_side, local_side: Sides of the crops in pixels.
-        global_scale, local_scale: Smallest and largest width of the crops as a fraction of the picture's.
+        global_scale, local_scale: Smallest and largest width of the crops as a fraction of the image's.
         outputs: Number K of outputs. DINO has 65,536.
         hidden, bottleneck: Widths of the head's layers.
         student_temperature, teacher_temperature: Temperatures of the softmax.
@@ -130,10 +130,10 @@ class Network(nn.Module):
 
 
 def multi_crop(
-    pictures: UInt8[np.ndarray, "batch size size 3"], rng: np.random.Generator, config: DistillationConfig
+    images: UInt8[np.ndarray, "batch size size 3"], rng: np.random.Generator, config: DistillationConfig
 ) -> tuple[Float[Tensor, "2 batch 3 g g"], Float[Tensor, "k batch 3 l l"]]:
-    """Cut two global and k local crops out of each picture, each rotated, mirrored and recoloured independently."""
-    rgb = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255
+    """Cut two global and k local crops out of each image, each rotated, mirrored and recoloured independently."""
+    rgb = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
 
     def crops(count: int, side: int, scale: tuple[float, float]) -> Tensor:
         grid, _ = crop_grids(rng, count * len(rgb), 1, side, scale)
@@ -164,8 +164,8 @@ def distillation_loss(
     Returns:
         The loss, and figures in nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl",
         divergence of the student's distributions from them (loss = teacher_entropy + kl); "information", entropy of the
-        teacher's mean distribution minus teacher_entropy, which is the mutual information of output and picture: 0 for
-        both trivial solutions, at most log(batch) if both crops of a picture have the same distribution.
+        teacher's mean distribution minus teacher_entropy, which is the mutual information of output and image: 0 for
+        both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()
@@ -190,7 +190,7 @@ class Distillation(Task):
     Args:
         config: Configuration.
         backbone: Initial backbone; it is copied.
-        rgb: Pictures: several views of each of n objects.
+        rgb: Images, several views of each of n objects.
         measure: Computes figures of the teacher's backbone for the log.
     """
 
@@ -280,8 +280,8 @@ def distil(
     folder = Path(folder)
     network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "layer")}
     rendered = {"proportions": shape.proportions, "deformation": shape.deformation}
-    pictures = {"objects": shape.objects, "pictures_seed": shape.seed}
-    claim_folder(folder, asdict(config) | pictures | rendered | {"network": network})
+    objects = {"objects": shape.objects, "objects_seed": shape.seed}
+    claim_folder(folder, asdict(config) | objects | rendered | {"network": network})
     training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, **rendered)
     start = Trainee(shape)
     initialise(start, training, shape.seed)

@@ -25,7 +25,7 @@ _RENDER_SIZE = 160
 
 @dataclass(frozen=True)
 class ObjectCrops:
-    """Crops of n pictures, the `VIEWS` pictures of an object one after the other.
+    """Crops of n images, the `VIEWS` images of an object one after the other.
 
     Attributes:
         rgb: Crops, resized to squares.
@@ -41,7 +41,7 @@ class ObjectCrops:
         return len(self.rgb)
 
     def split(self, held_out: int) -> tuple["ObjectCrops", "ObjectCrops"]:
-        """Return all but the last `held_out` pictures, and these."""
+        """Return all but the last `held_out` images, and these."""
         parts = (self.rgb, self.aspect, self.rotation)
         first, last = [part[:-held_out] for part in parts], [part[-held_out:] for part in parts]
         return ObjectCrops(*first), ObjectCrops(*last)

@@ -1,7 +1,7 @@
 """Training of "posecontrast-tiny" on pose labels of the training categories (PoseContrast; Xiao et al. 2021).
 
 The loss is PoseContrast's: cross-entropy over the bins of the three angles, Huber loss of the offset within the true
-bin, and a contrastive loss in which a pair of pictures is weighted by the angle between their poses.
+bin, and a contrastive loss in which a pair of images is weighted by the angle between their poses.
 """
 
 import logging
@@ -35,7 +35,7 @@ from zsp_lite.training.export import export_convolutional
 from zsp_lite.training.loop import Task, claim_folder, run
 from zsp_lite.training.object_crops import VIEWS, ObjectCrops, object_crops
 
-_EVALUATED = 400  # held-out pictures, at most
+_EVALUATED = 400  # held-out images, at most
 
 logger = logging.getLogger(__name__)
 
@@ -45,18 +45,18 @@ class PoseContrastConfig:
     """Everything that determines the result of a run.
 
     Attributes:
-        seed: Seed of objects, pictures and random weights.
+        seed: Seed of objects, images and random weights.
         objects: Number of objects, of which the last twelfth is held out.
         steps: Number of steps.
-        batch: Pictures per step.
+        batch: Images per step.
         learning_rate: Largest learning rate.
         weight_decay: AdamW's.
         contrast: Weight of the contrastive loss.
         temperature: Temperature of the contrastive loss.
-        tilt: Standard deviation in degrees of the random in-plane rotation of pictures.
+        tilt: Standard deviation in degrees of the random in-plane rotation of images.
 
     Raises:
-        InputError: For fewer than 2 objects or pictures per step, or no step.
+        InputError: For fewer than 2 objects or images per step, or no step.
     """
 
     seed: int = 0
@@ -128,14 +128,14 @@ def train(config: PoseContrastConfig, folder: str | Path, log: Callable[[str], N
 def sample(
     crops: ObjectCrops, rng: np.random.Generator, config: PoseContrastConfig
 ) -> tuple[Float[Tensor, "b 3 s s"], Float[Tensor, "b 3 s s"], Float[Tensor, "b 3"]]:
-    """Draw a batch of pictures with a random in-plane rotation.
+    """Draw a batch of images with a random in-plane rotation.
 
     Returns:
-        The pictures with two independent colour changes, normalised for the network, and their azimuth, elevation and
+        The images with two independent colour changes, normalised for the network, and their azimuth, elevation and
         in-plane rotation (see `euler_to_rotation`).
     """
     index = rng.integers(len(crops), size=config.batch)
-    images = _pictures(crops, index)
+    images = _square_images(crops, index)
     tilt = np.radians(rng.normal(0, config.tilt, config.batch))
     c, s = np.cos(tilt), np.sin(tilt)
     # The camera rotates about its axis by `tilt`: pixel x shows what was at the position x rotated back.
@@ -167,13 +167,13 @@ def pose_contrast(
 ) -> Float[Tensor, ""]:
     """Compute the pose-aware contrastive loss.
 
-    With unit features f_i and f'_i of two versions of picture i, the angle d_ij between the poses of pictures i and j
+    With unit features f_i and f'_i of two versions of image i, the angle d_ij between the poses of images i and j
     in degrees, and temperature t, it is the mean over i of
 
         -log(p_i / (p_i + sum_j (d_ij / 180) exp(f_i . f_j / t))),  p_i = exp(f_i . f'_i / t).
 
     Args:
-        first, second: Features of the two versions of b pictures.
+        first, second: Features of the two versions of b images.
         labels: Azimuth, elevation and in-plane rotation in degrees.
         temperature: Temperature t.
     """
@@ -190,11 +190,11 @@ def held_out_errors(model: TinyPoseContrast, crops: ObjectCrops) -> dict[str, fl
     """Return the median error in degrees and Acc30 in per cent of absolute poses, on at most 400 crops."""
     model.eval()
     index = np.arange(min(_EVALUATED, len(crops)))
-    angles = predict_angles(*model.estimator(model.network(normalize(_pictures(crops, index)))))
+    angles = predict_angles(*model.estimator(model.network(normalize(_square_images(crops, index)))))
     errors = rotation_error(euler_to_rotation(angles.numpy()), crops.rotation[index])
     return {"held_out_median": round(float(median(errors)), 1), "held_out_acc30": round(float(accuracy(errors, 30)), 1)}
 
 
-def _pictures(crops: ObjectCrops, index: np.ndarray) -> Float[Tensor, "b 3 s s"]:
+def _square_images(crops: ObjectCrops, index: np.ndarray) -> Float[Tensor, "b 3 s s"]:
     squares = np.stack([pad_to_square(crops.rgb[i], float(crops.aspect[i]), TINY_SIZE) for i in index])
     return torch.from_numpy(squares).permute(0, 3, 1, 2).float() / 255

@@ -21,7 +21,7 @@ class Stage:
         steps: Number of steps.
         side: Side of the square crops in pixels.
         objects, views: Objects per step and views per object.
-        scale: Smallest and largest width of a crop as a fraction of the picture's.
+        scale: Smallest and largest width of a crop as a fraction of the image's.
         correspondence: Weight of the correspondence loss at the first and after the last step.
         helpers: Weight of the geometry and attention losses.
         radius: Standard deviation of the correspondence targets in object units.

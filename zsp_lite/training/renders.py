@@ -31,7 +31,7 @@ class RenderSet:
     """Views of n objects.
 
     Attributes:
-        rgb: Pictures.
+        rgb: Images.
         surface: Object coordinates of every fourth pixel, NaN on the background. Two views of one object correspond
             where these agree; they have no meaning across objects.
         geometry: Normal in the camera frame, and depth standardised over the object's pixels of the view.

@@ -1,7 +1,7 @@
 """Training of "swav-tiny" by swapped prediction of cluster assignments (SwAV; Caron et al. 2020).
 
-No labels are used. Each picture is cut into two large and two small crops. The large crops are assigned to prototypes
-by a few Sinkhorn iterations over the batch, which keep the assignments balanced; every other crop of the picture is
+No labels are used. Each image is cut into two large and two small crops. The large crops are assigned to prototypes
+by a few Sinkhorn iterations over the batch, which keep the assignments balanced; every other crop of the image is
 trained to predict the assignment.
 """
 
@@ -38,17 +38,17 @@ class SwavConfig:
         seed: Seed of objects, crops and random weights.
         objects: Number of training objects.
         steps: Number of steps.
-        batch: Pictures per step.
+        batch: Images per step.
         prototypes: Number of prototypes. SwAV has 3,000 for the 1,000 classes of ImageNet.
         large, small: Sides of the crops in pixels.
-        large_scale, small_scale: Smallest and largest width of the crops as a fraction of the picture's.
+        large_scale, small_scale: Smallest and largest width of the crops as a fraction of the image's.
         temperature: Temperature of the predictions.
         regularisation: Entropic regularisation of the Sinkhorn iterations.
         learning_rate: Largest learning rate.
         weight_decay: AdamW's.
 
     Raises:
-        InputError: For numbers below 1, and batches of fewer than 2 pictures.
+        InputError: For numbers below 1, and batches of fewer than 2 images.
     """
 
     seed: int = 0
@@ -85,12 +85,12 @@ class Network(nn.Module):
             nn.BatchNorm1d(hidden),
             nn.ReLU(),
             nn.Linear(hidden, bottleneck),
-            nn.BatchNorm1d(bottleneck, affine=False),  # without it, projections of all pictures stay similar for long
+            nn.BatchNorm1d(bottleneck, affine=False),  # without it, projections of all images stay similar for long
         )
         self.prototypes = nn.Parameter(torch.randn(prototypes, bottleneck))
 
     def forward(self, images: Float[Tensor, "b 3 s s"]) -> Float[Tensor, "b k"]:
-        """Return the cosine similarities of the pictures' projections to the k prototypes."""
+        """Return the cosine similarities of the images' projections to the k prototypes."""
         projected = F.normalize(self.projection(self.backbone(images)), dim=1)
         return F.linear(projected, F.normalize(self.prototypes, dim=1))
 
@@ -101,7 +101,7 @@ def swapped_prediction(
     """Compute the swapped-prediction loss.
 
     Args:
-        scores: Cosine similarities of b pictures' crops to k prototypes; the first two crops are the large ones.
+        scores: Cosine similarities of b images' crops to k prototypes; the first two crops are the large ones.
         temperature: Temperature of the predictions.
         regularisation: Entropic regularisation of the Sinkhorn iterations.
 
@@ -110,7 +110,7 @@ def swapped_prediction(
         the entropy of the mean assignment divided by log k, which is 1 if all prototypes are used equally.
     """
     with torch.no_grad():
-        # Each picture's assignment sums to 1, because columns are normalised last.
+        # Each image's assignment sums to 1, because columns are normalised last.
         assigned = torch.stack(
             [sinkhorn(-score.T.float(), regularisation, 3).T * len(score) for score in scores[:2]]
         ).to(scores.dtype)
@@ -141,8 +141,8 @@ class SwavTraining(Task):
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         config = self.config
         rng = np.random.default_rng([config.seed, 5, step])
-        pictures = torch.from_numpy(self.crops.rgb[rng.integers(len(self.crops), size=config.batch)])
-        crops = multi_crop(pictures.permute(0, 3, 1, 2).float() / 255, rng, config)
+        images = torch.from_numpy(self.crops.rgb[rng.integers(len(self.crops), size=config.batch)])
+        crops = multi_crop(images.permute(0, 3, 1, 2).float() / 255, rng, config)
         scores = torch.cat([self.network(batch).unflatten(0, (2, config.batch)) for batch in crops])
         loss, evenness = swapped_prediction(scores, config.temperature, config.regularisation)
         return loss, {"loss": loss.item(), "evenness": evenness}
@@ -167,16 +167,16 @@ def train(config: SwavConfig, folder: str | Path, log: Callable[[str], None] = l
 
 
 def multi_crop(
-    pictures: Float[Tensor, "b 3 s s"], rng: np.random.Generator, config: SwavConfig
+    images: Float[Tensor, "b 3 s s"], rng: np.random.Generator, config: SwavConfig
 ) -> list[Float[Tensor, "n 3 _ _"]]:
-    """Cut two large and two small crops out of each picture, with independent colour changes.
+    """Cut two large and two small crops out of each image, with independent colour changes.
 
     Returns:
         The large and the small crops, (2 b, 3, side, side) each, normalised for the network.
     """
     found = []
     for side, scale in ((config.large, config.large_scale), (config.small, config.small_scale)):
-        grid, _ = crop_grids(rng, 2 * len(pictures), 1, side, scale)
-        cut = F.grid_sample(pictures.repeat(2, 1, 1, 1), grid, padding_mode="reflection", align_corners=False)
+        grid, _ = crop_grids(rng, 2 * len(images), 1, side, scale)
+        cut = F.grid_sample(images.repeat(2, 1, 1, 1), grid, padding_mode="reflection", align_corners=False)
         found.append(normalize(recolour(rng, cut) * STD + MEAN))
     return found

@@ -10,11 +10,9 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.precision import Precision, autocast, choose_precision
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
-from zsp_lite.training.batches import sample_batch
+from zsp_lite.training.batches import PATCH_SIZE, sample_batch
 from zsp_lite.training.recipe import TrainingConfig
 from zsp_lite.training.renders import VIEWS, RenderSet
-
-_IMAGE_SIZE, _PATCH_SIZE = 224, 8
 
 
 class Trainee(nn.Module):
@@ -32,7 +30,7 @@ class Trainee(nn.Module):
         self.layer = config.layer
         self.precision: Precision | None = None
         size = config.embed_dim, config.depth, config.num_heads
-        self.backbone = VisionTransformer(_IMAGE_SIZE, _PATCH_SIZE, *size)
+        self.backbone = VisionTransformer(224, PATCH_SIZE, *size)
         self.geometry_of_tokens = nn.Linear(config.embed_dim, 5)
         self.geometry_of_keys = nn.Linear(config.embed_dim, 5)
         self.register_buffer("key_mean", torch.zeros(config.embed_dim))
