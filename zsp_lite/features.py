@@ -19,6 +19,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.html import picture_html
 
 Grid = tuple[int, int]  # (rows, columns) of patches
+# A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
+SALIENCY_THRESHOLD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +53,8 @@ class FeatureMap:
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape
         return (
-            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} with saliency > 0.05, keys of "
-            f"{channels} channels, global feature of {len(self.global_feature)}, {self.keys.device})"
+            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} of them foreground, keys of {channels} "
+            f"channels, global feature of {len(self.global_feature)}, {self.keys.device})"
         )
 
     def _repr_html_(self) -> str:
@@ -63,8 +65,8 @@ class FeatureMap:
         """Rows and columns of patches."""
         return self.keys.shape[0], self.keys.shape[1]
 
-    def foreground(self, threshold: float = 0.05) -> Bool[Tensor, "h w"]:
-        """Select the patches whose saliency is above the threshold; 0.05 is that of the published code."""
+    def foreground(self, threshold: float = SALIENCY_THRESHOLD) -> Bool[Tensor, "h w"]:
+        """Select the patches whose saliency is above the threshold."""
         return self.saliency > threshold
 
 

@@ -23,7 +23,7 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from zsp_lite.errors import InputError, check_integer, check_seed
-from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
+from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap, Grid, average_pool, bin_indices
 from zsp_lite.matchers import MATCHERS, Matcher
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
@@ -161,7 +161,7 @@ def match(
     kmeans: bool = True,
     seed: int | np.random.Generator = 0,
     cycle_from: Literal["reference", "target"] = "reference",
-    saliency_threshold: float = 0.05,
+    saliency_threshold: float = SALIENCY_THRESHOLD,
     ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,

@@ -17,7 +17,7 @@ from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.features import FeatureExtractor
+from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.io.html import picture_html
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import Matches, key_similarities, match, similarities
@@ -211,7 +211,7 @@ class ZeroShotPose:
     threshold: float = 0.2
     adaptive_threshold: bool = False
     sample_size: int = 4
-    saliency_threshold: float = 0.05
+    saliency_threshold: float = SALIENCY_THRESHOLD
     foreground: Literal["saliency", "mask"] = "saliency"
     cycle_from: Literal["reference", "target"] = "reference"
     matcher: str | Matcher = "cyclical"
@@ -253,10 +253,10 @@ class ZeroShotPose:
                 depth.
         """
         timings: dict[str, float] = {}
-        with _timed(timings, "crop"):
+        with timed(timings, "crop"):
             size = crop_size(self.backbone)
             frames = [object_crop(frame, size) for frame in (reference, *targets)]
-        with _timed(timings, "features"):
+        with timed(timings, "features"):
             views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
         return self.estimate_from_views(views[0], views[1:], timings)
 
@@ -276,7 +276,7 @@ class ZeroShotPose:
             timings: Seconds of earlier stages, to include in the estimate's.
         """
         timings = dict(timings or {})
-        with _timed(timings, "matching"):
+        with timed(timings, "matching"):
             sims = self.similarities(reference, targets)
             pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
         return self.estimate_from_pairs(reference, targets, pairs, timings)
@@ -358,12 +358,12 @@ def align_best_view(
     This is the `Solver` named "paper"; `ZeroShotPose` explains the settings.
     """
     timings: dict[str, float] = {}
-    with _timed(timings, "view"):
+    with timed(timings, "view"):
         select = VIEW_SELECTORS[view_selector] if isinstance(view_selector, str) else view_selector
         scores = np.array([select(pair) for pair in pairs], dtype=np.float64)
         best = int(scores.argmax())
         matches = pairs[best].matches
-    with _timed(timings, "alignment"):
+    with timed(timings, "alignment"):
         points = match_points(reference, targets[best], matches)
         unit = (standard_deviation(_foreground_points(targets[best])) or 1.0) if adaptive_threshold else 1.0
         flags: tuple[str, ...] = ()
@@ -411,7 +411,8 @@ def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str):
+def timed(timings: dict[str, float], stage: str):
+    """Write the run time of the block to `timings[stage]`, in seconds."""
     start = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - start

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureExtractor, FeatureMap
+from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
@@ -94,7 +94,7 @@ def extract_views(
     backbone: FeatureExtractor,
     frames: Sequence[Frame],
     foreground: str = "saliency",
-    saliency_threshold: float = 0.05,
+    saliency_threshold: float = SALIENCY_THRESHOLD,
 ) -> list[View]:
     """Extract the views of cropped frames, their features in one batch.
 
@@ -104,12 +104,12 @@ def extract_views(
         foreground: "saliency" or "mask" (see `frame_view`).
         saliency_threshold: A patch is foreground if its saliency is above this.
     """
-    features = backbone([frame.rgb for frame in frames])
-    return [frame_view(*pair, foreground, saliency_threshold) for pair in zip(frames, features)]
+    maps = backbone([frame.rgb for frame in frames])
+    return [frame_view(frame, features, foreground, saliency_threshold) for frame, features in zip(frames, maps)]
 
 
 def frame_view(
-    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = 0.05
+    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = SALIENCY_THRESHOLD
 ) -> View:
     """Combine a cropped frame with its features and its foreground patches.
 
@@ -170,7 +170,7 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
 
 
 def soft_saliency(
-    features: FeatureMap, size: tuple[int, int], threshold: float = 0.05
+    features: FeatureMap, size: tuple[int, int], threshold: float = SALIENCY_THRESHOLD
 ) -> Float[np.ndarray, "height width"]:
     """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the threshold, 1 from twice the threshold on.
 

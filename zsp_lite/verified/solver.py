@@ -1,9 +1,7 @@
 """The verified solver: all stages from matched views to ranked hypotheses."""
 
 import hashlib
-import time
 from collections.abc import Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.best_view import ViewPair
-from zsp_lite.pipeline import Hypothesis, PoseEstimate, match_points
+from zsp_lite.pipeline import Hypothesis, PoseEstimate, match_points, timed
 from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, calibration_for, score_margins
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
@@ -119,24 +117,24 @@ class VerifiedSolver:
         """
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
-            with _timed(timings, "scene"):
+            with timed(timings, "scene"):
                 order = _content_order(targets)
                 scene = build_scene(
                     reference, [targets[k] for k in order], [pairs[k].similarity for k in order],
                     [pairs[k].matches for k in order],
                 )  # fmt: skip
-            with _timed(timings, "proposals"):
+            with timed(timings, "proposals"):
                 poses = propose_poses(scene, rng)
-            with _timed(timings, "alignment"):
+            with timed(timings, "alignment"):
                 if self.icp:
                     poses = soft_icp(scene, poses, feature_weight=self.feature_weight)
-            with _timed(timings, "verification"):
+            with timed(timings, "verification"):
                 score = self.weights.score(score_terms(scene, poses))
                 poses = poses[non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)]
-            with _timed(timings, "refinement"):
+            with timed(timings, "refinement"):
                 if self.refinement:
                     poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
-            with _timed(timings, "ranking"):
+            with timed(timings, "ranking"):
                 terms = score_terms(scene, poses)
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
@@ -202,10 +200,3 @@ def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
     keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
     return tuple(sorted(range(len(targets)), key=keys.__getitem__))
-
-
-@contextmanager
-def _timed(timings: dict[str, float], stage: str):
-    start = time.perf_counter()
-    yield
-    timings[stage] = time.perf_counter() - start
