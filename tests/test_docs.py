@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import click
@@ -104,6 +105,14 @@ def test_every_make_target_that_is_named_exists(page):
     for command in commands:
         if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
             assert set(words) <= targets, command
+
+
+def test_the_page_on_installation_lists_every_extra():
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    listed = re.findall(
+        r"^\| `pip install 'zsp-lite\[(\w+)\]'`", markdown(REPOSITORY / "docs" / "install.md"), re.MULTILINE
+    )
+    assert {*listed} == {*extras} - {"test", "dev"}
 
 
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
