@@ -1,6 +1,6 @@
 """README.md, docs/, notebooks' text: links lead somewhere, names exist, commands parse, the README's code runs."""
 
-import importlib
+import importlib.util
 import json
 import re
 import shlex
@@ -84,6 +84,8 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
         for attribute in attributes:
             module = f"{module}.{attribute}"
             found = getattr(found, attribute, None) or importlib.import_module(module)
+    for module in re.findall(r"python -m (tools\.[\w.]*\w)", text):
+        assert importlib.util.find_spec(module), module
     for path in re.findall(r"\b(?:zsp_lite|notebooks|tests|tools|data_samples)/[\w./-]*\w", text):
         assert (REPOSITORY / path).exists() or path.startswith("notebooks/exercises/re"), path
 
