@@ -89,8 +89,8 @@ def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_cro
     assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
 
 
-def test_both_collapsed_answers_agree_perfectly_and_tell_nothing():
-    """A constant output and a uniform one have no divergence and no information; a telling one has log(pictures)."""
+def test_both_trivial_solutions_have_no_divergence_and_no_information():
+    """A different output for each of four images has an information of log(4)."""
     constant, uniform = torch.zeros(8), torch.zeros(8)
     constant[3] = 50.0
     for output, entropy in ((constant, 0.0), (uniform, math.log(8))):
@@ -119,7 +119,7 @@ def test_logits_are_cosines():
         torch.testing.assert_close(head(x), logits)
 
 
-def test_crops_come_from_their_own_picture_and_differ(pictures):
+def test_crops_come_from_their_own_image_and_differ(pictures):
     rng = np.random.default_rng
     large, small = multi_crop(pictures[:3, 0], rng(5), TINY)
     assert large.shape == (2, 3, 3, 32, 32) and small.shape == (2, 3, 3, 16, 16)
@@ -156,7 +156,7 @@ def test_centre_and_teacher_are_running_averages(pictures, backbone):
 
 
 def test_it_collapses_without_centring_and_without_sharpening(pictures, backbone):
-    """DINO, section 5.3: no centring, one output for all; no sharpening, all outputs alike; both together, neither."""
+    """DINO, section 5.3: without centring one output for all images, without sharpening a uniform distribution."""
     last = {}
     settings = {"both": {}, "no centring": dict(centring=False), "no sharpening": dict(sharpening=False)}
     for name, changes in settings.items():
@@ -193,15 +193,10 @@ def test_the_given_backbone_is_left_as_it_was(pictures, backbone):
     assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())
 
 
-SHAPE = TrainingConfig(objects=2, embed_dim=24, depth=2, num_heads=2, layer=1)
+SHAPE = TrainingConfig(objects=4, embed_dim=24, depth=2, num_heads=2, layer=1)
 
 
-@pytest.fixture(scope="module")
-def renders(tmp_path_factory):
-    return tmp_path_factory.mktemp("renders")
-
-
-def test_a_killed_run_resumes_to_the_same_weights_and_log(renders, tmp_path):
+def test_a_killed_run_resumes_to_the_same_weights_and_log(render_folder, tmp_path):
     """The log has the loss, the teacher's entropy and what is found on objects that no step has seen."""
 
     class Killed(Exception):
@@ -212,7 +207,7 @@ def test_a_killed_run_resumes_to_the_same_weights_and_log(renders, tmp_path):
             raise Killed
 
     config = replace(TINY, steps=5, images=4)
-    options = dict(renders=renders, checkpoint_every=2, log_every=1)
+    options = dict(renders=render_folder, checkpoint_every=2, log_every=1)
     whole = distil(config, SHAPE, tmp_path / "whole", log=lambda line: None, **options)
     with pytest.raises(Killed):
         distil(config, SHAPE, tmp_path / "killed", log=kill_at_four, **options)
@@ -232,10 +227,10 @@ def test_a_killed_run_resumes_to_the_same_weights_and_log(renders, tmp_path):
             distil(config, replace(SHAPE, **other), tmp_path / "killed", log=lambda line: None, **options)
 
 
-def test_both_trainers_are_measured_alike(renders):
-    """A trainee's own backbone, put in another trainee's place, is the same one to `held_out_accuracy`."""
-    training, held_out = training_and_held_out(renders, SHAPE.objects)
-    assert (len(training), len(held_out)) == (2, 1)
+def test_both_trainings_are_evaluated_by_the_same_code(render_folder):
+    """A trainee and its backbone in another trainee have the same `held_out_accuracy`."""
+    training, held_out = training_and_held_out(render_folder, SHAPE.objects)
+    assert (len(training), len(held_out)) == (4, 1)
     assert not any(np.array_equal(held_out.rgb[0], pictures) for pictures in training.rgb)
     model = Trainee(SHAPE)
     initialise(model, training, 0)

@@ -156,7 +156,7 @@ def test_weights_that_no_run_can_start_from_are_refused_before_a_folder_is_made(
     assert not (tmp_path / "run").exists()
 
 
-def test_read_outs_of_exported_weights_are_fitted_before_they_are_trained(renders):
+def test_heads_of_exported_weights_are_fitted_before_they_are_trained(renders):
     """They read normals and foreground on other crops than the fit's; depth takes more than these four objects."""
     model = Trainee(CONTINUATION)
     assert model.load_state_dict(starting_weights(CONTINUATION, "zsp-tiny"), strict=False).missing_keys
@@ -233,7 +233,7 @@ def test_a_damaged_run_and_no_objects_are_refused_in_one_line(render_folder, ren
         train(TINY, tmp_path, render_folder)
 
 
-def test_the_command_trains_continues_and_distils(render_folder, renders, tmp_path, capsys, monkeypatch):
+def test_the_command_trains_continues_and_distils(render_folder, renders, tmp_path, capsys, caplog, monkeypatch):
     """The command with tiny recipes: one step in each stage."""
     monkeypatch.setattr("zsp_lite.training.loop.keep_freed_memory", lambda: None)  # this process lives on
     monkeypatch.setattr(recipe, "TrainingConfig", lambda: TINY)
@@ -251,6 +251,7 @@ def test_the_command_trains_continues_and_distils(render_folder, renders, tmp_pa
 
     first, name = run("first")
     assert name == "zsp-tiny.safetensors" and first["step"] == 2 and first["view"] > 0
+    assert "step 2  seconds" in caplog.text  # lines of the log are messages of the module's logger
     second, _ = run("second", "--start-from", str(tmp_path / "first" / "checkpoint.pt"))
     assert second["step"] == 1
     third, name = run("third", "--self-distillation")

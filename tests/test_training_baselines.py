@@ -1,4 +1,4 @@
-"""The trainers of the small stand-ins: their pictures' poses are right, their losses do what the papers say."""
+"""Training of the small baseline networks: poses of the training images, losses, resumption, shipped weights."""
 
 import json
 import shutil
@@ -57,8 +57,8 @@ def test_finished_crops_are_used_again(folder, crops):
     assert len(first) == len(last) == VIEWS and (last.rgb == crops.rgb[VIEWS:]).all()
 
 
-def test_a_turned_picture_has_a_turned_pose(crops):
-    """Turned by a right angle, a square picture is `rot90`, and so is its label."""
+def test_a_rotated_image_has_a_rotated_pose(crops):
+    """A rotation by 90 degrees equals `rot90` of the image and rotates its label."""
     config = PoseContrastConfig(batch=4, tilt=7)
 
     class Right(np.random.Generator):
@@ -71,9 +71,9 @@ def test_a_turned_picture_has_a_turned_pose(crops):
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert rotation_error(euler_to_rotation(labels.numpy()), quarter @ crops.rotation[index]).max() < 0.01
     plain = posecontrast._square_images(crops, index).mean(1).flatten(1)
-    for pictures in (first, second):
+    for images in (first, second):
         # x to the right becomes y downwards: clockwise on the screen.
-        back = torch.rot90(pictures, 1, (2, 3)).mean(1).flatten(1)
+        back = torch.rot90(images, 1, (2, 3)).mean(1).flatten(1)
         alike = torch.nn.functional.cosine_similarity(back - back.mean(1, True), plain - plain.mean(1, True))
         assert alike.min() > 0.9
 
@@ -89,7 +89,7 @@ def test_the_viewpoint_loss_is_least_for_the_true_bins_and_offsets():
     assert viewpoint_loss([logit.roll(1, 1) for logit in logits], offsets, labels) > 30
 
 
-def test_pictures_of_one_pose_are_no_negatives_of_each_other():
+def test_images_with_the_same_pose_are_no_negatives_of_each_other():
     feature = torch.eye(3)[:2]
     same = torch.tensor([[30.0, 90.0, 180.0]] * 2)
     opposite = torch.tensor([[30.0, 90.0, 180.0], [210.0, 90.0, 180.0]])
@@ -106,15 +106,15 @@ def test_swapped_predictions_of_agreeing_crops_cost_least():
         torch.stack([scores, scores, scores.roll(1, 0), scores.roll(2, 0)]), config.temperature, config.regularisation
     )
     assert agree < 0.05 < 3 < differ and evenness == pytest.approx(1, abs=1e-3)
-    # Even if all pictures prefer one prototype, assignments are spread over all of them.
+    # Even if all images prefer one prototype, assignments are spread over all of them.
     one = torch.eye(8)[:1].repeat(8, 1) + 0.01 * torch.rand(8, 8, generator=torch.Generator().manual_seed(0))
     assert swapped_prediction(torch.stack([one] * 2), 0.1, 0.05)[1] > 0.9
 
 
 def test_crops_are_two_large_and_two_small_ones():
-    pictures = torch.rand(3, 3, SIZE, SIZE)
+    images = torch.rand(3, 3, SIZE, SIZE)
     config = SwavConfig()
-    large, small = multi_crop(pictures, np.random.default_rng(0), config)
+    large, small = multi_crop(images, np.random.default_rng(0), config)
     assert large.shape == (6, 3, config.large, config.large) and small.shape == (6, 3, config.small, config.small)
 
 
@@ -163,7 +163,7 @@ def test_killed_trainings_resume_to_the_same_weights(folder, tmp_path, monkeypat
         ("posecontrast-tiny", load_posecontrast_tiny, PoseContrastConfig()),
     ],
 )
-def test_a_shipped_stand_in_loads_and_has_seen_no_evaluation_category(name, load, recipe):
+def test_a_shipped_network_loads_and_was_trained_on_no_evaluation_category(name, load, recipe):
     config = json.loads((WEIGHTS / f"{name}.json").read_text())
     assert config == json.loads(json.dumps(asdict(recipe))) | {"categories": list(TRAINING)}
     assert config["categories"] and not set(config["categories"]) & set(EVALUATION)

@@ -179,8 +179,8 @@ def test_losses_of_crops_without_an_object_are_zero_not_nan():
     assert keys.grad.isfinite().all()
 
 
-def test_siblings_keep_the_build_and_change_the_proportions():
-    """Vertex i of a sibling is the same place of the same part, so that correspondence is known."""
+def test_variants_keep_the_parts_and_change_the_proportions():
+    """Vertex i of a variant is the same point of the same part, so that correspondences are known."""
     builds = [(generator, 5) for generator in TRAINING.values()] + [(random_assembly, seed) for seed in range(30)]
     for generator, seed in builds:
         first = make_shape(generator, seed)
