@@ -287,7 +287,11 @@ def train(
 )
 @click.argument("name", type=click.Choice(("swav-tiny", "posecontrast-tiny")))
 @click.option(
-    "--out", type=PATH, metavar="DIR", show_default="outputs/NAME", help="Folder for renders, log and weights."
+    "--out",
+    type=PATH,
+    metavar="DIR",
+    show_default="outputs/NAME",
+    help="Folder for renders, log, checkpoint and weights. An existing run is resumed.",
 )
 @click.option("--objects", type=COUNT, metavar="N", show_default="the configuration's", help="Training objects.")
 @click.option("--steps", type=COUNT, metavar="N", show_default="the configuration's", help="Training steps.")
