@@ -67,4 +67,4 @@ if __name__ == "__main__":
         print(done, flush=True)
 
     data, out, workers = sys.argv[1:]
-    evaluate(data, SlowBackbone(), ("ours", "ours-bv"), 6, 3, out=out, progress=report, workers=int(workers))
+    evaluate(data, SlowBackbone(grid=8), ("ours", "ours-bv"), 6, 3, out=out, progress=report, workers=int(workers))

@@ -23,7 +23,7 @@ from zsp_lite.data.pairs import sample_pairs, write_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 
-BACKBONE = CoordinateBackbone()
+BACKBONE = CoordinateBackbone(grid=8)
 ROWS = ("ours", "ours-bv", "oracle-view")
 
 
@@ -145,7 +145,7 @@ def test_frames_that_cannot_be_used_count_as_failures(folder, tmp_path):
         def features(self, image):
             raise InputError("blind")
 
-    summary = evaluate(folder, Blind(), ("ours",), 2, 5, out=tmp_path, categories=["lump"])
+    summary = evaluate(folder, Blind(grid=8), ("ours",), 2, 5, out=tmp_path, categories=["lump"])
     row = summary["methods"]["ours"]
     assert row["failed"] == row["n"] == 2 and row["acc30"] == 0 and row["median"] == 180
 
@@ -169,7 +169,7 @@ def test_a_folder_of_another_run_is_refused(run, folder):
     with pytest.raises(InputError, match="pairs"):
         evaluate(folder, BACKBONE, ("ours",), 7, 5, out=run[0])
     with pytest.raises(InputError, match="backbone"):
-        evaluate(folder, _Renamed(), ("ours",), 6, 5, out=run[0])
+        evaluate(folder, _Renamed(grid=8), ("ours",), 6, 5, out=run[0])
 
 
 def test_unknown_methods_categories_and_folders_are_refused(folder, tmp_path):

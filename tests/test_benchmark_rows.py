@@ -16,7 +16,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 
-BACKBONE = CoordinateBackbone()
+BACKBONE = CoordinateBackbone(grid=8)
 ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
 
 

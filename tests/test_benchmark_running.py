@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -37,8 +38,8 @@ from zsp_lite.data.labels import read_labels, write_label
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 
-BACKBONE = CoordinateBackbone()
-QUICK = SlowBackbone(_seconds=0)
+BACKBONE = CoordinateBackbone(grid=8)
+QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
 TESTS = Path(__file__).parent
 
@@ -69,20 +70,30 @@ def kill(process: subprocess.Popen) -> None:
 
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
     stored = 0
-    for more in (1, 3):
-        process = start(tmp_path)
+    for workers, more in ((2, 1), (1, 3)):
+        process = start(tmp_path, workers)
         reached = wait_for_pairs(process, stored + more)
+        children = _children(process.pid)
         with pytest.raises(InputError, match="another run is writing"):
             evaluate(small_folder(), QUICK, ROWS, 6, 3, out=tmp_path)
         kill(process)
         stored = len(read_records(tmp_path).evaluations)
         assert stored >= reached
+        wait_for_end(children)  # a killed run's workers end by themselves
     assert 4 <= stored < 12
-    # What is there has tables.
-    interrupted = read_results(tmp_path)
-    assert interrupted.summary["methods"]["ours"]["n"] == stored
+    # An interrupted run has tables of what is finished.
+    assert read_results(tmp_path).summary["methods"]["ours"]["n"] == stored
     assert evaluate(small_folder(), QUICK, ROWS, 6, 3, out=tmp_path)["methods"] == undisturbed[1]["methods"]
     assert [len(found) for found in read_records(tmp_path).evaluations.values()] == 12 * [1]
+
+
+def wait_for_end(pids: set[int]) -> None:
+    deadline = time.monotonic() + 20
+    for pid in pids:
+        status = Path(f"/proc/{pid}/stat")
+        while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
+            assert time.monotonic() < deadline, f"worker {pid} outlives its run"
+            time.sleep(0.05)
 
 
 def test_a_transaction_cut_off_by_a_kill_is_rolled_back(undisturbed, tmp_path):
@@ -103,7 +114,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert read_records(run) == before
 
 
-def test_two_processes_find_what_one_finds_and_one_dying_costs_nothing_but_time(undisturbed, tmp_path):
+def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path):
     seen = []
 
     def kill_a_worker(done: int, total: int) -> None:
@@ -112,27 +123,13 @@ def test_two_processes_find_what_one_finds_and_one_dying_costs_nothing_but_time(
         seen.append((done, total))
 
     before = _children(os.getpid())
-    arguments = (small_folder(), SlowBackbone(), ROWS, 6, 3)
+    arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3)
     with pytest.raises(InputError, match="run again"):
         evaluate(*arguments, out=tmp_path, workers=2, progress=kill_a_worker)
-    again = evaluate(*arguments, out=tmp_path, workers=2, progress=lambda *step: seen.append(step))
+    assert len(read_records(tmp_path).evaluations) >= seen[0][0]
+    again = evaluate(*arguments, out=tmp_path, progress=lambda *step: seen.append(step))
     assert again["methods"] == undisturbed[1]["methods"]
     assert [total for _, total in seen] == [12] * len(seen) and seen[-1] == (12, 12)
-
-
-def test_workers_of_a_killed_run_end_and_what_they_returned_is_kept(tmp_path):
-    process = start(tmp_path, workers=2)
-    reached = wait_for_pairs(process, 1)
-    workers = _children(process.pid)
-    kill(process)
-    assert len(read_records(tmp_path).evaluations) >= reached
-    for pid in workers:
-        for _ in range(100):
-            if not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split(")")[1]:
-                break
-            subprocess.run(["sleep", "0.05"])
-        else:
-            pytest.fail(f"worker {pid} outlives its run")
 
 
 def _children(pid: int) -> set[int]:
@@ -140,6 +137,7 @@ def _children(pid: int) -> set[int]:
     return {int(child) for child in listed.split()}
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path):
     from distributed import LocalCluster
 
@@ -154,7 +152,7 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
 
         address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
         summary = evaluate(
-            small_folder(), SlowBackbone(), ROWS, 6, 3, out=tmp_path, executor=address, progress=kill_once
+            small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, out=tmp_path, executor=address, progress=kill_once
         )
     assert killed and killed[0] < 12
     assert summary["methods"] == undisturbed[1]["methods"]
@@ -193,7 +191,7 @@ class Sociable(CoordinateBackbone):
 
 def test_a_frame_is_described_by_itself_so_that_no_order_matters():
     (chunk,) = make_chunks(work_of(ROWS, 6, 3))
-    evaluator = Evaluator(Setup(str(small_folder()), resolve(ROWS), Sociable()))
+    evaluator = Evaluator(Setup(str(small_folder()), resolve(ROWS), Sociable(grid=8)))
 
     def errors(chunk):
         return {record["pair"]: record["results"]["ours"]["error"] for record in evaluator.records(chunk)}
@@ -314,7 +312,7 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     rows = {name: name for name in ("ours", "ours-k30", "ours-n1", "ours-globalsim")} | {"six": Method(targets=6)}
-    evaluate(small_folder(), Counting(), rows, 4, 3, out=tmp_path, categories=["lump"])
+    evaluate(small_folder(), Counting(grid=8), rows, 4, 3, out=tmp_path, categories=["lump"])
     frames = {key for pair in work_of(rows, 4, 3) for key in frame_keys(pair)}
     assert sum(calls) == len(frames) and set(calls) == {1}
 

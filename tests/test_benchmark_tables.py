@@ -3,9 +3,8 @@
 import csv
 import gzip
 import io
-import json
+import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from rich.console import Console
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.compare import compare, comparison_table, split_rows
 from zsp_lite.benchmark.database import RunFolder
-from zsp_lite.benchmark.document import with_tables
 from zsp_lite.benchmark.figures import (
     accuracy_against_views,
     error_curves,
@@ -23,19 +21,20 @@ from zsp_lite.benchmark.figures import (
     reliability_diagram,
     write_figures,
 )
-from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, write_tables
+from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, insert_tables, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
 from zsp_lite.benchmark.summary import category_of, objects_of, weights_of_pairs
 from zsp_lite.benchmark.tables import (
-    OTHER_DATA,
+    PUBLISHED,
     THIS_RUN,
-    Cell,
+    PValue,
     all_rows,
     by_category,
     category_tables,
     every_table,
+    make_table,
     paper_tables,
 )
 from zsp_lite.data.pairs import Pair
@@ -83,8 +82,7 @@ def run(tmp_path_factory):
 
 
 def cell(table, row, column, group=THIS_RUN):
-    index = [(c.group, c.title) for c in table.columns].index((group, column))
-    return dict(table.rows)[row][index]
+    return table.cells.loc[row, (group, column)]
 
 
 def test_every_table_of_the_paper_is_there(run):
@@ -105,20 +103,20 @@ def test_a_tables_figures_are_the_runs_and_the_published_ones_stand_apart(run):
     assert found.value == pytest.approx(np.mean(medians)) and found.low < found.value < found.high
     toasters = run[1]["methods"]["icp"]["per_category"]["toaster"]
     assert cell(tables["table_1"], "ICP", "toaster Acc30").value == toasters["acc30"]
-    assert cell(tables["table_1"], "ICP", "toaster Acc30", OTHER_DATA).value == 7.0
+    assert cell(tables["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
     assert cell(tables["table_1"], "SWaV", "Acc30 (%)") is None
-    assert cell(tables["table_1"], "SWaV", "Acc30 (%)", OTHER_DATA).value == 7.5
-    assert cell(tables["table_1"], "swav-tiny (stand-in)", "Acc30 (%)", OTHER_DATA) is None
+    assert cell(tables["table_1"], "SWaV", "Acc30 (%)", PUBLISHED).value == 7.5
+    assert cell(tables["table_1"], "swav-tiny (stand-in)", "Acc30 (%)", PUBLISHED) is None
     found = cell(tables["table_a_correspondences"], "K = 70", "Acc15 (%)", f"{THIS_RUN}: without k-means")
     assert found.value == run[1]["methods"]["ours-k70-nokmeans"]["acc15"]
-    assert cell(tables["table_a_targets"], "views = 20", "full: Acc30 (%)", OTHER_DATA).value == 52.1
-    assert [row for row, _ in tables["beyond"].rows] == ["ours", "rootsift", "verified"]
+    assert cell(tables["table_a_targets"], "views = 20", "full: Acc30 (%)", PUBLISHED).value == 52.1
+    assert list(tables["beyond"].cells.index) == ["ours", "rootsift", "verified"]
 
 
 def test_a_run_of_three_rows_has_no_table_of_what_it_lacks(tmp_path):
     summary = made_up_run(tmp_path, ["ours", "ours-bv", "rootsift"])
     assert [table.name for table in paper_tables(summary)] == ["table_2", "table_a_targets", "table_a_depth", "beyond"]
-    assert len(all_rows(summary).rows) == 3
+    assert len(all_rows(summary).cells) == 3
     found = read_results(tmp_path)
     keys = sorted(found.rows["ours"], key=lambda key: (CATEGORIES.index(category_of(key)), key))
     errors = [[found.errors(name)[key] for key in keys] for name in ("rootsift", "ours")]
@@ -131,7 +129,7 @@ def test_the_verified_solver_stands_beside_the_papers_by_number_of_views(tmp_pat
     rows = ["ours", "ours-n1", *GROUPS["verified-views"]]
     summary = made_up_run(tmp_path, rows)
     table = next(table for table in paper_tables(summary) if table.name == "verified_targets")
-    assert [label for label, _ in table.rows] == [f"views = {n}" for n in (1, 3, 5, 10)]
+    assert list(table.cells.index) == [f"views = {n}" for n in (1, 3, 5, 10)]
     for n, name in ((1, "verified-mask-n1"), (5, "verified-mask"), (10, "verified-mask-n10")):
         found = cell(table, f"views = {n}", "Acc30 (%)", f"{THIS_RUN}: verified, true mask")
         assert found.value == summary["methods"][name]["acc30"]
@@ -142,8 +140,8 @@ def test_the_verified_solver_stands_beside_the_papers_by_number_of_views(tmp_pat
 
 def test_every_category_has_its_figure_for_every_row(run):
     for table, figure in zip(category_tables(run[1]), ("median", "acc30", "acc15"), strict=True):
-        assert [column.title for column in table.columns] == [*CATEGORIES, "all"]
-        for name, cells in table.rows:
+        assert [title for _, title in table.cells.columns] == [*CATEGORIES, "all"]
+        for name, *cells in table.cells.itertuples():
             row = run[1]["methods"][name]["per_category"]
             assert [one.value for one in cells[:-1]] == [row[category][figure] for category in CATEGORIES]
 
@@ -153,39 +151,25 @@ def test_rows_of_other_numbers_of_views_are_tested_where_they_ask_the_same(run):
     assert "ours-n1" in against and "ours" not in against
 
 
-class Cells(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.rows, self.classes = [], []
-
-    def handle_starttag(self, tag, attributes):
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-            self.classes.append(dict(attributes).get("class"))
-
-    def handle_data(self, data):
-        if self.rows and self.rows[-1]:
-            self.rows[-1][-1] += data.strip()
-
-
 def test_all_formats_say_the_same(run):
     table = next(table for table in paper_tables(run[1]) if table.name == "table_3")
     ours = run[1]["methods"]["ours"]
     text = f"{ours['acc30']:.1f} [{ours['acc30_ci'][0]:.1f}, {ours['acc30_ci'][1]:.1f}]"
     lines = list(csv.DictReader(io.StringIO(as_csv(table))))
+    assert lines[3]["row"] == "CorrespondSim"
     assert float(lines[3][f"{THIS_RUN}: Acc30 (%)"]) == ours["acc30"]
     assert float(lines[3][f"{THIS_RUN}: Acc30 (%) low"]) == ours["acc30_ci"][0]
-    assert f"{OTHER_DATA}: Acc30 (%) low" not in lines[0]
+    assert f"{PUBLISHED}: Acc30 (%) low" not in lines[0]
     markdown = as_markdown(table).splitlines()
     assert text in markdown[-3] and markdown[2].count("|") == markdown[-3].count("|")
     latex = as_latex(table)
-    assert text in latex and "46.3" in latex and "\\%" in latex and latex.count("\\begin") == latex.count("\\end") == 2
-    assert {line.count(" & ") for line in latex.splitlines() if line.endswith("\\\\") and "multi" not in line} == {6}
-    cells = Cells()
-    cells.feed(as_html(table))
-    assert text in cells.rows[-1] and cells.rows[-1][-2] == "46.3" and cells.classes.count("published") == 3 * 5 + 1
+    assert text in latex and "46.3" in latex and "95 \\%" in latex
+    assert latex.count("\\begin") == latex.count("\\end") == 2 and "\\toprule" in latex
+    lines = [line for line in latex.splitlines() if line.endswith("\\\\") and "multi" not in line]
+    assert {line.count(" & ") for line in lines} == {6}
+    (last,) = re.findall(r"<th>CorrespondSim</th>(.*?)</tr>", as_html(table), re.DOTALL)
+    values = re.findall(r"<td>(.*?)</td>", last)
+    assert values[1] == text and values[4] == "46.3" and as_html(table).count(PUBLISHED) == 1
     console = Console(width=250, file=io.StringIO())
     console.print(as_rich(table))
     shown = console.file.getvalue()
@@ -201,11 +185,11 @@ def test_tables_are_written_in_all_formats(run, tmp_path):
 def test_a_document_gets_the_tables_that_it_has_marks_for(run):
     first, second = (f"<!-- table {name} -->\nold\n<!-- end of table -->\n" for name in ("table_1", "table_3"))
     text = f"before\n{first}between\n{second}"
-    once = with_tables(text, every_table(run[1]), 1234)
+    once = insert_tables(text, every_table(run[1]), 1234)
     assert "old" not in once and once.startswith("before\n<!-- table table_1 -->\n**Table 1.") and "between" in once
     assert f"{run[1]['methods']['ours']['acc30']:.1f}" in once and "hydrant" not in once
-    assert with_tables(once, every_table(run[1]), 1234) == once
-    assert "old" not in with_tables(text.replace("\n", "\r\n"), every_table(run[1]), 1234)
+    assert insert_tables(once, every_table(run[1]), 1234) == once
+    assert "old" not in insert_tables(text.replace("\n", "\r\n"), every_table(run[1]), 1234)
     lost = text.replace("<!-- end of table -->\nbetween", "between")
     for wrong, told in (
         ("no marks", "no marked table"),
@@ -215,14 +199,14 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
         (text[text.index("old") :], "expected a start and an end for each"),
     ):
         with pytest.raises(InputError, match=told):
-            with_tables(wrong, every_table(run[1]), 1234)
+            insert_tables(wrong, every_table(run[1]), 1234)
 
 
 def test_the_tables_of_the_documentation_are_those_of_the_stored_run():
     repository = Path(__file__).parents[1]
     summary = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz").summary
     text = (repository / "docs" / "results.md").read_text()
-    assert with_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
+    assert insert_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
     assert set(GROUPS["all"]) <= summary["methods"].keys() and len(summary["data"]["categories"]) == 20
     assert {row["n"] for row in summary["methods"].values()} == {2000}
 
@@ -233,7 +217,6 @@ def test_the_papers_figures_were_copied_right():
               published.CORRESPONDENCES, published.DEPTH, published.TRIALS)  # fmt: skip
     for table in tables:
         assert all(len(row) == len(table.columns) for row in table.rows.values())
-    assert len(published.CATEGORIES) == 20
 
 
 def test_a_run_in_one_file_gives_the_same_tables(run, tmp_path):
@@ -278,8 +261,8 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
     assert found["icp"].acc30[1] - found["icp"].acc30[0] == pytest.approx(test["accuracy_gain"])
     (mixed,) = compare(first, first, [("ours", "icp")])
     table = comparison_table([mixed], "a", "b")
-    assert table.rows[0][0] == "ours:icp" and len(table.rows[0][1]) == len(table.columns)
-    heading, rule, line = as_markdown(replace(table, rows=(("a|b", table.rows[0][1]),))).splitlines()[2:5]
+    assert list(table.cells.index) == ["ours:icp"]
+    heading, rule, line = as_markdown(replace(table, cells=table.cells.set_axis(["a|b"]))).splitlines()[2:5]
     assert len({text.replace("\\|", "").count("|") for text in (heading, rule, line)}) == 1
     with pytest.raises(InputError, match="pair in common"):
         compare(first, second, [("ours-n1", "ours")])
@@ -311,17 +294,6 @@ def test_intervals_of_a_run_come_from_resampled_objects(run):
     objects, categories = [objects_of(key) for key in errors], [category_of(key) for key in errors]
     expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), object_weights(objects, categories))
     assert run[1]["methods"]["ours"]["acc30_ci"] == pytest.approx(list(expected))
-
-
-def test_a_run_of_an_earlier_version_gets_its_intervals_again(run, tmp_path):
-    results = read_results(run[0])
-    old = json.loads(json.dumps(results.summary))
-    del old["intervals"]
-    old["methods"]["ours"] |= {"acc30_ci": [0, 100], "flagged": 7}
-    path = export_results(replace(results, summary=old), tmp_path / "results.json.gz")
-    again = read_results(path).summary
-    assert again["methods"]["ours"]["acc30_ci"] == pytest.approx(run[1]["methods"]["ours"]["acc30_ci"])
-    assert again["methods"]["ours"]["flagged"] == 7 and again["intervals"]["resampled"] == "objects"
 
 
 def test_runs_on_different_objects_are_pooled(tmp_path):
@@ -362,19 +334,22 @@ def test_runs_that_are_not_of_one_benchmark_are_not_pooled(tmp_path):
         pool([one, Results({}, {}, [], {"x": {}})])
 
 
-def test_small_p_values_are_not_printed_as_zero(run):
-    table = all_rows(run[1])
-    index = [column.title for column in table.columns].index("p")
-    for p, text in ((0.0004, "< 0.001"), (1e-30, "< 0.001"), (0.0123, "0.012"), (1.0, "1.000")):
-        cells = [Cell(p, p_value=True) if i == index else None for i in range(len(table.columns))]
-        assert f"| {text} |" in as_markdown(replace(table, rows=(("ours", tuple(cells)),)))
+@pytest.mark.parametrize(("p", "text"), [(0.0004, "< 0.001"), (1e-30, "< 0.001"), (0.0123, "0.012"), (1.0, "1.000")])
+def test_small_p_values_are_not_printed_as_zero(p, text):
+    assert f"| {text} |" in as_markdown(make_table("t", "T", [("", "p")], {"ours": [PValue(p)]}))
+
+
+def test_table_1_says_which_rows_use_the_true_mask_and_what_posecontrast_is(run):
+    (table,) = (table for table in paper_tables(run[1]) if table.name == "table_1")
+    for text in (as_markdown(table), as_latex(table), as_html(table)):
+        assert "SIFT, SWaV and swav-tiny use the true object mask" in text and "one retrained on CO3D" in text
 
 
 def test_rows_by_category_for_a_terminal(run):
     summary = run[1]
     table = by_category(summary, ["ours", "icp"])
-    assert [label for label, _ in table.rows] == list(CATEGORIES)
-    for category, cells in table.rows:
+    assert list(table.cells.index) == list(CATEGORIES)
+    for category, *cells in table.cells.itertuples():
         found = [summary["methods"][name]["per_category"][category]["acc30"] for name in ("ours", "icp")]
         assert [cell.value for cell in cells] == found
     with pytest.raises(InputError, match="no row nobody, expected some of icp"):

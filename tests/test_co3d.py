@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from co3d_folders import edit_json, sequence_data
 
-from zsp_lite.benchmark.annotations import annotation_benchmark
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
 from zsp_lite.data.pairs import Pair
@@ -334,11 +333,3 @@ def test_sequences_of_inconsistent_parts_are_refused(tmp_path):
     object.__setattr__(data, "timestamps", [0.0])
     with pytest.raises(InputError, match="4 frames and 1 timestamps"):
         write_co3d(tmp_path, "chair", [data])
-
-
-def test_opening_a_category_costs_little_more_than_its_json():
-    figures = annotation_benchmark(frames=8600)
-    assert figures["frames"] == 8600
-    assert 1.0 < figures["json_mb"] / 8600 * 1000 < 1.3  # real entries have about 1.2 kB
-    # A tenth of the limits for 86,000 frames (3 s, 400 MB), with a margin for a busy machine.
-    assert figures["seconds"] < 1 and figures["extra_memory_mb"] < 60

@@ -13,7 +13,6 @@ from zsp_lite.benchmark.robustness import (
     DAMAGES,
     Damaged,
     depth_noise,
-    exact,
     holes,
     mask_error,
     nothing,
@@ -25,6 +24,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
+from zsp_lite.synthetic.exact import exact_frame
 from zsp_lite.synthetic.export import export_categories, make_object, make_sequence
 
 
@@ -109,7 +109,7 @@ def test_exact_depth_and_mask_are_the_renderers(folder):
     observed, rendered = make_sequence("camera", 1, 6, 5, 96)
     assert observed.name == name
     stored = dataset.load(dataset.frames("camera", name)[2])
-    mended, seen = exact(stored, folder, "camera", name), rendered.views[2]
+    mended, seen = exact_frame(stored, folder, "camera", name), rendered.views[2]
     assert (mended.mask != seen.mask).mean() < 0.003  # pixels whose centre the outline just touches
     both = (mended.mask > 0) & seen.mask
     np.testing.assert_allclose(mended.depth[both], seen.depth[both], rtol=2e-3)
@@ -121,7 +121,7 @@ def test_only_what_was_exported_with_the_seed_can_be_made_again(folder, ellipsoi
     with pytest.raises(InputError, match="does not exist in an export with seed 6"):
         make_object("camera", Co3D(folder).sequences("camera")[0].sequence_name, 6)
     with pytest.raises(InputError, match="expected a folder made by zsp-lite synth"):
-        exact(frame, ellipsoids.root, "ellipsoid", "a")
+        exact_frame(frame, ellipsoids.root, "ellipsoid", "a")
 
 
 SETTINGS = {"solver": "verified", "foreground": "mask"}
@@ -130,7 +130,7 @@ SETTINGS = {"solver": "verified", "foreground": "mask"}
 @pytest.fixture(scope="module")
 def problem(ellipsoids):
     (pair, *_) = sample_pairs(ellipsoids, "ellipsoid", 2, 2, 0)
-    store = FrameStore(ellipsoids, "ellipsoid", {"backbone": CoordinateBackbone()})
+    store = FrameStore(ellipsoids, "ellipsoid", {"backbone": CoordinateBackbone(grid=8)})
     return Problem(pair, store)
 
 
@@ -146,6 +146,12 @@ def test_damage_is_the_same_whenever_the_pair_is(problem):
     first, again = (Damaged("holes")(problem) for _ in range(2))
     assert (first.sim3.matrix == again.sim3.matrix).all()
     assert (first.reference_view.frame.depth == again.reference_view.frame.depth).all()
+
+
+def test_damages_of_names_of_one_length_draw_different_noise(problem, monkeypatch):
+    monkeypatch.setitem(DAMAGES, "seloh", DAMAGES["holes"])
+    first, second = (Damaged(name)(problem).reference_view.frame.depth for name in ("holes", "seloh"))
+    assert (first != second).any()
 
 
 def test_every_damage_has_a_row_of_both_solvers_with_a_fingerprint_of_its_own():

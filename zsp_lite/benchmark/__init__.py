@@ -7,7 +7,7 @@
     evaluation   all rows on one pair
     execution    chunks of pairs in this process, a pool, Dask, or any `concurrent.futures.Executor`
     database     folder of a run
-    summary tables formats figures document compare results reports      evaluation of a run
+    summary tables formats figures compare results reports      evaluation of a run
     plan         estimate of time, memory and disk space
 
 docs/scale.md shows how to run it on several processes and machines, with Dask or MPI.

@@ -7,7 +7,7 @@ import numpy as np
 
 from zsp_lite.benchmark.results import Results
 from zsp_lite.benchmark.summary import weights_of_pairs
-from zsp_lite.benchmark.tables import Cell, Column, Table
+from zsp_lite.benchmark.tables import Cell, PValue, Table, make_table
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, paired_test
 
@@ -51,10 +51,9 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
         keys = sorted(key for key in a if key in b)
         if not keys:
             raise InputError(f"rows {one} and {other} have no pair in common: other data, seed or number of views")
-        before, after = np.array([a[key] for key in keys]), np.array([b[key] for key in keys])
-        test = paired_test(before, after, weights=weights_of_pairs(keys))
-        acc30 = float(accuracy(before, 30)), float(accuracy(after, 30))
-        found.append(Difference(one, other, len(keys), acc30, (float(median(before)), float(median(after))), test))
+        errors = np.array([[run[key] for key in keys] for run in (a, b)])
+        test = paired_test(*errors, weights=weights_of_pairs(keys))
+        found.append(Difference(one, other, len(keys), tuple(accuracy(errors, 30)), tuple(median(errors)), test))
     return found
 
 
@@ -76,26 +75,27 @@ def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
     return found[0]
 
 
-def comparison_table(differences: list[Difference], first: str, second: str) -> Table:
+def comparison_table(differences: Sequence[Difference], first: str, second: str) -> Table:
     """Tabulate differences; `first` and `second` name the runs."""
-    columns = [Column("pairs")]
-    for group, gain, test in (("Acc30 (%)", "B - A", "sign test"), ("error (°)", "mean of A - B", "permutation test")):
-        columns += [Column(title, group) for title in ("A", "B", gain, "p", f"p, {test}")]
-    rows = []
+    groups = {"Acc30 (%)": ("B - A", "sign test"), "error (°)": ("mean of A - B", "permutation test")}
+    columns = [("", "pairs")]
+    columns += [
+        (group, title) for group, (gain, test) in groups.items() for title in ("A", "B", gain, "p", f"p, {test}")
+    ]
+    rows = {}
     for one in differences:
-        cells = [Cell(one.n, decimals=0)]
-        for values, name, test in (
+        cells: list[Cell] = [Cell(one.n, decimals=0)]
+        for figures, gain, test in (
             (one.acc30, "accuracy_gain", "sign_test_p"),
             (one.median, "error_drop", "permutation_test_p"),
         ):
-            cells += [*map(Cell, values), Cell(one.test[name], *one.test[f"{name}_ci"])]
-            cells += [Cell(one.test[p], p_value=True) for p in (f"{name}_p", test)]
-        label = one.first if one.first == one.second else f"{one.first}:{one.second}"
-        rows.append((label, tuple(cells)))
+            cells += [*map(Cell, figures), Cell(one.test[gain], *one.test[f"{gain}_ci"])]
+            cells += [PValue(one.test[f"{gain}_p"]), PValue(one.test[test])]
+        rows[one.first if one.first == one.second else f"{one.first}:{one.second}"] = cells
     note = (
         "On the common pairs; errors of A and B are medians. Intervals (95 %) and p: bootstrap over objects. The sign "
         "test (pairs that only one of the two solves) and the permutation test (mean difference) treat pairs as "
         "independent; pairs share objects, so their p values are too small. Of twenty rows without a difference, one "
         "has p < 0.05 by chance."
     )
-    return Table("compare", f"A = {first}, B = {second}", tuple(columns), tuple(rows), note)
+    return make_table("compare", f"A = {first}, B = {second}", columns, rows, note)

@@ -102,26 +102,3 @@ TRIALS = PublishedTable(
         "2000": (46.6,),
     },
 )
-
-CATEGORIES = (
-    "backpack",
-    "bicycle",
-    "book",
-    "car",
-    "chair",
-    "hairdryer",
-    "handbag",
-    "hydrant",
-    "keyboard",
-    "laptop",
-    "motorcycle",
-    "mouse",
-    "remote",
-    "teddybear",
-    "toaster",
-    "toilet",
-    "toybus",
-    "toyplane",
-    "toytrain",
-    "toytruck",
-)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.benchmark.database import Records, read_records, read_settings
-from zsp_lite.benchmark.summary import INTERVALS, category_of, summarise_rows, summarise_run
+from zsp_lite.benchmark.summary import category_of, summarise_rows, summarise_run
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 
@@ -98,8 +98,7 @@ def read_results(path: str | Path) -> Results:
             }
             for name, row in content["rows"].items()
         }
-        summary = _with_object_intervals(content["summary"], rows)
-        return Results(summary, content["settings"], content["invocations"], rows)
+        return Results(content["summary"], content["settings"], content["invocations"], rows)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(f"results {path}: not a run's results ({error})") from error
 
@@ -175,13 +174,3 @@ def export_results(results: Results, path: str | Path) -> Path:
 
 def _rounded(value: Any) -> Any:
     return round(value, _DECIMALS) if isinstance(value, float) else value
-
-
-def _with_object_intervals(summary: Mapping[str, Any], rows: Mapping[str, Mapping[str, dict]]) -> dict[str, Any]:
-    """Return the summary; intervals of earlier versions, which treated pairs as independent, are computed again."""
-    if summary.get("intervals") == INTERVALS or not summary.get("methods"):
-        return dict(summary)
-    computed = summarise_rows({name: rows[name] for name in summary["methods"]})
-    for name, row in computed["methods"].items():  # earlier versions did not export these by pair
-        row |= {part: summary["methods"][name][part] for part in ("failed", "flagged")}
-    return {**summary, **computed}

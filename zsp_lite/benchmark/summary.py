@@ -14,9 +14,6 @@ from zsp_lite.metrics import (
     summarise,
 )
 
-# Method of the intervals; summaries of earlier versions have no such member, or another one.
-INTERVALS = {"level": 0.95, "resampled": "objects"}
-
 
 def summarise_run(
     rows: Mapping[str, Mapping[str, Mapping[str, Any]]],
@@ -101,7 +98,7 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
                 for members in [categories == category]
             },
         }
-    summary: dict[str, Any] = {"methods": methods, "intervals": dict(INTERVALS)}
+    summary: dict[str, Any] = {"methods": methods, "intervals": {"level": 0.95, "resampled": "objects"}}
     if "ours" in rows:
         problems, drawn = list(map(_problem, rows["ours"])), weights_of_pairs(rows["ours"])
         summary["against_ours"] = {

@@ -185,7 +185,7 @@ def tables(sources: tuple[Path, ...], out: Path | None, by_category: list[str] |
 
 
 def _update_document(sources: tuple[Path, ...], document: Path) -> None:
-    from zsp_lite.benchmark.document import update_document
+    from zsp_lite.benchmark.formats import update_document
     from zsp_lite.benchmark.results import read_runs
     from zsp_lite.benchmark.tables import every_table
 
@@ -229,7 +229,7 @@ def compare(first: Path, second: Path, rows: list[str] | None, out: Path | None)
 @click.option("--repeats", type=COUNT, metavar="N", default=5, help="Runs behind each median.")
 def profile(repeats: int) -> None:
     """Measure time and memory of every stage, and of the plain loops that it replaces."""
-    from zsp_lite.benchmark.profile import profile as rows
+    from zsp_lite.cli.profile import measure_all
 
-    for row in rows(repeats):
-        print(row, flush=True)
+    for measurement in measure_all(repeats):
+        print(measurement, flush=True)
