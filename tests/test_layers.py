@@ -18,6 +18,7 @@ LAYERS = [
     "data",
     "matching views",
     "best_view points",
+    "estimates",
     "pipeline backbones",
     "demo verified labelling importers synthetic baselines",
     "viz training",

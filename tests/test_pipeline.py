@@ -12,10 +12,11 @@ from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, 
 
 from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.errors import InputError
+from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.html import picture_html
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import PoseEstimate, ZeroShotPose, match_points, view_alignment
+from zsp_lite.pipeline import ZeroShotPose, view_alignment
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import extract_views, object_crop, patch_mask
 

@@ -15,9 +15,10 @@ from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, 
 from zsp_lite import pipeline
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
+from zsp_lite.estimates import match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, match, similarity
-from zsp_lite.pipeline import ZeroShotPose, match_points, view_alignment
+from zsp_lite.pipeline import ZeroShotPose, view_alignment
 from zsp_lite.points import standard_deviation
 from zsp_lite.verified import VerifiedSolver, proposals, refinement, soft_icp, solver
 from zsp_lite.verified.confidence import Calibration, calibration_for

@@ -14,6 +14,7 @@ Read the files in this order:
     best_view    selection of the target view to align with
     alignment    Umeyama's method in RANSAC
     points       points of the object
+    estimates    the result, and the protocol of solvers
     metrics      rotation errors and their statistics
     demo         one pair of each category, from data folder to pose error
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         data,
         demo,
         errors,
+        estimates,
         features,
         importers,
         io,
@@ -68,16 +70,17 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.frames import Frame
     from zsp_lite.errors import InputError
+    from zsp_lite.estimates import PoseEstimate
     from zsp_lite.features import FeatureMap
     from zsp_lite.io import download, files, ply
     from zsp_lite.matching import Matches
-    from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+    from zsp_lite.pipeline import ZeroShotPose
     from zsp_lite.viz import plots, report, scene3d
 
 # Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
 # which `zsp-lite --help` does not need.
 _HOMES = {
-    "": "alignment best_view demo errors features matchers matching metrics minimal pipeline points views "
+    "": "alignment best_view demo errors estimates features matchers matching metrics minimal pipeline points views "
     "backbones baselines benchmark cli data importers io labelling synthetic training verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",
@@ -88,10 +91,11 @@ _HOMES = {
     "data.co3d": "Co3D",
     "data.frames": "Frame",
     "errors": "InputError",
+    "estimates": "PoseEstimate",
     "features": "FeatureMap",
     "io": "download files ply",
     "matching": "Matches",
-    "pipeline": "PoseEstimate ZeroShotPose",
+    "pipeline": "ZeroShotPose",
     "viz": "plots report scene3d",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}

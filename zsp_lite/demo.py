@@ -11,9 +11,10 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError
+from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+from zsp_lite.pipeline import ZeroShotPose
 
 N_TARGETS = 5
 _SEQUENCE_FRAMES = 6

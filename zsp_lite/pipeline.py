@@ -1,177 +1,29 @@
 """Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
 import importlib
-import time
 from collections.abc import Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
-from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
-from zsp_lite.io.html import picture_html
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import Matches, key_similarities, match, similarities
-from zsp_lite.metrics import rotation_error
+from zsp_lite.matching import key_similarities, match, similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import View, crop_size, extract_views, frame_defect, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
 _FEW = 10  # fewer points do not give a standard deviation
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One of several candidate poses of a solver.
-
-    Attributes:
-        sim3: Reference-camera points to camera points of target view `view`.
-        view: Index of the target view that is closest to the reference viewpoint under this pose.
-        score: In nats, comparable between the hypotheses of one estimate.
-        terms: The terms that the score is a weighted sum of, by name.
-        confidence: Probability that the rotation error is below 30 degrees.
-    """
-
-    sim3: Sim3
-    view: int
-    score: float
-    terms: dict[str, float]
-    confidence: float
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """Pose of the reference object in one of the target views, with the intermediate results behind it.
-
-    Attributes:
-        sim3: Reference-camera points to camera points of the chosen target view.
-        view: Index of the chosen target view.
-        matches: Matches between the reference and the chosen view.
-        inliers: (K,) the matches that agree with the pose.
-        view_scores: (N,) score of every target view, higher is better; -inf for views that were left out.
-        reference_view: Crop, features and foreground of the reference.
-        target_views: The same of all N target views.
-        timings: Seconds per stage.
-        flags: One line per reason not to trust the estimate.
-        hypotheses: Candidate poses of the solver, best first; empty for the paper's solver.
-    """
-
-    sim3: Sim3
-    view: int
-    matches: Matches
-    inliers: Bool[np.ndarray, " k"]
-    view_scores: Float[np.ndarray, " n"]
-    reference_view: View
-    target_views: tuple[View, ...]
-    timings: dict[str, float] = field(default_factory=dict)
-    flags: tuple[str, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()
-
-    @property
-    def target_camera(self) -> Camera:
-        """Camera of the chosen target view's crop."""
-        return self.target_views[self.view].frame.camera
-
-    @cached_property
-    def points(self) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-        """3D points of the matches, in the reference's and in the chosen target's camera frame."""
-        return match_points(self.reference_view, self.target_views[self.view], self.matches)
-
-    @property
-    def confidence(self) -> float | None:
-        """Probability that the rotation error is below 30 degrees; None if the solver does not estimate it."""
-        return self.hypotheses[0].confidence if self.hypotheses else None
-
-    @property
-    def reliable(self) -> bool:
-        """Whether there are no flags. This says nothing about the accuracy of a fitted pose."""
-        return not self.flags
-
-    @property
-    def note(self) -> str:
-        """The flags as one line."""
-        return "; ".join(self.flags)
-
-    def __repr__(self) -> str:
-        matches = f"{int(self.inliers.sum())} of {len(self.matches)} matches agree"
-        sure = "" if self.confidence is None else f", confidence {self.confidence:.2f}"
-        angle = rotation_error(np.eye(3), self.sim3.R)
-        lines = [
-            f"PoseEstimate(target view {self.view} of {len(self.target_views)}, {matches}{sure},",
-            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale {self.sim3.scale:.3f},",
-            f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})",
-        ]
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return picture_html(repr(self), self.reference_view.frame.rgb, self.target_views[self.view].frame.rgb)
-
-    def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
-        """Express the pose in other cameras of the target sequence (sec. 5.6).
-
-        Args:
-            cameras: Cameras in the world of the target sequence.
-
-        Returns:
-            For each camera, the similarity from reference-camera points to its camera points.
-        """
-        best = self.target_camera
-        poses = []
-        for camera in cameras:
-            rotation = camera.R @ best.R.T
-            poses.append(Sim3(1.0, rotation, camera.t - rotation @ best.t) @ self.sim3)
-        return poses
-
-
-@runtime_checkable
-class Solver(Protocol):
-    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this signature is accepted.
-
-    A solver that fits the pose in the first target view:
-
-        def first_view(reference, targets, pairs, *, seed, threshold):
-            points = match_points(reference, targets[0], pairs[0].matches)
-            sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
-            scores = np.zeros(len(targets))
-            return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets))
-
-        ZeroShotPose(backbone, solver=first_view)
-    """
-
-    def __call__(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
-    ) -> PoseEstimate:
-        """Estimate the pose of the reference object.
-
-        `ZeroShotPose` checks the views before the call and leaves out unusable targets (see `views.usable_targets`).
-        It maps `view`, `view_scores`, `target_views` and the hypotheses' views of the result back to all targets,
-        and adds its own flags and timings.
-
-        Args:
-            reference: Reference view, with known depth in at least one pixel.
-            targets: N >= 1 target views, each with known depth in at least one pixel and a foreground patch.
-            pairs: For each target view, its similarities to the reference and their matches.
-            seed: Seed of everything that is drawn; the same seed gives the same pose.
-            threshold: Largest residual of an inlier, in units of the target object's standard deviation. (The
-                scenes of CO3D are scaled to unit standard deviation.)
-
-        Returns:
-            The estimate, in terms of the views given.
-
-        Raises:
-            InputError: The views do not determine a pose.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -380,14 +232,6 @@ def align_best_view(
     return PoseEstimate(sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags)
 
 
-def match_points(
-    reference: View, target: View, matches: Matches
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
-    (source, _), (destination, _) = reference.patch_points, target.patch_points
-    return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
-
-
 def view_alignment(reference: View, target: View) -> Sim3:
     """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
 
@@ -408,11 +252,3 @@ def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
         if chosen.sum() >= _FEW:
             return points[chosen]
     return points.reshape(-1, 3)
-
-
-@contextmanager
-def timed(timings: dict[str, float], stage: str):
-    """Write the run time of the block to `timings[stage]`, in seconds."""
-    start = time.perf_counter()
-    yield
-    timings[stage] = time.perf_counter() - start

@@ -15,7 +15,8 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import Hypothesis, PoseEstimate, ZeroShotPose
+from zsp_lite.estimates import Hypothesis, PoseEstimate
+from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
 # Members of a stored result; an answer's details must have other names.

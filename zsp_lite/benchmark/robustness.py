@@ -16,7 +16,8 @@ from jaxtyping import Float
 from zsp_lite.benchmark.problem import Problem
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.pipeline import PoseEstimate, ZeroShotPose
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_points, standard_deviation
 from zsp_lite.views import frame_view
 

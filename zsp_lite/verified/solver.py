@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.best_view import ViewPair
-from zsp_lite.pipeline import Hypothesis, PoseEstimate, match_points, timed
+from zsp_lite.estimates import Hypothesis, PoseEstimate, match_points, timed
 from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, calibration_for, score_margins
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
@@ -65,7 +65,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class VerifiedSolver:
-    """A `pipeline.Solver` that scores many poses against all target views. The defaults had the highest accuracy.
+    """A `estimates.Solver` that scores many poses against all target views. The defaults had the highest accuracy.
 
     Attributes:
         weights: Weights of the score's terms.
@@ -84,7 +84,7 @@ class VerifiedSolver:
     def __call__(
         self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
     ) -> PoseEstimate:
-        """Estimate the pose of the reference object (see `pipeline.Solver`): the best hypothesis of `solve`."""
+        """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`."""
         solution = self.solve(reference, targets, pairs, seed)
         best = solution.hypotheses[0]
         matches = pairs[best.view].matches
