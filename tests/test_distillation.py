@@ -18,11 +18,11 @@ from zsp_lite.training.distillation import (
     Distillation,
     DistillationConfig,
     Head,
-    cosine,
     distil,
     distillation_loss,
     multi_crop,
 )
+from zsp_lite.training.loop import cosine
 from zsp_lite.training.recipe import TrainingConfig
 from zsp_lite.training.renders import training_and_held_out
 from zsp_lite.training.train import held_out_accuracy

@@ -10,7 +10,6 @@ teacher's logits prevents the first and favours the second; sharpening, a low te
 
 import copy
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import crop_grids, recolour
 from zsp_lite.training.export import export_checkpoint
-from zsp_lite.training.loop import Task, claim_folder, run
+from zsp_lite.training.loop import Task, claim_folder, cosine, run
 from zsp_lite.training.recipe import TrainingConfig
 from zsp_lite.training.renders import training_and_held_out
 from zsp_lite.training.train import held_out_accuracy
@@ -177,11 +176,6 @@ def distillation_loss(
     mean = p.mean((0, 1))
     information = -torch.xlogy(mean, mean).sum().item() - entropy
     return loss, dict(loss=loss.item(), teacher_entropy=entropy, kl=loss.item() - entropy, information=information)
-
-
-def cosine(ends: tuple[float, float], progress: float) -> float:
-    """Interpolate from ends[0] to ends[1] along half a cosine, for progress from 0 to 1."""
-    return ends[1] + (ends[0] - ends[1]) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
 class Distillation(Task):

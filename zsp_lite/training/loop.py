@@ -173,6 +173,11 @@ def run(
             task.save(checkpoint)
 
 
+def cosine(ends: tuple[float, float], progress: float) -> float:
+    """Interpolate from ends[0] to ends[1] along half a cosine, for progress from 0 to 1."""
+    return ends[1] + (ends[0] - ends[1]) * 0.5 * (1 + math.cos(math.pi * progress))
+
+
 def claim_folder(folder: Path, settings: dict[str, Any]) -> None:
     """Make the folder of a run and write its settings to config.json.
 

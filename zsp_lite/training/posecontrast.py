@@ -5,7 +5,6 @@ bin, and a contrastive loss in which a pair of images is weighted by the angle b
 """
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,7 +31,7 @@ from zsp_lite.metrics import accuracy, median, rotation_error
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.batches import MEAN, STD, recolour
 from zsp_lite.training.export import export_convolutional
-from zsp_lite.training.loop import Task, claim_folder, run
+from zsp_lite.training.loop import Task, claim_folder, cosine, run
 from zsp_lite.training.object_crops import VIEWS, ObjectCrops, object_crops
 
 _EVALUATED = 400  # held-out images, at most
@@ -89,8 +88,8 @@ class PoseContrastTraining(Task):
         self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
 
     def schedule(self, step: int) -> dict[str, float]:
-        warm_up, decay = min(1.0, (step + 1) / 30), 0.5 * (1 + math.cos(math.pi * step / self.steps))
-        self.set_learning_rate(self.config.learning_rate * warm_up * decay)
+        warm_up = min(1.0, (step + 1) / 30)
+        self.set_learning_rate(self.config.learning_rate * warm_up * cosine((1.0, 0.0), step / self.steps))
         return {}
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:

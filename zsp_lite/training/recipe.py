@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from zsp_lite.errors import InputError
+from zsp_lite.training.loop import cosine
 from zsp_lite.training.renders import DEFORMATION, PROPORTIONS
 
 
@@ -115,9 +116,8 @@ class TrainingConfig:
         """
         warm_up = max(1, min(150, self.steps // 4))
         progress = max(0.0, (step / self.steps - 0.35) / 0.65)
-        decay = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
         size_factor = 0.7 if self.stage_at(step)[0].side > 128 else 1.0
-        return self.learning_rate * min(1, (step + 1) / warm_up) * decay * size_factor
+        return self.learning_rate * min(1, (step + 1) / warm_up) * cosine((1.0, 0.01), progress) * size_factor
 
     def shortened(self, factor: float) -> "TrainingConfig":
         """Multiply the steps of every stage by `factor`. Raises InputError unless 0 < factor <= 1000."""

@@ -24,7 +24,7 @@ from zsp_lite.matchers import sinkhorn
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.batches import MEAN, STD, crop_grids, recolour
 from zsp_lite.training.export import export_convolutional
-from zsp_lite.training.loop import Task, claim_folder, run
+from zsp_lite.training.loop import Task, claim_folder, cosine, run
 from zsp_lite.training.object_crops import ObjectCrops, object_crops
 
 logger = logging.getLogger(__name__)
@@ -133,8 +133,8 @@ class SwavTraining(Task):
         self.optimizer = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=config.weight_decay)
 
     def schedule(self, step: int) -> dict[str, float]:
-        warm_up, decay = min(1.0, (step + 1) / 20), 0.5 * (1 + math.cos(math.pi * step / self.steps))
-        self.set_learning_rate(self.config.learning_rate * warm_up * decay)
+        warm_up = min(1.0, (step + 1) / 20)
+        self.set_learning_rate(self.config.learning_rate * warm_up * cosine((1.0, 0.0), step / self.steps))
         self.network.prototypes.requires_grad_(step >= self.steps // 20)  # SwAV fixes them in the first epoch
         return {}
 
