@@ -342,7 +342,7 @@ def test_small_p_values_are_not_printed_as_zero(p, text):
 def test_table_1_says_which_rows_use_the_true_mask_and_what_posecontrast_is(run):
     (table,) = (table for table in paper_tables(run[1]) if table.name == "table_1")
     for text in (as_markdown(table), as_latex(table), as_html(table)):
-        assert "SIFT, SWaV and swav-tiny use the true object mask" in text and "one retrained on CO3D" in text
+        assert "SIFT, SWaV and swav-tiny use the true object mask" in text and "trained one on ObjectNet3D" in text
 
 
 def test_rows_by_category_for_a_terminal(run):

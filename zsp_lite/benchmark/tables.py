@@ -22,7 +22,8 @@ NOTE = (
 )
 TABLE_1_NOTE = (
     "ICP, ICP+BV, SIFT, SWaV and swav-tiny use the true object mask, the other rows do not. PoseContrast is the "
-    "published network, posecontrast-tiny a small one of this project; the row of the paper is one retrained on CO3D."
+    "published network, posecontrast-tiny a small one of this project; the paper trained one on ObjectNet3D, without "
+    "its evaluation categories."
 )
 _TITLES = {"med": "Med. err. (°)", "acc30": "Acc30 (%)", "acc15": "Acc15 (%)"}
 _FIGURES = tuple(_TITLES)

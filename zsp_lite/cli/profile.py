@@ -284,7 +284,7 @@ def _in_new_process(code: str, *arguments: str):
 
 
 def _median_seconds(functions: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median wall time of each function; they take turns, so that other load of the machine affects all alike."""
+    """Measure median wall times. The functions alternate, so that other load affects all of them equally."""
     times = np.empty((repeats, len(functions)))
     for function in functions:
         function()
