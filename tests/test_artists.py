@@ -1,0 +1,128 @@
+"""The catalogue of artist-made models is complete and consistent, and its builder checks what it copies."""
+
+import hashlib
+import zipfile
+
+import numpy as np
+import pytest
+from model_files import write_quad
+from PIL import Image
+
+from tools.ac3d import convert
+from tools.artists import Catalogue, Entry, build, read_catalogue
+from zsp_lite.errors import InputError
+from zsp_lite.synthetic.models import list_models
+from zsp_lite.synthetic.training_categories import TRAINING
+from zsp_lite.synthetic.validation_categories import VALIDATION
+
+# A world with one group, moved by 10 along x, of a square turned by a quarter about y; one polyline, one wrong count.
+AC3D = """AC3Db
+MATERIAL "red paint" rgb 1 0 0  amb 1 1 1  emis 0 0 0  spec 0.5 0.5 0.5  shi 10  trans 0.25
+OBJECT world
+kids 2
+OBJECT group
+name "gear"
+loc 10 0 0
+kids 1
+OBJECT poly
+name "square"
+data 9
+a comment
+rot 0 0 -1 0 1 0 1 0 0
+texture "maps\\paint.rgb"
+texrep 2 1
+numvert 4
+-1 -1 0
+1 -1 0
+
+1 1 0
+-1 1 0
+numsurf 2
+SURF 0x20
+mat 0
+refs 4
+0 0 0
+1 1 0
+2 1 1
+3 0 1
+SURF 0x22
+mat 0
+refs 2
+0 0 0
+1 1 0
+kids 0
+"""
+
+
+@pytest.fixture
+def aircraft(tmp_path):
+    path = tmp_path / "packages" / "sky" / "plane.ac"
+    (path.parent / "liveries").mkdir(parents=True)
+    path.write_text(AC3D)
+    Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(path.parent / "liveries" / "paint.rgb", format="SGI")
+    return path
+
+
+def test_the_catalogue_has_eight_categories_of_six_models_under_free_licences():
+    catalogue = read_catalogue()
+    assert len(catalogue.models) >= 8 and all(len(models) >= 6 for models in catalogue.models.values())
+    entries = [entry for models in catalogue.models.values() for entry in models.values()]
+    assert len({entry.sha256 for entry in entries}) == len(entries)  # no file twice
+    assert {entry.package for entry in entries} == set(catalogue.packages)
+    free = {"CC0 1.0", "Public Domain Mark 1.0", "CC BY 3.0", "CC BY 3.0 US", "GPL-2+"}
+    assert {entry.licence for entry in entries} <= free and all(
+        entry.author and entry.licence_file for entry in entries
+    )
+
+
+def test_no_category_of_the_catalogue_is_trained_on_or_used_for_model_selection():
+    assert not set(read_catalogue().models) & {*TRAINING, *VALIDATION}
+
+
+def test_an_ac3d_model_keeps_its_placement_texture_and_opacity(aircraft, tmp_path):
+    from zsp_lite.synthetic.meshes import read_mesh
+
+    out = tmp_path / "out" / "plane.obj"
+    convert(aircraft, out, [aircraft.parent / "liveries"])
+    mesh = read_mesh(out)
+    assert len(mesh.faces) == 2  # a line is no surface
+    assert mesh.vertices.mean(0) == pytest.approx([10, 0, 0]) and np.ptp(mesh.vertices, axis=0) == pytest.approx(
+        [0, 2, 2]
+    )
+    assert mesh.uv.max((0, 1)).tolist() == [2, 1]  # the texture repeats twice
+    (material,) = mesh.materials
+    assert material.colour == pytest.approx([1, 0, 0, 0.75], abs=0.01) and material.texture.shape == (8, 8, 4)
+    with pytest.raises(InputError, match="lacks its texture 'paint.rgb'"):
+        convert(aircraft, out)
+    aircraft.write_text(AC3D[:-40])
+    with pytest.raises(InputError, match="is damaged"):
+        convert(aircraft, out, [aircraft.parent / "liveries"])
+    aircraft.write_text("solid")
+    with pytest.raises(InputError, match="does not begin with AC3D"):
+        convert(aircraft, out)
+
+
+def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
+    packages, texture = tmp_path / "packages", np.full((4, 4, 3), 90, np.uint8)
+    quad = write_quad(tmp_path / "quad.obj", texture)
+    (packages / "home").mkdir()
+    with zipfile.ZipFile(packages / "home" / "set.sh3f", "w") as archive:
+        for path in (quad, quad.with_suffix(".mtl"), quad.with_suffix(".png")):
+            archive.write(path, f"set/sign/{path.name}")
+    checksum = lambda path: hashlib.sha256(path.read_bytes()).hexdigest()  # noqa: E731
+    sign = Entry("home", "set.sh3f", checksum(quad), "CC0 1.0", "Ann", "LICENSE.TXT", member="set/sign/quad.obj")
+    plane = Entry("sky", "plane.ac", checksum(aircraft), "GPL-2+", "Bob", "copyright", textures="liveries", front="-x")
+    catalogue = Catalogue({"home": "1.0", "sky": "2.0"}, {"sign": {"stop": sign}, "aircraft": {"plane": plane}})
+    out = tmp_path / "models"
+    build(packages, out, catalogue)
+    build(packages, out, catalogue)  # again into the same folder
+    aircraft_model, sign_model = list_models(out)
+    assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D"
+    assert sign_model.info.source == "home 1.0: set/sign/quad.obj" and sign_model.info.author == "Ann"
+    assert len(sign_model.read().faces) == len(aircraft_model.read().faces) == 2
+    aircraft.write_text(AC3D + " ")
+    with pytest.raises(InputError, match="plane.ac .*checksum"):
+        build(packages, out, catalogue)
+    aircraft.unlink()
+    with pytest.raises(InputError, match="expected the unpacked package sky"):
+        build(packages, out, catalogue)
