@@ -1,4 +1,4 @@
-"""The verified solver as a whole, with perfect features: what it finds, what it does not depend on, when it doubts."""
+"""The verified solver as a whole, with perfect features: estimates, invariances and flags."""
 
 from dataclasses import replace
 
@@ -63,7 +63,7 @@ def test_perfect_features_give_the_true_pose(estimate, frames):
     assert estimate.confidence > 0.5 and estimate.reliable
 
 
-def test_hypotheses_are_ranked_and_apart_and_each_says_what_speaks_for_it(estimate):
+def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
     found = estimate.hypotheses
     assert 1 < len(found) <= 6
     assert found[0].sim3 is estimate.sim3 and found[0].view == estimate.view
@@ -82,7 +82,7 @@ def test_hypotheses_are_ranked_and_apart_and_each_says_what_speaks_for_it(estima
     assert (apart + 180 * np.eye(len(found)) > 14.9).all()
 
 
-def test_the_answer_is_for_the_view_most_like_the_reference(estimate):
+def test_the_estimate_is_for_the_view_closest_to_the_reference(estimate):
     angles = []
     for camera in (view.frame.camera for view in estimate.target_views):
         (pose,) = estimate.propagate([camera])
@@ -91,7 +91,7 @@ def test_the_answer_is_for_the_view_most_like_the_reference(estimate):
     np.testing.assert_allclose(-estimate.view_scores, angles, atol=0.1)
 
 
-def test_inliers_agree_with_the_pose_within_a_share_of_the_objects_size(estimate, frames):
+def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estimate, frames):
     source, target = estimate.points
     residual = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1)
     seen = []
@@ -124,7 +124,7 @@ def test_the_order_of_the_views_does_not_matter(method, estimate, views):
     np.testing.assert_array_equal(other.view_scores, estimate.view_scores[order])
 
 
-def test_turning_the_target_world_turns_the_answer(method, estimate, views):
+def test_a_rotation_of_the_target_world_rotates_the_estimate(method, estimate, views):
     turn = look_at((0.2, 0.5, -1)).R
     moved = [changed(view, camera=turned(view.frame.camera, turn)) for view in views[1:]]
     other = method.estimate_from_views(views[0], moved)
@@ -157,13 +157,13 @@ def test_the_papers_solver_is_the_default_and_has_no_hypotheses(method, views):
     assert default.hypotheses == () and default.confidence is None
 
 
-def test_a_given_mask_takes_the_place_of_saliency(method, frames):
+def test_a_given_mask_replaces_the_saliency(method, frames):
     masked = replace(method, foreground="mask").estimate(frames[0], frames[1:4])
     assert error(masked, frames) < 8
     assert masked.reference_view.object_mask is masked.reference_view.frame.mask
 
 
-def test_without_refinement_it_is_still_near(method, views, frames):
+def test_without_refinement_the_estimate_is_still_close(method, views, frames):
     plain = replace(method, solver=VerifiedSolver(refinement=False))
     assert error(plain.estimate_from_views(views[0], views[1:]), frames) < 15
 
@@ -173,12 +173,12 @@ def holes(depth: np.ndarray, seed: int) -> np.ndarray:
     return np.where(unknown, 0, depth).astype(np.float32)
 
 
-def test_holes_in_the_depth_do_not_break_it(method, views, frames):
+def test_holes_in_the_depth_change_the_estimate_little(method, views, frames):
     pierced = [changed(view, depth=holes(view.frame.depth, seed)) for seed, view in enumerate(views)]
     assert error(method.estimate_from_views(pierced[0], pierced[1:]), frames) < 10
 
 
-def test_noisy_cameras_and_depth_do_not_break_it(method, views, frames):
+def test_noise_of_cameras_and_depth_changes_the_estimate_little(method, views, frames):
     rng = np.random.default_rng(0)
 
     def noisy(view):
@@ -193,7 +193,7 @@ def test_noisy_cameras_and_depth_do_not_break_it(method, views, frames):
     assert error(shaken, frames) < 10
 
 
-def test_a_view_without_depth_is_left_out_and_said_so(method, views, frames):
+def test_a_view_without_depth_is_left_out_with_a_flag(method, views, frames):
     blind = changed(views[2], depth=np.zeros_like(views[2].frame.depth))
     found = method.estimate_from_views(views[0], [views[1], blind, views[3]])
     assert found.flags == ("target 1 left out: no known depth",)
@@ -201,7 +201,7 @@ def test_a_view_without_depth_is_left_out_and_said_so(method, views, frames):
     assert error(found, frames) < 10
 
 
-def test_a_view_without_foreground_is_left_out_and_said_so(method, views, frames):
+def test_a_view_without_foreground_is_left_out_with_a_flag(method, views, frames):
     empty = replace(views[1], foreground=torch.zeros_like(views[1].foreground))
     found = method.estimate_from_views(views[0], [empty, *views[2:]])
     assert "target 0 left out: no foreground" in found.flags and not found.reliable
@@ -218,7 +218,7 @@ def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
     assert "are not similar" in found.note and not found.reliable
 
 
-def test_where_nothing_can_be_known_one_line_says_so(method, views, frames):
+def test_unusable_views_are_refused_in_one_line(method, views, frames):
     blind = [changed(view, depth=np.zeros_like(view.frame.depth)) for view in views]
     with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no known depth"):
         method.estimate_from_views(views[0], blind[1:3])
@@ -234,7 +234,7 @@ def test_where_nothing_can_be_known_one_line_says_so(method, views, frames):
         replace(method, solver="best")
 
 
-def test_features_that_say_nothing_leave_it_unsure(method, views):
+def test_uninformative_features_give_a_low_confidence(method, views):
     rng = torch.Generator().manual_seed(0)
 
     def meaningless(view):
@@ -279,7 +279,7 @@ ALL_AROUND = [(1, 0.5, 0.5), (-1, -0.5, 0.5), (-0.4, 1, 0.2), (0.4, -1, 0.2), (0
 
 
 @pytest.mark.parametrize("symmetry", SYMMETRIES)
-def test_a_symmetric_object_is_called_ambiguous(method, symmetry):
+def test_a_symmetric_object_is_flagged_as_ambiguous(method, symmetry):
     paint, turns = SYMMETRIES[symmetry]
     frames = [egg(direction, paint, f"egg {i}") for i, direction in enumerate([(0.9, -0.5, 0.3), *ALL_AROUND])]
     found = method.estimate(frames[0], frames[1:])
@@ -298,7 +298,7 @@ def test_a_symmetric_object_is_called_ambiguous(method, symmetry):
     assert (best < 15).sum() >= 2
 
 
-def test_equally_good_are_only_distinct_answers_within_a_nat():
+def test_hypotheses_are_tied_if_distinct_and_within_one_nat():
     rotation = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 0, angle] for angle in (0, 20, 180, 190, 90)])))
     assert tied_hypotheses(torch.tensor([5.0, 4.9, 4.5, 4.4, 3.9]), rotation) == [0, 2]  # 20 is 0's, 190 is 180's
     assert tied_hypotheses(torch.tensor([5.0, 4.9, 3.5, 4.4, 4.2]), rotation) == [0, 3, 4]

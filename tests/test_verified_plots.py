@@ -70,7 +70,7 @@ def test_a_terms_values_are_the_colours(evidence, maps, term):
     np.testing.assert_allclose(sorted(drawn), sorted(getattr(evidence, term)[0, 0].tolist()), atol=1e-6)
 
 
-def test_the_worst_offence_is_the_largest_point(evidence, maps):
+def test_the_largest_violation_is_the_largest_point(evidence, maps):
     _, axes = plots.show_images([IMAGE])
     verified_plots.draw_point_term(axes, evidence, maps, "free_space")
     drawn = axes[0].collections[0]

@@ -107,7 +107,7 @@ def test_a_known_similarity_is_fitted(seed):
 
 
 @given(seeds)
-def test_many_fits_at_once_are_umeyamas_fits(seed):
+def test_batched_fits_equal_umeyama(seed):
     rng = np.random.default_rng(seed)
     source, target = rng.normal(size=(2, 4, 7, 3))
     fitted = fit_poses(torch.tensor(source), torch.tensor(target))
@@ -207,7 +207,7 @@ def test_working_units_have_mean_zero_and_unit_spread(scene):
         assert float(points.square().sum(dim=1).mean() / 3) == pytest.approx(1, abs=1e-5)
 
 
-def test_a_pose_survives_the_way_to_a_camera_and_back(scene):
+def test_conversion_to_a_camera_pose_and_back_is_the_identity(scene):
     rng = np.random.default_rng(2)
     pose = Sim3(0.8, some_rotation(rng), rng.normal(size=3))
     for view in range(3):
@@ -223,7 +223,7 @@ def test_contrast_has_no_mean_along_either_side():
     assert double_centre(torch.zeros(6, 0)).shape == (6, 0)
 
 
-def test_strays_far_behind_the_object_are_left_out(views):
+def test_outliers_far_behind_the_object_are_left_out(views):
     reference, *targets = views
     depth = reference.frame.depth.copy()
     row, column = (int(i) for i in np.argwhere(depth > 0)[len(np.argwhere(depth > 0)) // 2])
@@ -280,7 +280,7 @@ def test_proposals_have_scales_from_a_half_to_two(scale, allowed):
 # Soft ICP
 
 
-def test_soft_icp_comes_nearer_to_the_truth_and_stays_there(scene, truth):
+def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     turn = rotation_matrices(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
     start = Poses(truth.scale * 0.8, turn @ truth.rotation, truth.translation + 0.15)
     aligned = soft_icp(scene, concatenate([start, truth]))
@@ -290,7 +290,7 @@ def test_soft_icp_comes_nearer_to_the_truth_and_stays_there(scene, truth):
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
 
 
-def test_features_lead_where_shape_alone_does_not(scene, truth):
+def test_soft_icp_with_features_succeeds_where_shape_alone_fails(scene, truth):
     turn = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 60, 0]])))
     start = Poses(truth.scale, turn @ truth.rotation, truth.translation)
     with_features, without = (soft_icp(scene, start, feature_weight=weight) for weight in (8.0, 0.0))
@@ -304,7 +304,7 @@ def test_a_pose_is_aligned_by_itself(scene, truth):
     np.testing.assert_allclose(soft_icp(scene, start[[1]]).rotation, together.rotation[[1]], atol=1e-4)
 
 
-def test_spread_indices_are_spread():
+def test_evenly_spaced_indices_are_evenly_spaced():
     assert evenly_spaced_indices(10, 4).tolist() == [0, 2, 5, 7]
     assert evenly_spaced_indices(3, 10).tolist() == [0, 1, 2]
 
@@ -328,7 +328,7 @@ EVERY = (5, 10)  # by hand it takes a while
 
 
 def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
-    """The terms as one would write them down, point by point, with the frames' own cameras."""
+    """The terms computed point by point with the cameras of the frames."""
     reference, *targets = views
     unit = 1 / scene.target_to_working.scale  # of the targets' working frame
     first = scene.target_cameras[0]
@@ -387,7 +387,7 @@ def patch_column(scene, targets, view, patch):
 
 
 @pytest.mark.parametrize("turn", [(0, 0, 0), (25.0, 10, -15), (0, 180, 0)])
-def test_terms_are_what_one_works_out_point_by_point(scene, views, truth, turn):
+def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
     turned = rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
     poses = Poses(truth.scale, turned, truth.translation + 0.1)
     found, expected = score_terms(scene, poses, EVERY).as_dict(0), by_hand(scene, views, scene.to_sim3(poses, 0, 0))
@@ -418,7 +418,7 @@ def test_the_truth_scores_above_other_poses(scene, truth):
     )
 
 
-def test_points_before_a_seen_surface_offend_and_hidden_ones_do_not(scene, truth):
+def test_points_in_front_of_a_surface_violate_free_space_and_occluded_ones_do_not(scene, truth):
     toward = -scene.target_maps.camera_centres[0] / scene.target_maps.camera_centres[0].norm()
     near, far = (Poses(truth.scale, truth.rotation, truth.translation + move * toward) for move in (-1.0, 1.0))
     fronts = [float(forward_terms(scene, pose).free_space[0, 0].mean()) for pose in (near, truth, far)]
@@ -455,8 +455,8 @@ def test_the_score_is_the_weighted_sum_of_the_terms():
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
 
 
-def test_the_view_term_prefers_the_pose_that_looks_from_the_side_of_the_likest_view(views):
-    """Of two targets seen from far apart, one is alike: being seen from there is worth more, by likeness and angle."""
+def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_view(views):
+    """Of two target views far apart, one is similar: the term is its similarity weighted by the angle."""
     alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
     scene = build_scene(views[0], views[1:3], [alike, other])
     np.testing.assert_allclose(scene.view_similarity, [0.3, -0.3], atol=1e-6)
@@ -467,13 +467,13 @@ def test_the_view_term_prefers_the_pose_that_looks_from_the_side_of_the_likest_v
     np.testing.assert_allclose(score_terms(scene, sides).viewpoint, viewpoint_term(scene, sides))
 
 
-def test_with_one_view_the_view_term_says_nothing(views):
+def test_with_one_view_the_viewpoint_term_is_zero(views):
     scene = build_scene(views[0], views[1:2], [torch.rand(784, 784)])
     np.testing.assert_array_equal(viewpoint_term(scene, poses_from_views(scene)), [0])
 
 
-def test_reverse_is_forward_with_the_sides_exchanged(views, truth):
-    """With one target, what the targets' points meet in the reference is the forward test of the inverse pose."""
+def test_reverse_terms_equal_forward_terms_with_exchanged_views(views, truth):
+    """With one target view, the reverse terms are the forward terms of the inverse pose with exchanged views."""
     zeros = [torch.zeros(784, 784)]
     one, other = build_scene(views[0], [views[1]], zeros), build_scene(views[1], [views[0]], zeros)
     pose = one.from_sim3([Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3]))], 0)
@@ -485,7 +485,7 @@ def test_reverse_is_forward_with_the_sides_exchanged(views, truth):
 # Refinement
 
 
-def test_refinement_climbs_and_never_descends():
+def test_refinement_never_lowers_the_score():
     rng = np.random.default_rng(5)
     goal = as_poses(Sim3(1.1, some_rotation(rng), np.array([0.1, -0.2, 0.05])))
 
@@ -508,7 +508,7 @@ def test_refinement_climbs_and_never_descends():
 
 @pytest.mark.parametrize("scale", [0.51, 1.95])
 def test_refinement_reaches_the_ends_of_the_scale_range(scale):
-    """Proposals and soft ICP reach scales up to 2; refinement once stopped at 1.6."""
+    """Proposals, soft ICP and refinement share the scale range of 0.5 to 2."""
     start = as_poses(Sim3(0.9 * scale if scale > 1 else 1.1 * scale, np.eye(3), np.zeros(3)))
     search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8)
     found, _ = refine(start, lambda poses: -(poses.scale / scale).log().square(), search)
@@ -523,7 +523,7 @@ def test_refinement_stays_within_the_scale_range():
 
 
 @given(seeds)
-def test_rotation_vectors_turn_by_their_length_about_themselves(seed):
+def test_rotation_vectors_rotate_by_their_length_about_their_direction(seed):
     vector = torch.tensor(np.random.default_rng(seed).normal(size=(1, 3)), dtype=torch.float64)
     matrix = rotation_matrices(vector)
     np.testing.assert_allclose(matrix[0] @ matrix[0].T, np.eye(3), atol=1e-6)
@@ -541,7 +541,7 @@ def test_bad_scenes_are_refused_in_one_line(views):
         build_scene(reference, [empty], [torch.zeros(784, 784)])
 
 
-def test_points_share_the_surface_evenly_however_densely_it_was_seen():
+def test_surface_weights_do_not_depend_on_the_sampling_density():
     rng = np.random.default_rng(6)
     angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
     ring = torch.tensor(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32)
@@ -553,7 +553,7 @@ def test_points_share_the_surface_evenly_however_densely_it_was_seen():
 # Confidence
 
 
-def test_fewer_views_are_trusted_less():
+def test_confidence_is_lower_with_fewer_views():
     margin = np.array([0.5, 1.0, 3.0, 8.0])
     found = [calibration_for(n).confidence(margin, 0.04) for n in (1, 2, 3, 4, 5, 20)]
     assert all((fewer <= more).all() for fewer, more in zip(found, found[1:]))
@@ -563,7 +563,7 @@ def test_fewer_views_are_trusted_less():
     assert (between.bias, between.margin, between.view_std) == pytest.approx((-1.25, 0.45, 0))
 
 
-def test_views_that_the_features_tell_apart_are_trusted_more():
+def test_confidence_rises_with_the_spread_of_view_similarities():
     margin = np.array([0.5, 3.0])
     assert (Calibration().confidence(margin, 0.08) > Calibration().confidence(margin, 0.02)).all()
 
@@ -586,7 +586,7 @@ def test_reliability_by_hand():
         reliability(confidence, right)
 
 
-def test_a_lead_is_over_the_best_rival_that_is_another_answer():
+def test_a_score_margin_is_over_the_best_distinct_rival():
     score = np.array([5.0, 4.5, 3.0])
     apart = np.array([[0.0, 20, 90], [20, 0, 100], [90, 100, 0]])
     np.testing.assert_allclose(score_margins(score, apart), [2, 1.5, -2])
