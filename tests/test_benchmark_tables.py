@@ -21,7 +21,7 @@ from zsp_lite.benchmark.figures import (
     reliability_diagram,
     write_figures,
 )
-from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, as_rich, insert_tables, write_tables
+from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, insert_tables, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
@@ -37,6 +37,7 @@ from zsp_lite.benchmark.tables import (
     make_table,
     paper_tables,
 )
+from zsp_lite.cli.terminal import as_rich
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, bootstrap_ci, object_weights, paired_test
@@ -316,6 +317,18 @@ def test_runs_on_different_objects_are_pooled(tmp_path):
     assert read_runs([tmp_path / "0"]).summary == runs[0].summary
     write_reports([tmp_path / "0", tmp_path / "1"], tmp_path / "pooled")
     assert read_results(tmp_path / "pooled" / "results.json.gz").summary["methods"]["icp"]["n"] == 96
+
+
+def test_exports_of_the_stored_run_can_be_pooled(tmp_path):
+    repository = Path(__file__).parents[1]
+    stored = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz")
+    paths = []
+    for part in (0, 1):
+        rows = {"ours": dict(list(stored.rows["ours"].items())[part:200:2])}
+        paths.append(export_results(replace(stored, rows=rows), tmp_path / f"{part}.json.gz"))
+    row = read_runs(paths).summary["methods"]["ours"]
+    errors = list(stored.errors("ours").values())[:200]
+    assert row["n"] == 200 and row["acc30"] == pytest.approx(100 * np.mean(np.array(errors) < 30))
 
 
 def test_runs_that_are_not_of_one_benchmark_are_not_pooled(tmp_path):

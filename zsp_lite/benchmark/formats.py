@@ -1,4 +1,4 @@
-"""Tables in a terminal, as CSV, Markdown, LaTeX and HTML, and inside a Markdown document."""
+"""Tables as CSV, Markdown, LaTeX and HTML, and inside a Markdown document."""
 
 import html
 import re
@@ -6,11 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table as RichTable
 
-from zsp_lite.benchmark.tables import PUBLISHED, THIS_RUN, Cell, Table
+from zsp_lite.benchmark.tables import THIS_RUN, Cell, Table
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 
@@ -21,32 +18,6 @@ thead { border-bottom: 1px solid; } p { color: #444; max-width: 60em; }
 """
 _MARKED = re.compile(r"(<!-- table (\S+) -->[ \t]*\r?\n)(.*?)(<!-- end of table -->)", re.DOTALL)
 _MARK = re.compile(r"<!-- (table \S+|end of table) -->")
-
-
-def as_rich(table: Table) -> RichTable:
-    """Format for a terminal: intervals below their figures, published figures dim."""
-    made = RichTable(
-        title=table.title, caption=table.note or None, caption_justify="left", box=SIMPLE_HEAD, pad_edge=False
-    )
-    longest = max(map(len, table.text.index), default=0)
-    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
-    for group, title in table.text.columns:
-        style = "dim" if group == PUBLISHED else None
-        group = _short(group).replace(" on ", "\non ").replace(" (", "\n(")
-        title = title.replace(" (", "\n(").replace(" Acc30", "\nAcc30")
-        made.add_column(f"{group}\n{title}" if group else title, justify="right", style=style, header_style=style)
-    for label, *cells in table.text.itertuples():
-        made.add_row(label, *(cell.replace(" [", "\n[") for cell in cells))
-    return made
-
-
-def print_tables(tables: Iterable[Table]) -> None:
-    """Print to the terminal; lines that are wider continue in the next one, and no figure is cut."""
-    console = Console()
-    for table in tables:
-        made = as_rich(table)
-        needed = console.measure(made, options=console.options.update(max_width=1000)).maximum
-        Console(width=max(console.width, needed)).print(made)
 
 
 def as_csv(table: Table) -> str:
@@ -122,7 +93,7 @@ def insert_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
             raise InputError(f"document has a mark for table {name}, the run has tables {', '.join(by_name)}")
         table = by_name[name]
         cells = table.cells.loc[:, [not re.fullmatch(r"\w+ Acc30", title) for _, title in table.cells.columns]]
-        short = Table(name, f"{table.title} ({pairs:,} pairs)", cells.rename(columns=_short, level="group"))
+        short = Table(name, f"{table.title} ({pairs:,} pairs)", cells.rename(columns=short_group, level="group"))
         return f"{start}{as_markdown(short)}\n{end}"
 
     return _MARKED.sub(render, text)
@@ -137,8 +108,8 @@ def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> No
     write_atomic(path, insert_tables(text, tables, pairs).encode())
 
 
-def _short(group: str) -> str:
-    """A group's name without "this run"."""
+def short_group(group: str) -> str:
+    """Return the heading of a group of columns without "this run"."""
     return group.removeprefix(THIS_RUN).removeprefix(": ")
 
 

@@ -87,16 +87,16 @@ def evaluate(
     loaded = load_backbone(backbone) if named else backbone
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
     settings = _settings(root, loaded, extractors, rows, row_pairs, pairs, targets, seed)
-    with RunFolder(out, settings, allow_other_version) as folder, open_workers(executor, workers) as crew:
-        threads = threads or max(1, available_cores() // crew.number)
+    with RunFolder(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
+        threads = threads or max(1, available_cores() // opened.number)
         setup = Setup(
             str(Path(root).resolve()), rows, backbone if named else loaded, settings["backbone"],
             None if cache is None else str(Path(cache).resolve()), threads, keep_hypotheses,
         )  # fmt: skip
         todo = _unfinished(work, folder.finished())
         total, left = sum(map(len, work.values())), sum(map(len, todo.values()))
-        where = executor if isinstance(executor, str) else type(crew.executor).__name__ if crew.executor else None
-        call = {"executor": where, "workers": crew.number, "threads": threads, "rows": list(rows)}
+        where = executor if isinstance(executor, str) else type(opened.executor).__name__ if opened.executor else None
+        call = {"executor": where, "workers": opened.number, "threads": threads, "rows": list(rows)}
         folder.begin(environment() | call | {"categories": list(work), "pairs": left})
         done = total - left
 
@@ -108,9 +108,9 @@ def evaluate(
                 progress(done, total)
 
         start = time.perf_counter()
-        size = max(1, min(CHUNK_SIZE, left // (4 * crew.number)))
+        size = max(1, min(CHUNK_SIZE, left // (4 * opened.number)))
         chunks = [chunk for found in todo.values() if found for chunk in make_chunks(found, size)]
-        evaluate_chunks(setup, chunks, crew, save, extractors)
+        evaluate_chunks(setup, chunks, opened, save, extractors)
         folder.finish(round(time.perf_counter() - start, 2))
         summary = results_of(settings, folder.read()).summary
         write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())

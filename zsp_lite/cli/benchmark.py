@@ -80,10 +80,10 @@ def benchmark(
     from rich.console import Console
     from tqdm import tqdm
 
-    from zsp_lite.benchmark.formats import print_tables
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate, plan_run
     from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
+    from zsp_lite.cli.terminal import print_tables
     from zsp_lite.data.samples import data_folders
 
     root = data_folders(data)[0][1]
@@ -173,9 +173,9 @@ def tables(sources: tuple[Path, ...], out: Path | None, by_category: list[str] |
 
     matplotlib.use("Agg")
     from zsp_lite.benchmark import tables as build
-    from zsp_lite.benchmark.formats import print_tables
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.results import read_runs
+    from zsp_lite.cli.terminal import print_tables
 
     write = len(sources) == 1 or out
     summary = (write_reports(sources, out) if write else read_runs(sources)).summary
@@ -214,8 +214,9 @@ def compare(first: Path, second: Path, rows: list[str] | None, out: Path | None)
     """
     from zsp_lite.benchmark.compare import compare as compare_runs
     from zsp_lite.benchmark.compare import comparison_table, split_rows
-    from zsp_lite.benchmark.formats import print_tables, write_tables
+    from zsp_lite.benchmark.formats import write_tables
     from zsp_lite.benchmark.results import read_results
+    from zsp_lite.cli.terminal import print_tables
 
     runs = read_results(first), read_results(second)
     found = compare_runs(*runs, [split_rows(text, *runs) for text in rows] if rows else None)
