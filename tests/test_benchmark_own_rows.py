@@ -137,6 +137,15 @@ def test_a_class_that_was_typed_in_is_known_by_its_members():
     assert made[0] == made[1] != made[2]
 
 
+def test_comments_and_docstrings_do_not_make_another_function():
+    made = []
+    for text, result in (("'One.'", 1), ("'Two.'  # three", 1), ("'One.'", 2)):
+        space = {}
+        exec(f"def own(problem):\n    {text}\n    return problem, {result}", space)
+        made.append(digest_of(space["own"]))
+    assert made[0] == made[1] != made[2]
+
+
 def test_another_process_finds_the_same_identity():
     code = """
 import logging

@@ -36,9 +36,9 @@ def backbone_digest(backbone: Backbone) -> str:
 def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     """Describe a value as text.
 
-    A function is described by its source, defaults and closure, without the globals that it uses. An object is
-    described by its `__repr__`, if its class defines one, otherwise by its class and its public attributes except
-    cached properties. Arrays and weights are described by hashes.
+    A function is described by its bytecode, defaults and closure, without its docstring and the globals it uses. An
+    object is described by its `__repr__`, if its class defines one, otherwise by its class and its public attributes
+    except cached properties. Arrays and weights are described by hashes.
     """
     value = inspect.unwrap(value) if callable(value) else value
     if id(value) in _within:
@@ -68,9 +68,11 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
         return f"{description(value.__self__, _within)}.{value.__name__}"
     if inspect.isfunction(value):
         cells = [cell.cell_contents for cell in value.__closure__ or () if cell != types.CellType()]
-        return _source(value) + description((value.__defaults__, value.__kwdefaults__, cells), _within)
+        return _code(value.__code__, value.__doc__) + description(
+            (value.__defaults__, value.__kwdefaults__, cells), _within
+        )
     if inspect.isclass(value):
-        return _source(value)
+        return f"{value.__qualname__} {description(_members(value), _within)}"
     kind = type(value)
     attributes = _attributes(value)
     if isinstance(value, torch.nn.Module):
@@ -79,7 +81,7 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     elif kind.__repr__ is not object.__repr__ and not hasattr(kind, "__dataclass_fields__"):
         return f"{kind.__qualname__} {_ADDRESS.sub('', repr(value))}"
     own = [one for one in kind.__mro__ if one.__module__.split(".")[0] == kind.__module__.split(".")[0]]
-    return " ".join(map(_source, own)) + description(attributes, _within)
+    return " ".join(all_of(own)) + description(attributes, _within)
 
 
 def _attributes(value: Any) -> dict[str, Any]:
@@ -96,22 +98,17 @@ def _bytes(tensor: torch.Tensor) -> bytes:
     return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
-@functools.lru_cache(maxsize=512)
-def _source(known: Any) -> str:
-    try:
-        return inspect.getsource(known)
-    except (OSError, TypeError):  # defined at a prompt, unpickled in a worker, or compiled
-        name = getattr(known, "__qualname__", str(known))
-    if inspect.isclass(known):
-        members = {
-            part: getattr(one, "__func__", getattr(one, "fget", one)) for part, one in vars(known).items()
-            if not part.startswith("__") or inspect.isfunction(one)
-        }  # fmt: skip
-        return f"{name} {description(members, (id(known),))}"
-    code = getattr(known, "__code__", None)
-    return name if code is None else f"{name} {_code(code)}"
+def _members(kind: type) -> dict[str, Any]:
+    """Functions and public attributes that a class defines itself."""
+    unwrapped = {
+        name: getattr(one, "__func__", getattr(one, "fget", getattr(one, "func", one)))
+        for name, one in vars(kind).items()
+    }
+    return {name: one for name, one in unwrapped.items() if inspect.isfunction(one) or not name.startswith("_")}
 
 
-def _code(code: types.CodeType) -> str:
-    constants = [_code(one) if isinstance(one, types.CodeType) else description(one) for one in code.co_consts]
+def _code(code: types.CodeType, docstring: str | None = None) -> str:
+    """Bytecode and constants, without docstring and line numbers."""
+    constants = [_code(one) if isinstance(one, types.CodeType) else description(one)
+                 for one in code.co_consts if docstring is None or one != docstring]  # fmt: skip
     return f"{code.co_code.hex()} {code.co_names} {constants}"
