@@ -28,14 +28,20 @@ def as_crop(view) -> minimal.Crop:
     )
 
 
+def frame_keys(pair) -> list[tuple[str, str, int]]:
+    """List the frames of a pair, the reference first: category, sequence and frame number."""
+    targets = [(pair.category, pair.target_sequence, number) for number in pair.target_frames]
+    return [(pair.category, pair.reference_sequence, pair.reference_frame), *targets]
+
+
 def check_pairs(dataset, pairs, image_size: int, **settings) -> None:
     """Check that both versions find the same matches, view, inliers and pose."""
     method = zsp_lite.ZeroShotPose(load_backbone(image_size=image_size), **settings)
-    loaded = [dataset.load_pair(pair) for pair in pairs]
-    frames = {frame.name: frame for reference, targets in loaded for frame in (reference, *targets)}
-    views = dict(zip(frames, method.views(list(frames.values()))))
-    for pair, (reference, targets) in zip(pairs, loaded):
-        reference, targets = views[reference.name], [views[target.name] for target in targets]
+    keys = {pair.key: frame_keys(pair) for pair in pairs}
+    distinct = list(dict.fromkeys(key for one in keys.values() for key in one))
+    views = dict(zip(distinct, method.views([dataset.load(dataset.frame(*key)) for key in distinct])))
+    for pair in pairs:
+        reference, *targets = (views[key] for key in keys[pair.key])
         expected = method.estimate_from_views(reference, targets)
         found = minimal.estimate_pose(as_crop(reference), [as_crop(target) for target in targets], **settings)
         assert found.view == expected.view, pair.key
@@ -52,8 +58,8 @@ def test_it_is_one_page():
     assert [line for line in source.splitlines() if "zsp_lite" in line] == ["from zsp_lite.errors import InputError"]
 
 
-def test_it_gives_the_librarys_pose_for_a_pair_of_each_category(dataset):
-    pairs = [shipped_pairs(dataset, category, 1)[0] for category in labelled_categories(dataset)]
+def test_it_gives_the_librarys_pose_for_two_pairs_at_full_size(dataset):
+    pairs = [shipped_pairs(dataset, category, 1)[0] for category in ("chair", "teddybear")]
     check_pairs(dataset, pairs, 224)
 
 
