@@ -73,6 +73,7 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
     for workers, more in ((2, 1), (1, 3)):
         process = start(tmp_path, workers)
         reached = wait_for_pairs(process, stored + more)
+        process.send_signal(signal.SIGSTOP)  # it must not finish before it is killed
         children = _children(process.pid)
         with pytest.raises(InputError, match="another run is writing"):
             evaluate(small_folder(), QUICK, ROWS, 6, 3, out=tmp_path)
@@ -341,7 +342,7 @@ def test_a_cache_keeps_features_for_other_runs_and_changes_nothing(undisturbed, 
 
     arguments = {"pairs": 6, "targets": 3, "cache": tmp_path / "cache"}
     first = evaluate(small_folder(), QUICK, ROWS, out=tmp_path / "a", **arguments)
-    monkeypatch.setattr(SlowBackbone, "__call__", never)
+    monkeypatch.setattr(CoordinateBackbone, "__call__", never)  # which SlowBackbone calls
     second = evaluate(small_folder(), QUICK, ROWS, out=tmp_path / "b", **arguments)
     assert first["methods"] == second["methods"] == undisturbed[1]["methods"]
 
