@@ -282,6 +282,7 @@ def test_what_a_folder_cannot_be_continued_from_is_named(undisturbed, tmp_path):
     with pytest.raises(InputError, match="run.json: not the settings of a run"):
         (tmp_path / SETTINGS).write_text("{")
         RunFolder(tmp_path, settings)
+    assert not (tmp_path / DATABASE).exists()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / DATABASE).write_bytes(b"no database" * 1000)
     with pytest.raises(InputError, match="not the database of a run"):
@@ -290,6 +291,19 @@ def test_what_a_folder_cannot_be_continued_from_is_named(undisturbed, tmp_path):
         read_records(tmp_path / "other")
     with pytest.raises(InputError, match="holds no benchmark run"):
         read_records(tmp_path / "nowhere")
+
+
+def test_a_database_that_cannot_be_opened_or_written_is_bad_input(undisturbed, tmp_path):
+    settings = read_settings(undisturbed[0]) | {"library": read_settings(undisturbed[0])["library"][0]}
+    (tmp_path / "closed" / DATABASE).mkdir(parents=True)
+    with pytest.raises(InputError, match="run.sqlite cannot be opened for writing"):
+        RunFolder(tmp_path / "closed", settings)
+    record = {"pair": "a", "results": {"x": {"note": "y" * 10**6}}, "seconds": 1, "timings": {}, "saliency_iou": {}}
+    with RunFolder(tmp_path / "full", settings) as folder:
+        folder._database.execute("PRAGMA max_page_count = 20")
+        with pytest.raises(InputError, match="run.sqlite cannot be written: database or disk is full"):
+            folder.add([record])
+    assert not read_records(tmp_path / "full").rows
 
 
 def test_a_result_cannot_be_stored_twice(undisturbed, tmp_path):

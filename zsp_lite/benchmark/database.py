@@ -63,9 +63,13 @@ class RunFolder:
     """
 
     def __init__(self, out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False):
-        out = Path(out)
+        self._out = out = Path(out)
         out.mkdir(parents=True, exist_ok=True)
-        self._database = sqlite3.connect(out / DATABASE, timeout=0.5)
+        check_settings(out, settings, allow_other_version)  # a refused folder gets no database
+        try:
+            self._database = sqlite3.connect(out / DATABASE, timeout=0.5)
+        except sqlite3.Error as error:
+            raise _unusable(out, error) from error
         try:
             with self._database:
                 self._database.execute("PRAGMA locking_mode = EXCLUSIVE")  # locks are kept until the connection closes
@@ -101,7 +105,17 @@ class RunFolder:
             self._database.execute(update, [seconds, self._invocation])
 
     def add(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Store evaluated pairs (see `evaluate_pair`) in one transaction."""
+        """Store evaluated pairs (see `evaluate_pair`) in one transaction.
+
+        Raises:
+            InputError: If the file cannot be written, for example because the disk is full.
+        """
+        try:
+            self._add(records)
+        except sqlite3.OperationalError as error:
+            raise InputError(f"{self._out / DATABASE} cannot be written: {error}") from error
+
+    def _add(self, records: Iterable[Mapping[str, Any]]) -> None:
         with self._database:
             for record in records:
                 cost = {name: record[name] for name in ("seconds", "timings", "saliency_iou")}
@@ -230,4 +244,6 @@ def _read(database: sqlite3.Connection) -> Records:
 def _unusable(out: Path, error: Exception) -> InputError:
     if "locked" in str(error):
         return InputError(f"{out}: another run is writing to it; wait for it or choose another folder")
+    if "unable to open" in str(error):
+        return InputError(f"{out / DATABASE} cannot be opened for writing; choose another folder")
     return InputError(f"{out / DATABASE}: not the database of a run, or damaged ({error})")
