@@ -203,6 +203,11 @@ def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
     assert result["permutation_test_p"] == pytest.approx(16 / 128)
 
 
+def test_one_pair_proves_nothing():
+    result = paired_test([90.0], [10.0])
+    assert result["error_drop"] == 80 and result["sign_test_p"] == result["permutation_test_p"] == 1
+
+
 def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates():
     rng = np.random.default_rng(0)
     first, second = rng.uniform(0, 60, 6), rng.uniform(0, 40, 6)

@@ -288,12 +288,15 @@ def paired_test(
 
     result = paired_difference(first, second, threshold, weights)
     first, second = _errors(first), _errors(second)
-    flipped = permutation_test(
-        (first - second,), np.mean, permutation_type="samples", n_resamples=10_000, batch=500, vectorized=True, rng=seed
-    )
+    p = 1.0  # of one pair: both signs give the same absolute difference, and scipy refuses one pair
+    if len(first) > 1:
+        p = permutation_test(
+            (first - second,), np.mean, permutation_type="samples", n_resamples=10_000, batch=500, vectorized=True,
+            rng=seed,
+        ).pvalue  # fmt: skip
     return result | {
         "sign_test_p": sign_test(first < threshold, second < threshold),
-        "permutation_test_p": float(flipped.pvalue),
+        "permutation_test_p": float(p),
     }
 
 
