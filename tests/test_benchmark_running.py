@@ -332,6 +332,15 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
     assert sum(calls) == len(frames) and set(calls) == {1}
 
 
+def test_frames_are_cropped_at_the_size_that_the_backbone_takes():
+    class Large(CoordinateBackbone):
+        image_size = 448
+
+    for backbone, size in ((BACKBONE, 224), (Large(), 448)):
+        frame = FrameStore(Co3D(small_folder()), "lump", {"backbone": backbone}).frame(("100_a", 0))
+        assert frame.rgb.shape == (size, size, 3) and frame.camera.size == (size, size)
+
+
 def test_the_points_behind_a_frames_patches_are_computed_once():
     frames = FrameStore(Co3D(small_folder()), "lump", {"backbone": BACKBONE, "other": BACKBONE})
     points = frames.view("backbone", ("100_a", 0), "saliency", 0.05).patch_points

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import click
 import pytest
@@ -239,3 +240,33 @@ def test_a_run_is_planned_tabulated_and_compared(ellipsoids, tmp_path, monkeypat
     assert "ours:ours-globalsim" in capsys.readouterr().out
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
     assert "nowhere" in assert_one_line(capsys)
+
+
+def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path):
+    class Reached(Exception):
+        pass
+
+    given = {}
+
+    def record(*arguments, **options):
+        given.update(options, arguments=arguments)
+        raise Reached
+
+    monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
+    monkeypatch.setattr("zsp_lite.benchmark.run.plan_run", record)
+    words = "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair --pairs 7 --targets 3"
+    words = ["benchmark", "--data", str(tmp_path), *words.split(), "--methods", "ours,sift", "--seed", "4"]
+    words += ["--out", "there", "--allow-other-version"]
+    config = BackboneConfig("small", "3", "value", 64)
+    common = (tmp_path, config, ["ours", "sift"], 7, 3, 4, Path("there"), ["lump", "chair"])
+    with pytest.raises(Reached):
+        cli.main([*words, "--plan"])
+    assert given.pop("arguments") == (*common, True) and not given
+    words += "--workers 5 --executor dask://host:1 --threads 6 --cache kept --keep-hypotheses".split()
+    with pytest.raises(Reached):
+        cli.main(words)
+    assert given.pop("arguments")[:-1] == common  # the last one draws the progress bar
+    assert given == {
+        "executor": "dask://host:1", "workers": 5, "threads": 6, "cache": Path("kept"), "keep_hypotheses": True,
+        "allow_other_version": True,
+    }  # fmt: skip
