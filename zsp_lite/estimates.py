@@ -151,8 +151,9 @@ class Solver(Protocol):
             targets: N >= 1 target views, each with known depth in at least one pixel and a foreground patch.
             pairs: For each target view, its similarities to the reference and their matches.
             seed: Seed of everything that is drawn; the same seed gives the same pose.
-            threshold: Largest residual of an inlier, in units of the target object's standard deviation. (The
-                scenes of CO3D are scaled to unit standard deviation.)
+            threshold: Largest residual of an inlier for an object of unit standard deviation, as the scenes of CO3D
+                are scaled. (The paper's solver takes it in scene units unless `adaptive_threshold` is set; the
+                verified solver multiplies it by the target object's standard deviation.)
 
         Returns:
             The estimate, in terms of the views given.

@@ -48,7 +48,7 @@ class ZeroShotPose:
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
         solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
-            or a `Solver`.
+            or a `Solver`. The settings view_selector, trials, sample_size and adaptive_threshold are for "paper" only.
         seed: Seed of k-means and of the solver.
 
     Raises:
