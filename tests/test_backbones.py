@@ -145,6 +145,9 @@ def test_bad_images_are_refused_by_number(vit, image):
         {"saliency_heads": ()},
         {"precision": "int8"},
         {"batch_size": 0},
+        {"batch_size": 2.5},
+        {"image_size": 0},
+        {"image_size": 10.5},
         {"device": "nowhere"},
     ],
 )

@@ -378,6 +378,8 @@ def test_without_transformers_the_extra_is_named(folders, monkeypatch):
         ({"num_heads": 4}, "num_heads"),
         ({"saliency_heads": (4,)}, "saliency_heads"),
         ({"image_size": 0}, "image_size"),
+        ({"image_size": 10.5}, "image_size is 10.5"),
+        ({"batch_size": 2.5}, "batch_size is 2.5"),
     ],
 )
 def test_settings_out_of_range_are_refused(folders, options, match):

@@ -289,12 +289,14 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
     [
         {"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"solver": "best"}, {"threshold": -1},
         {"k": 0}, {"k": 2.5}, {"k": True}, {"trials": 10.5}, {"trials": 0}, {"sample_size": 2}, {"sample_size": 4.0},
-        {"seed": -1}, {"seed": 0.5},
+        {"seed": -1}, {"seed": 0.5}, {"kmeans": "no"}, {"adaptive_threshold": "no"}, {"binning": None},
+        {"threshold": 0}, {"threshold": np.inf}, {"threshold": np.nan}, {"threshold": "0.2"}, {"threshold": True},
+        {"saliency_threshold": np.nan}, {"saliency_threshold": np.inf}, {"saliency_threshold": "x"},
     ],
     ids=str,
 )  # fmt: skip
 def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(settings):
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match=f"^{next(iter(settings))} is "):
         ZeroShotPose(CoordinateBackbone(), **settings)
     assert ZeroShotPose(CoordinateBackbone(), k=30).k == 30
 

@@ -11,7 +11,7 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite.data.frames import read_image
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.points import object_cloud
-from zsp_lite.viz.report import COLUMNS, render_page, table_row, write_overview, write_report
+from zsp_lite.viz.report import COLUMNS, _views_figure, render_page, table_row, write_overview, write_report
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +108,15 @@ def test_all_text_is_escaped(results, text):
     page = render_page([replace(results[0], pair=pair, estimate=estimate)], hostile, hostile, hostile)
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") == 11
+
+
+def test_a_view_that_was_left_out_has_no_score(results):
+    estimate = results[0].estimate
+    scores = np.where(np.arange(5) == (estimate.view + 1) % 5, -np.inf, estimate.view_scores)
+    figure = _views_figure(replace(results[0], estimate=replace(estimate, view_scores=scores)))
+    titles = [axis.get_title() for axis in figure.axes]
+    assert sum("left out" in title for title in titles) == 1 and sum("score" in title for title in titles) == 4
+    assert not any("inf" in title for title in titles)
 
 
 def test_the_report_is_written_to_its_path(results, tmp_path):

@@ -117,6 +117,17 @@ def test_a_resumed_run_keeps_its_precision_and_refuses_other_networks_and_origin
         read_checkpoint(tmp_path / "checkpoint.pt")
 
 
+def test_a_run_resumed_where_its_precision_is_slow_says_so(tmp_path, monkeypatch, caplog):
+    LineFit(precision="bfloat16").save(tmp_path / "slow.pt")
+    LineFit(precision="float32").save(tmp_path / "exact.pt")
+    for fast in (True, False):
+        monkeypatch.setattr("zsp_lite.training.loop.bfloat16_is_fast", lambda device, fast=fast: fast)
+        for name in ("slow.pt", "exact.pt"):
+            LineFit().restore(tmp_path / name)
+    (warning,) = caplog.messages
+    assert "slow.pt: the run began in bfloat16 and keeps it" in warning
+
+
 def test_a_folder_belongs_to_one_configuration(tmp_path):
     claim_folder(tmp_path / "run", {"seed": 0, "sides": (1, 2)})
     claim_folder(tmp_path / "run", {"seed": 0, "sides": (1, 2)})

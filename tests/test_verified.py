@@ -110,6 +110,12 @@ def test_every_stage_is_timed(estimate):
     assert list(estimate.timings) == stages
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5])
+def test_a_bad_seed_is_refused_in_one_line(views, seed):
+    with pytest.raises(InputError, match=f"^seed is {seed}, expected an integer of at least 0$"):
+        VerifiedSolver().solve(views[0], views[1:], [], seed)
+
+
 def test_a_second_run_gives_the_same_numbers(method, estimate, views):
     again = method.estimate_from_views(views[0], views[1:])
     assert (again.sim3.matrix == estimate.sim3.matrix).all()

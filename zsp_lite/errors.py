@@ -1,5 +1,6 @@
 """The exception that the library raises for bad input, and checks that several modules share."""
 
+import math
 import numbers
 
 
@@ -19,6 +20,17 @@ def check_integer(name: str, value: object, minimum: int) -> None:
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < minimum:
         raise InputError(f"{name} is {value!r}, expected an integer of at least {minimum}")
+
+
+def check_number(name: str, value: object, above: float = -math.inf) -> None:
+    """Check that a value is a finite real number (a Python or NumPy one, not a bool) greater than `above`.
+
+    Raises:
+        InputError: The value is of another type, not finite, or not greater.
+    """
+    if not isinstance(value, numbers.Real) or isinstance(value, bool) or not above < value < math.inf:
+        expected = "a finite number" + (f" greater than {above:g}" if above > -math.inf else "")
+        raise InputError(f"{name} is {value!r}, expected {expected}")
 
 
 def check_seed(name: str, value: object) -> None:

@@ -98,8 +98,8 @@ def view_score(cosine, k):
 
 
 def unproject(crop, patches):
-    """Compute the 3D point of each patch (supplement, "Depth completion"): depth * K^-1 (column, row, 1). It is that of
-    the pixel at the 25th percentile of known depths (the object is the nearer surface), or of the in-painted centre."""
+    """Compute depth * K^-1 (column, row, 1) at one pixel of each patch (supplement, "Depth completion"): the pixel at
+    the 25th percentile of its known depths. A patch without known depth takes its centre, where depth is in-painted."""
     known = crop.depth > 0
     filled = cv2.inpaint(crop.depth, np.uint8(~known), 3, cv2.INPAINT_NS)
     filled = np.clip(np.nan_to_num(filled), crop.depth[known].min(), crop.depth.max())

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
@@ -78,16 +78,19 @@ class ZeroShotPose:
             ("foreground", ("saliency", "mask")),
             ("cycle_from", ("reference", "target")),
             ("solver", ("paper", *SOLVERS)),
+            ("kmeans", (True, False)),
+            ("adaptive_threshold", (True, False)),
+            ("binning", (True, False)),
         ):
             value = getattr(self, name)
             if name in ("matcher", "view_selector", "solver") and callable(value):
                 continue
             if value not in allowed:
-                raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
+                raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
         for name, minimum in (("k", 1), ("trials", 1), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), minimum)
-        if not self.threshold > 0:
-            raise InputError(f"threshold is {self.threshold}, expected a positive number")
+        check_number("threshold", self.threshold, above=0)
+        check_number("saliency_threshold", self.saliency_threshold)
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.

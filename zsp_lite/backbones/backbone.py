@@ -12,7 +12,7 @@ from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import HuggingFaceViT, nearest_multiple
 from zsp_lite.backbones.precision import Precision, autocast, supported_precision
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import FeatureMap
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
@@ -67,8 +67,7 @@ class Backbone:
     ):
         if precision not in ("float32", "bfloat16"):
             raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
-        if batch_size < 1:
-            raise InputError(f"batch_size: expected at least 1, got {batch_size}")
+        check_integer("batch_size", batch_size, 1)
         if saliency_heads is None:
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
             saliency_heads = (0, 2, 4, 5) if dino_small else range(model.num_heads)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.facets import Facet
 from zsp_lite.backbones.vit import Tokens
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's
@@ -200,8 +200,7 @@ def _has_weights(folder: Path) -> bool:
 
 def nearest_multiple(size: int, patch_size: int) -> int:
     """Round `size` to a positive multiple of `patch_size`. Raises InputError for a size below 1."""
-    if size < 1:
-        raise InputError(f"image_size: expected at least 1 pixel, got {size}")
+    check_integer("image_size", size, 1)
     return max(1, round(size / patch_size)) * patch_size
 
 

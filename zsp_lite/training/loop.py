@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from zsp_lite.backbones.precision import Precision
+from zsp_lite.backbones.precision import Precision, bfloat16_is_fast
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
@@ -116,6 +116,11 @@ class Task(nn.Module):
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{path}: checkpoint of another network") from error
         self.origin, self.steps_done, self.smoothed = state["origin"], state["steps_done"], state["smoothed"]
+        device = next(self.parameters()).device.type
+        if state["precision"] == "bfloat16" and not bfloat16_is_fast(device):
+            logger.warning(
+                "%s: the run began in bfloat16 and keeps it, which is slow on this device (%s)", path, device
+            )
         for module in self.modules():
             if hasattr(module, "precision"):
                 module.precision = state["precision"]

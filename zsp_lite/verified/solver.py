@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.best_view import ViewPair
+from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, match_points, timed
 from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, calibration_for, score_margins
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
@@ -113,8 +114,10 @@ class VerifiedSolver:
             seed: Seed or generator of all random draws.
 
         Raises:
-            InputError: The reference, or all targets together, have too few foreground patches of known depth.
+            InputError: The seed is negative or no integer; or the reference, or all targets together, have too few
+                foreground patches of known depth.
         """
+        check_seed("seed", seed)
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
             with timed(timings, "scene"):

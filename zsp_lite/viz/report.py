@@ -195,7 +195,10 @@ def stage_figures(result: DemoResult, scene_id: str) -> list[StageFigure]:
 def _views_figure(result: DemoResult) -> Figure:
     estimate = result.estimate
     views = [estimate.reference_view, *estimate.target_views]
-    titles = ["reference"] + [f"target {i + 1}\nscore {score:.1f}" for i, score in enumerate(estimate.view_scores)]
+    titles = ["reference"] + [
+        f"target {number}\n" + (f"score {score:.1f}" if np.isfinite(score) else "left out")
+        for number, score in enumerate(estimate.view_scores, 1)
+    ]
     figure, axes = plots.show_images([view.frame.rgb for view in views], titles, size=1.9)
     plots.mark(axes[1 + estimate.view], "chosen")
     return figure
