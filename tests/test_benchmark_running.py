@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -165,6 +165,42 @@ def test_any_executor_will_do(undisturbed, tmp_path):
     assert summary["methods"] == undisturbed[1]["methods"]
 
 
+class Numbered(Future):
+    """A future whose hash is its number, which orders small sets."""
+
+    def __init__(self, number):
+        super().__init__()
+        self.number = number
+
+    def __hash__(self):
+        return self.number
+
+
+class FirstFails(Executor):
+    """Evaluates chunks at once; the first one fails."""
+
+    _max_workers = 2
+
+    def __init__(self):
+        self.submitted = 0
+
+    def submit(self, function, *arguments):
+        future = Numbered(self.submitted)
+        if self.submitted:
+            future.set_result(function(*arguments))
+        else:
+            future.set_exception(InputError("the first chunk fails"))
+        self.submitted += 1
+        return future
+
+
+def test_what_was_evaluated_together_with_a_failure_is_saved(tmp_path):
+    executor = FirstFails()
+    with pytest.raises(InputError, match="the first chunk fails"):
+        evaluate(small_folder(), QUICK, ["ours-bv"], 6, 3, out=tmp_path, executor=executor)
+    assert executor.submitted == 4 and len(read_records(tmp_path).evaluations) >= 3
+
+
 def test_unusable_executors_are_refused(monkeypatch):
     monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
     for executor, message in (("dask://127.0.0.1:1", "no scheduler"), ("nowhere:Pool", "module:Class"), ("x", "dask:")):
@@ -291,6 +327,14 @@ def test_what_a_folder_cannot_be_continued_from_is_named(undisturbed, tmp_path):
         read_records(tmp_path / "other")
     with pytest.raises(InputError, match="holds no benchmark run"):
         read_records(tmp_path / "nowhere")
+
+
+def test_results_without_their_settings_are_refused(undisturbed, tmp_path):
+    run = shutil.copytree(undisturbed[0], tmp_path / "run")
+    settings = read_settings(run)
+    (run / SETTINGS).write_text(json.dumps({name: one for name, one in settings.items() if name != "data"}))
+    with pytest.raises(InputError, match="run.json: no data, expected the settings of a run"):
+        read_results(run)
 
 
 def test_a_database_that_cannot_be_opened_or_written_is_bad_input(undisturbed, tmp_path):

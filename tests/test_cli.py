@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import pytest
@@ -270,3 +271,31 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         "executor": "dask://host:1", "workers": 5, "threads": 6, "cache": Path("kept"), "keep_hypotheses": True,
         "allow_other_version": True,
     }  # fmt: skip
+
+
+def test_every_option_of_the_tables_reaches_the_library(monkeypatch, tmp_path):
+    methods = {name: {"n": n} for name, n in (("ours", 3), ("sift", 5), ("icp", 4))}
+    run = SimpleNamespace(summary={"methods": methods})
+    calls = []
+
+    def recorded(name, found):
+        return lambda *arguments: calls.append((name, *arguments)) or found
+
+    monkeypatch.setattr("zsp_lite.benchmark.results.read_runs", recorded("read", run))
+    monkeypatch.setattr("zsp_lite.benchmark.reports.write_reports", recorded("write", run))
+    for name in ("all_rows", "paper_tables", "every_table"):
+        monkeypatch.setattr(f"zsp_lite.benchmark.tables.{name}", lambda summary, name=name: [name])
+    monkeypatch.setattr("zsp_lite.benchmark.tables.by_category", recorded("by category", "narrow"))
+    monkeypatch.setattr("zsp_lite.benchmark.formats.update_document", recorded("update", None))
+    monkeypatch.setattr("zsp_lite.cli.terminal.print_tables", recorded("print", None))
+    a, b, there = tmp_path / "a", tmp_path / "b", tmp_path / "there"
+    printed = ("print", [["all_rows"], "paper_tables", "narrow"])
+
+    assert cli.main(["tables", str(a), str(b), "--into", str(there)]) == 0
+    assert calls == [("read", (a, b)), ("update", there, ["every_table"], 5)]
+    calls.clear()
+    assert cli.main(["tables", str(a), str(b), "--by-category", "sift,ours"]) == 0
+    assert calls == [("read", (a, b)), ("by category", run.summary, ["sift", "ours"]), printed]
+    calls.clear()
+    assert cli.main(["tables", str(a), str(b), "--out", str(there)]) == 0
+    assert calls == [("write", (a, b), there), ("by category", run.summary, list(methods)), printed]

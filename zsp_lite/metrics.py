@@ -109,10 +109,10 @@ def object_weights(
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
     its two objects' multiplicities: the pigeonhole bootstrap (Owen, "The pigeonhole bootstrap", 2007) with one set of
     objects on both sides, as in the vertex bootstrap of a network (Snijders & Borgatti, 1999). It accounts for pairs
-    that share an object. It is conservative if the errors depend little on the objects, because the part of an error
-    that is specific to a pair is counted up to three times. Every category keeps its total weight. Pairs of a category
-    with fewer than three objects are resampled as if they were independent: the spread between objects cannot be
-    estimated from two.
+    that share an object. If the errors depend little on the objects, the intervals are too wide: the estimated
+    variance is then up to three times the true one. Every category keeps its total weight. Pairs of a category with
+    fewer than three objects are resampled as if they were independent: the spread between objects cannot be estimated
+    from two.
 
     Args:
         objects: The two objects (reference, target) of each of the n pairs.

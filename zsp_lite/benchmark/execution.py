@@ -1,7 +1,7 @@
 """Evaluate chunks of pairs in this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
 
-A chunk is a few pairs of one category that share frames. Workers return the records of a whole chunk: what a killed
-run loses is the chunks that were being evaluated.
+A chunk is a few pairs of one category that share frames. Workers return the records of a whole chunk, so a killed run
+loses the chunks that were being evaluated.
 """
 
 import os
@@ -198,7 +198,8 @@ def evaluate_chunks(
             if not running:
                 return
             finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
-            for future in finished:
+            # Failures last: all that has been evaluated is saved before an error ends the run.
+            for future in sorted(finished, key=_failed):
                 save(future.result())
     except workers.deaths as error:
         raise InputError(
@@ -226,6 +227,10 @@ def one_thread() -> Iterator[None]:
             yield
         finally:
             cv2.setNumThreads(cv2_threads)
+
+
+def _failed(future: Future) -> bool:
+    return future.cancelled() or future.exception() is not None
 
 
 _worker = threading.local()  # an executor's workers may be threads

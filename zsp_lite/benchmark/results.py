@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.benchmark.database import Records, read_records, read_settings
+from zsp_lite.benchmark.database import SETTINGS, Records, read_records, read_settings
 from zsp_lite.benchmark.summary import category_of, summarise_rows, summarise_run
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
@@ -17,6 +17,7 @@ from zsp_lite.io.files import read_bytes, write_atomic
 logger = logging.getLogger(__name__)
 
 RESULTS = "results.json.gz"
+_NEEDED = ("data", "backbone", "targets", "seed")  # of run.json, for the summary
 _DECIMALS = 4  # of degrees and lengths in an export
 _EXPORTED = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
 
@@ -83,8 +84,10 @@ def read_results(path: str | Path) -> Results:
     """
     path = Path(path)
     if path.is_dir():
-        records = read_records(path)
-        return results_of(read_settings(path), records)
+        records, settings = read_records(path), read_settings(path)
+        if missing := [name for name in _NEEDED if name not in settings]:
+            raise InputError(f"{path / SETTINGS}: no {', '.join(missing)}, expected the settings of a run")
+        return results_of(settings, records)
     try:
         content = json.loads(gzip.decompress(read_bytes(path, "results")))
     except (OSError, EOFError, zlib.error, ValueError) as error:
