@@ -159,6 +159,25 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
     assert summary["methods"] == undisturbed[1]["methods"]
 
 
+def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path):
+    seen = []
+
+    def look(done: int, total: int) -> None:
+        if done == 3:
+            code = "import sys; from zsp_lite.cli.main import main; sys.exit(main(sys.argv[1:]))"
+            command = [sys.executable, "-c", code, "tables", str(tmp_path), "--out", str(tmp_path / "tables")]
+            environment = os.environ | {"PYTHONPATH": str(TESTS.parent)}
+            assert subprocess.run(command, env=environment, stdout=subprocess.DEVNULL).returncode == 0
+            with pytest.raises(InputError, match="another run is writing"):
+                evaluate(*arguments, out=tmp_path)
+        seen.append(read_results(tmp_path).summary["methods"]["ours-bv"]["n"])
+
+    arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3)
+    evaluate(*arguments, out=tmp_path, progress=look)
+    assert seen == [1, 2, 3, 4]
+    assert evaluate(*arguments, out=tmp_path)["methods"]["ours-bv"]["n"] == 4
+
+
 def test_any_executor_will_do(undisturbed, tmp_path):
     with ThreadPoolExecutor(2) as executor:
         summary = evaluate(small_folder(), QUICK, ROWS, 6, 3, out=tmp_path, executor=executor)
@@ -335,6 +354,10 @@ def test_results_without_their_settings_are_refused(undisturbed, tmp_path):
     (run / SETTINGS).write_text(json.dumps({name: one for name, one in settings.items() if name != "data"}))
     with pytest.raises(InputError, match="run.json: no data, expected the settings of a run"):
         read_results(run)
+    (run / SETTINGS).unlink()
+    for call in (evaluate, plan_run):
+        with pytest.raises(InputError, match="holds results in run.sqlite without run.json"):
+            call(small_folder(), QUICK, ROWS, 6, 3, seed=1, out=run)
 
 
 def test_a_database_that_cannot_be_opened_or_written_is_bad_input(undisturbed, tmp_path):

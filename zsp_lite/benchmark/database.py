@@ -6,14 +6,14 @@ Tables of run.sqlite; the last column of each holds JSON:
     evaluations  what each evaluation of a pair cost, and the IoU of its foregrounds with the masks
     invocations  each call of `evaluate`: command, versions, machine, rows, categories, seconds
 
-The process that started the run is the only one that writes. It holds SQLite's exclusive lock, which the operating
-system releases when the process ends.
+The process that started the run is the only one that writes. It holds SQLite's exclusive lock on the empty database
+run.lock, which the operating system releases when the process ends. Other processes can read run.sqlite meanwhile.
 """
 
 import json
 import sqlite3
 from collections.abc import Iterable, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from typing import Any
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 
-SETTINGS, DATABASE = "run.json", "run.sqlite"
+SETTINGS, DATABASE, LOCK = "run.json", "run.sqlite", "run.lock"
+_TIMEOUT = 60  # seconds to wait for the end of a read or of a transaction
 _TABLES = (
     "CREATE TABLE IF NOT EXISTS invocations (id INTEGER PRIMARY KEY, facts TEXT)",
     "CREATE TABLE IF NOT EXISTS results"
@@ -65,32 +66,27 @@ class RunFolder:
     def __init__(self, out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False):
         self._out = out = Path(out)
         out.mkdir(parents=True, exist_ok=True)
-        check_settings(out, settings, allow_other_version)  # a refused folder gets no database
+        check_settings(out, settings, allow_other_version)  # a refused folder gets no lock and no database
         try:
-            self._database = sqlite3.connect(out / DATABASE, timeout=0.5)
+            with ExitStack() as opened:
+                lock = opened.enter_context(closing(sqlite3.connect(out / LOCK, timeout=0.5)))
+                lock.execute("BEGIN EXCLUSIVE")
+                merged = check_settings(out, settings, allow_other_version)
+                write_atomic(out / SETTINGS, json.dumps(merged, indent=1).encode())
+                self._database = opened.enter_context(closing(sqlite3.connect(out / DATABASE, timeout=_TIMEOUT)))
+                with self._database:
+                    for table in _TABLES:
+                        self._database.execute(table)
+                self._opened = opened.pop_all()
         except sqlite3.Error as error:
             raise _unusable(out, error) from error
-        try:
-            with self._database:
-                self._database.execute("PRAGMA locking_mode = EXCLUSIVE")  # locks are kept until the connection closes
-                self._database.execute("BEGIN EXCLUSIVE")
-                for table in _TABLES:
-                    self._database.execute(table)
-            merged = check_settings(out, settings, allow_other_version)
-            write_atomic(out / SETTINGS, json.dumps(merged, indent=1).encode())
-        except sqlite3.Error as error:
-            self._database.close()
-            raise _unusable(out, error) from error
-        except BaseException:
-            self._database.close()
-            raise
         self._invocation: int | None = None
 
     def __enter__(self) -> "RunFolder":
         return self
 
     def __exit__(self, *_) -> None:
-        self._database.close()
+        self._opened.close()
 
     def begin(self, facts: Mapping[str, Any]) -> None:
         """Record a call of `evaluate`; the results that follow are its own."""
@@ -141,7 +137,7 @@ def read_records(out: str | Path) -> Records:
     """Read the records of a run's folder, finished or interrupted.
 
     Raises:
-        InputError: If there is no run in it, it is damaged, or a process writes to it.
+        InputError: If there is no run in it, or it is damaged.
     """
     return _query(Path(out), _read)
 
@@ -186,6 +182,8 @@ def check_settings(out: str | Path, settings: Mapping[str, Any], allow_other_ver
     if not (out / SETTINGS).is_file():
         if (out / "pairs.jsonl").is_file():
             raise InputError(f"{out} holds pairs.jsonl without {SETTINGS}; choose another folder")
+        if finished_results(out):
+            raise InputError(f"{out} holds results in {DATABASE} without {SETTINGS}; choose another folder")
         return dict(settings) | {"library": [settings["library"]]}
     before = read_settings(out)
     if (out / "pairs.jsonl").is_file() or "library" not in before:
@@ -220,7 +218,8 @@ def _query(out: Path, read: Any) -> Any:
         raise InputError(f"{out} holds no benchmark run{old}")
     try:
         # Not read-only: after a crash, SQLite first has to roll back the unfinished transaction.
-        with closing(sqlite3.connect(out / DATABASE, timeout=0.5)) as database:
+        with closing(sqlite3.connect(out / DATABASE, timeout=_TIMEOUT)) as database:
+            database.execute("BEGIN")  # all queries see one state of a run that goes on
             return read(database)
     except (sqlite3.Error, ValueError) as error:
         raise _unusable(out, error) from error
