@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from model_files import wedge, write_quad, write_wedge
+from model_files import painted, wedge, write_quad, write_wedge
 
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import meshes
@@ -91,10 +91,10 @@ def _shift(x: float) -> np.ndarray:
 
 def test_edges_of_a_box_stay_sharp_and_an_ellipsoid_is_smooth(tmp_path):
     cube = box((1, 2, 3))
-    sharp = meshes.plain_mesh(cube.vertices, cube.faces, meshes.Material(np.ones(4)))
+    sharp = painted(cube)
     assert np.abs(sharp.normals).max(-1) == pytest.approx(np.ones((12, 3)))
     ball = ellipsoid((1, 1, 1), sides=32, rings=24)
-    smooth = meshes.plain_mesh(ball.vertices, ball.faces, meshes.Material(np.ones(4)))
+    smooth = painted(ball)
     corners = ball.vertices[ball.faces]
     along = np.abs((smooth.normals * corners).sum(-1) / np.linalg.norm(corners, axis=-1))
     assert np.median(along) > 0.999 and np.quantile(along, 0.02) > 0.98

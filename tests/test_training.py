@@ -12,12 +12,13 @@ import torch.nn.functional as F
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from tools import ablations
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.pretrained import TINY as SHIPPED
 from zsp_lite.cli import main as cli
 from zsp_lite.errors import InputError
-from zsp_lite.training import ablations, distillation, recipe
+from zsp_lite.training import distillation, recipe
 from zsp_lite.training.batches import MEAN, STD, sample_batch
 from zsp_lite.training.export import export_checkpoint, starting_weights
 from zsp_lite.training.loop import read_checkpoint

@@ -419,7 +419,8 @@ def test_the_truth_scores_above_other_poses(scene, truth):
 
 
 def test_points_in_front_of_a_surface_violate_free_space_and_occluded_ones_do_not(scene, truth):
-    toward = -scene.target_maps.camera_centres[0] / scene.target_maps.camera_centres[0].norm()
+    from_camera = scene.target_maps.rotation[0].T @ scene.target_maps.translation[0]  # to the origin
+    toward = from_camera / from_camera.norm()
     near, far = (Poses(truth.scale, truth.rotation, truth.translation + move * toward) for move in (-1.0, 1.0))
     fronts = [float(forward_terms(scene, pose).free_space[0, 0].mean()) for pose in (near, truth, far)]
     assert fronts[0] > 0.3 and fronts[1] < 0.02 and fronts[2] < 0.02

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.views import View
 
-ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
+_INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
 def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
@@ -54,6 +54,14 @@ def standard_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(np.square(points - points.mean(axis=0)).sum(axis=1).mean() / 3))
 
 
+def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
+    """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D (supplement).
+
+    It is at most `standard_deviation`, and equal to it for points that vary equally along all axes.
+    """
+    return float(points.std(axis=0).mean())
+
+
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Gather a view's object points for display, without outliers.
 
@@ -71,7 +79,7 @@ def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarra
         InputError: No pixel of the object has a known depth.
     """
     frame = view.frame
-    pixels = object_pixels(frame, 0.9)
+    pixels = object_pixels(frame, _INTERIOR)
     if frame.mask is None:
         rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
         pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]

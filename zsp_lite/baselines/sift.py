@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from zsp_lite.data.depth import inpaint_depth
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
-from zsp_lite.points import ON_OBJECT
 
 
 @dataclass(frozen=True, eq=False)

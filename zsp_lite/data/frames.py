@@ -16,6 +16,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
 
+ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -59,7 +61,7 @@ class Frame:
     def __repr__(self) -> str:
         height, width = self.camera.size
         depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
-        mask = "no mask" if self.mask is None else f"mask above 0.5 at {(self.mask > 0.5).mean():.0%}"
+        mask = "no mask" if self.mask is None else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
 
     def _repr_html_(self) -> str:

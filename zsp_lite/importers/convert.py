@@ -6,6 +6,7 @@ from pathlib import Path
 
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
+from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import CaptureFrame, subsample
 from zsp_lite.importers.fusion import fuse, scale_frame, unit_scale
@@ -87,7 +88,7 @@ def import_capture(
         raise InputError(
             "the capture has no masks of its own, expected a box in its first picture or a folder of masks"
         )
-    seen = [index for index, frame in enumerate(frames) if (frame.mask > 0.5).any()]
+    seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
     if not seen:
         raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
     empty, frames = len(frames) - len(seen), [frames[index] for index in seen]

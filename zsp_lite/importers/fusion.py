@@ -10,7 +10,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.points import object_points
+from zsp_lite.points import axis_deviation, object_pixels, object_points
 
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
@@ -36,7 +36,7 @@ def fuse(
     types, shapes = (o3d.core.float32,) * 3, ((1,), (1,), (3,))
     volume = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), types, shapes, voxel, 16, 2000)
     for frame in frames:
-        depth = np.where(frame.mask > 0.5, frame.depth, 0).astype(np.float32)
+        depth = np.where(object_pixels(frame), frame.depth, 0).astype(np.float32)
         if not depth.any():
             continue
         intrinsic = o3d.core.Tensor(frame.camera.K - HALF_PIXEL)
@@ -67,7 +67,7 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 
 def unit_scale(points: Float[np.ndarray, "n 3"]) -> float:
     """Compute the factor that gives points (n, 3) unit standard deviation, averaged over the axes, as in CO3D."""
-    spread = float(points.std(axis=0).mean())
+    spread = axis_deviation(points)
     if not spread > 0:
         raise InputError(f"point cloud of {len(points)} points has no extent, expected an object")
     return 1 / spread

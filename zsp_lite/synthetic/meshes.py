@@ -117,14 +117,6 @@ def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> Te
     return replace(mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32))
 
 
-def plain_mesh(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], material: Material) -> TexturedMesh:
-    """Return a mesh of one material, with smooth normals except at sharp edges and without texture coordinates."""
-    n = len(faces)
-    uv, colours = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
-    normals = _smooth_normals(vertices, faces)
-    return TexturedMesh(vertices, faces, normals, uv, colours, np.zeros(n, int), (material,))
-
-
 def _require_pycollada(path: Path) -> None:
     try:
         import collada  # noqa: F401

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
+from zsp_lite.points import axis_deviation
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 
@@ -136,7 +137,7 @@ def simulate_capture(
         depths.append(stereo_depth(view, rng, *shares))
         masks.append(soft_mask(view.mask, rng))
     points, normals, colours = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
-    factor = round(float(1 / points.std(0).mean()), 9)
+    factor = round(1 / axis_deviation(points), 9)
     exact = rescaled(sequence, factor)
     frames = [
         Frame(view.rgb, depth * np.float32(factor), mask, view.camera, f"{name}/{number}")

@@ -56,11 +56,6 @@ class ViewMaps:
     def __len__(self) -> int:
         return len(self.focal_length)
 
-    @property
-    def camera_centres(self) -> Float[Tensor, "v 3"]:
-        """Camera centres in the working frame."""
-        return -(self.rotation.transpose(1, 2) @ self.translation[..., None])[..., 0]
-
 
 @dataclass(frozen=True, eq=False)
 class Projection:

@@ -192,9 +192,8 @@ def _relative_pose(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 
 
 
 def _patch_cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.ndarray, " patches"]]:
-    """Camera-frame points of all patches, and which of them are foreground of known depth."""
-    points, known = view.patch_points
-    return points.reshape(-1, 3), (known & np.asarray(view.foreground.cpu())).ravel()
+    """Return the camera-frame points of all patches, and which of them are foreground of known depth."""
+    return view.patch_points[0].reshape(-1, 3), view.known_foreground.ravel()
 
 
 def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:

@@ -20,8 +20,8 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.demo import DemoResult
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.points import object_cloud
-from zsp_lite.views import View, object_crop
+from zsp_lite.points import axis_deviation, object_cloud
+from zsp_lite.views import View, frame_defect, object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz.scene3d import aligned_clouds
 
@@ -29,7 +29,6 @@ COLUMNS = ("category", "chosen view", "inliers", "rotation error", "time")
 _DPI = 110
 _OVERVIEW_FRAMES = 4
 _OVERVIEW_POINTS = 1500
-_MASK_THRESHOLD = 0.4  # as in `crop_to_object`
 
 
 @dataclass(frozen=True)
@@ -250,7 +249,7 @@ def _sequence_figure(result: DemoResult) -> Figure:
     frames = result.sequence
     titles = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=3.3)
-    length = 2 * float(cloud.std(axis=0).mean())
+    length = 2 * axis_deviation(cloud)
     for axis, frame, pose in zip(axes, frames, result.estimate.propagate([frame.camera for frame in frames])):
         plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
         plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), length)
@@ -263,9 +262,9 @@ def _chosen_views(result: DemoResult) -> list[View]:
 
 
 def _sequence_crops(result: DemoResult) -> list[Frame]:
-    """Object crops of frames of the target sequence, without the frames whose mask is empty (CO3D has some)."""
-    visible = [frame for frame in result.sequence if frame.mask is None or (frame.mask > _MASK_THRESHOLD).any()]
-    return [object_crop(frame) for frame in visible[:_OVERVIEW_FRAMES]]
+    """Crop the first usable frames of the target sequence to their objects; in CO3D some frames have an empty mask."""
+    usable = [frame for frame in result.sequence if not frame_defect(frame)]
+    return [object_crop(frame) for frame in usable[:_OVERVIEW_FRAMES]]
 
 
 def _data_uri(figure: Figure) -> str:

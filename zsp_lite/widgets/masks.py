@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
@@ -36,7 +37,7 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
         try:
             if bottom - top < 4 or right - left < 4:
                 raise InputError("the box is empty, expected top above bottom and left before right")
-            mask = grab_cut(frame.rgb, (top, left, bottom - top, right - left)) > 0.5
+            mask = grab_cut(frame.rgb, (top, left, bottom - top, right - left)) > ON_OBJECT
         except InputError as error:
             shade.set_data(dark)
             return str(error)
@@ -44,7 +45,7 @@ def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
         shade.set_data(dark)
         text = f"mask of {mask.sum():,} pixels"
         if frame.mask is not None:
-            true = frame.mask > 0.5
+            true = frame.mask > ON_OBJECT
             text += f", IoU with the true mask {(mask & true).sum() / (mask | true).sum():.2f}"
         return text
 

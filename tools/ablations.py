@@ -1,6 +1,6 @@
 """Ablations of the training: short runs that continue from the same weights, each without one part.
 
-    python -m zsp_lite.training.ablations zsp-tiny outputs/ablations
+    python -m tools.ablations zsp-tiny outputs/ablations
 
 renders 800 objects in three variants, trains every variant for the same number of steps on 128 px crops, and prints a
 table of accuracies on objects of training categories that no run has seen. Renders and runs are kept in the folder and
@@ -45,7 +45,7 @@ Row = tuple[float, float, float]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m zsp_lite.training.ablations", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.ablations", description=__doc__.splitlines()[0])
     parser.add_argument(
         "start_from", help="initial weights: checkpoint.pt of a run, exported .safetensors, or zsp-tiny"
     )
