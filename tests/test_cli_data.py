@@ -2,16 +2,20 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
 from test_importers import METRES, write_lists
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import Frame, write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.importers import READERS
+from zsp_lite.importers.convert import ImportResult
 from zsp_lite.synthetic.export import make_sequence
 
 
@@ -68,6 +72,56 @@ def test_label_lists_the_progress_and_draws_a_contact_sheet(root, tmp_path, caps
     assert sheet.read_bytes().startswith(b"\x89PNG")
     assert main(["label", str(root), "chair", "--contact-sheet", str(tmp_path / "sheet.doc")]) == 2
     assert "expected the name of a .png file" in capsys.readouterr().err
+
+
+def test_label_proposes_alignments_by_the_given_backbone(root, monkeypatch, capsys):
+    given, pose = [], Sim3.identity()
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: f"loaded {name}")
+
+    def estimate(dataset, backbone, *names):
+        given.append((backbone, *names))
+        return pose, 0.7
+
+    monkeypatch.setattr("zsp_lite.labelling.guess.guess_alignment", estimate)
+    monkeypatch.setattr("zsp_lite.labelling.Labelling.guess", lambda self, *arguments: given.append(arguments))
+    proposals = []
+
+    def label_category(labelling, ask, show, propose):
+        proposals.append(propose is not None and propose("b"))
+
+    monkeypatch.setattr("zsp_lite.labelling.desktop.label_category", label_category)
+    assert main(["label", str(root), "chair"]) == 0
+    assert proposals == [False] and not given
+    assert main(["label", str(root), "chair", "--guess", "--backbone", "small"]) == 0
+    assert given == [("loaded small", "chair", "a", "b"), ("b", pose)]
+    assert "b: proposed with 70 % confidence" in capsys.readouterr().out
+
+
+def test_options_of_transfer_and_import_reach_the_library(tmp_path, monkeypatch):
+    given = []
+
+    def transfer(*arguments):
+        given.append(arguments)
+        return {}
+
+    monkeypatch.setattr("zsp_lite.data.label_import.transfer_labels", transfer)
+    assert main(["data", "transfer", "v1", "v2", "chair", "--max-residual", "0.2", "--replace"]) == 0
+    assert given.pop() == (Path("v1"), Path("v2"), "chair", 0.2, True)
+
+    def import_capture(*arguments):
+        given.append(arguments)
+        return ImportResult(1, 0, 1, 1.0)
+
+    for layout in ("tum", "lists"):
+        monkeypatch.setitem(READERS, layout, lambda folder, **options: (folder, options))
+    monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
+    words = "--root mine --category cup --sequence one --frames 7".split()
+    assert main(["data", "import", "tum", "scan", *words, "--intrinsics", "5,6,7,8", "--box", "1,2,3,4"]) == 0
+    capture = (Path("scan"), {"intrinsics": (5, 6, 7, 8)})
+    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
+    capture = (Path("scan"), {"depth_unit": 0.5})
+    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
 
 
 def test_label_without_a_desktop_gives_one_line(root, monkeypatch, capsys):

@@ -26,9 +26,9 @@ class Calibration:
     Scores are in nats, so a coefficient of 1 for the margin means that the score itself is calibrated.
 
     Attributes:
-        bias: intercept.
-        margin: coefficient of the score margin in nats, x_1 (see `score_margins`).
-        view_std: coefficient of the standard deviation of view similarities, x_2 (see `Scene.view_similarity_std`).
+        bias: Intercept.
+        margin: Coefficient of the score margin in nats, x_1 (see `score_margins`).
+        view_std: Coefficient of the standard deviation of view similarities, x_2 (see `Scene.view_similarity_std`).
     """
 
     bias: float = -1.0
@@ -57,8 +57,8 @@ def score_margins(score: Float[np.ndarray, " m"], angle: Float[np.ndarray, "m m"
     """Return each hypothesis's score minus the best score more than 30 degrees away, clipped to [-8, 8] nats.
 
     Args:
-        score: scores of the hypotheses, nats.
-        angle: angles between their rotations, degrees.
+        score: Scores of the hypotheses, nats.
+        angle: Angles between their rotations, degrees.
     """
     rivals = np.where(angle > MODE_ANGLE, score, -np.inf)
     return np.clip(score - rivals.max(axis=1), -_MAX_MARGIN, _MAX_MARGIN)
@@ -71,9 +71,9 @@ class Reliability:
     Bins hold equal numbers of estimates, in order of confidence.
 
     Attributes:
-        auroc: area under the ROC curve (see `auroc`).
-        calibration_error: expected calibration error, in [0, 1].
-        top_half_accuracy: fraction of correct estimates among the more confident half.
+        auroc: Area under the ROC curve (see `auroc`).
+        calibration_error: Expected calibration error, in [0, 1].
+        top_half_accuracy: Fraction of correct estimates among the more confident half.
         count: (bins,) number of estimates.
         confidence: (bins,) mean confidence.
         accuracy: (bins,) fraction of correct estimates.
@@ -102,9 +102,9 @@ def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, "
     """Measure the reliability of confidences.
 
     Args:
-        confidence: confidences of n estimates, in [0, 1].
-        correct: which of the estimates were correct.
-        bins: number of bins of equal count.
+        confidence: Confidences of n estimates, in [0, 1].
+        correct: Which of the estimates were correct.
+        bins: Number of bins of equal count.
 
     Raises:
         InputError: If the lengths differ or there are fewer estimates than bins.
@@ -125,7 +125,7 @@ def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, "
 
 
 def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
-    """Probability that a correct estimate has a higher confidence than a wrong one, ties counting half.
+    """Estimate the probability that a correct estimate has a higher confidence than a wrong one, ties counting half.
 
     Returns:
         Area under the ROC curve in [0, 1]; nan if all estimates are correct or all are wrong.

@@ -87,10 +87,10 @@ def build_maps(
     """Build the maps of views that share a world frame.
 
     Args:
-        views: v views.
-        world_to_camera: rotation and translation of each view, from their common world frame.
-        world_to_working: from that frame to working units; its rotation must be the identity.
-        columns: per view, the similarity column of each patch (row-major), -1 for none.
+        views: The v views.
+        world_to_camera: Rotation and translation of each view, from their common world frame.
+        world_to_working: From that frame to working units; its rotation must be the identity.
+        columns: Per view, the similarity column of each patch (row-major), -1 for none.
     """
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
@@ -127,10 +127,10 @@ def project_points(
     there, and its extent beyond the border is unknown.
 
     Args:
-        maps: maps of v views.
-        linear: linear parts of m poses in the working frame.
-        translation: translations of m poses, working units.
-        points: n points in working units.
+        maps: Maps of the v views.
+        linear: Linear parts of m poses in the working frame.
+        translation: Translations of m poses, working units.
+        points: The n points in working units.
     """
     m, v = len(linear), len(maps)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
@@ -152,7 +152,7 @@ def project_points(
 
 
 def _map_camera(camera: Camera) -> Camera:
-    """The camera resized to about _MAP_PIXELS pixels, with equal focal lengths along both axes."""
+    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes."""
     height, width = camera.size
     aspect = (height / camera.focal_length[1]) / (width / camera.focal_length[0])
     rows = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
@@ -177,7 +177,7 @@ def _table(
 
 
 def _distance(outside: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Distance in pixels from each pixel to the nearest one that is not outside."""
+    """Compute the distance in pixels from each pixel to the nearest one that is not outside."""
     if outside.all():
         return np.full(outside.shape, _NO_SILHOUETTE, np.float32)
     return cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)

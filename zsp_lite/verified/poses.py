@@ -58,7 +58,7 @@ def nearest_rotation(covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3
     """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
 
     Args:
-        covariance: sum of target @ source^T over corresponding centred points.
+        covariance: Sum of target @ source^T over corresponding centred points.
     """
     left, _, right = torch.linalg.svd(covariance)
     sign = torch.ones_like(covariance[..., 0])
@@ -83,7 +83,7 @@ def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) ->
 
 
 def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
-    """Geodesic angle in degrees between each rotation of one batch and each of the other."""
+    """Compute the geodesic angle in degrees between each rotation of one batch and each of the other."""
     cosine = (first.flatten(1) @ second.flatten(1).T - 1) / 2
     return torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))
 
@@ -104,10 +104,10 @@ def non_maximum_suppression(
     """Select the best-scored poses whose rotations differ.
 
     Args:
-        rotation: rotations of the poses.
-        score: scores of the poses, higher is better.
-        min_angle: smallest angle in degrees between any two selected rotations.
-        max_count: largest number of poses to select.
+        rotation: Rotations of the poses.
+        score: Scores of the poses, higher is better.
+        min_angle: Smallest angle in degrees between any two selected rotations.
+        max_count: Largest number of poses to select.
 
     Returns:
         Indices of the selected poses, best score first.

@@ -29,10 +29,10 @@ def propose_poses(
     """Propose poses from the matches of each target view, followed by one pose per view from its rotation.
 
     Args:
-        scene: scene with N target views.
-        seed: seed or generator of the samples.
-        trials: samples of three matches, per view.
-        per_view: largest number of proposals from the matches of a view.
+        scene: Scene with N target views.
+        seed: Seed or generator of the samples.
+        trials: Samples of three matches, per view.
+        per_view: Largest number of proposals from the matches of a view.
 
     Returns:
         N to N * (per_view + 1) poses.
@@ -55,11 +55,11 @@ def poses_from_matches(
     sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2) over all matches.
 
     Args:
-        source: matched points of the reference, in working units.
-        target: matched points of the target view, in working units.
-        seed: seed or generator of the samples.
-        trials: number of samples.
-        max_count: largest number of poses to return.
+        source: Matched points of the reference, in working units.
+        target: Matched points of the target view, in working units.
+        seed: Seed or generator of the samples.
+        trials: Number of samples.
+        max_count: Largest number of poses to return.
 
     Returns:
         At most `max_count` poses, best score first. None for fewer than three matches, or if no fit has a scale
@@ -79,6 +79,6 @@ def poses_from_matches(
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """For each target view, return the pose under which its viewpoint is that of the reference, centroids aligned."""
+    """Return for each target view the pose under which the reference has its viewpoint, with the centroids aligned."""
     rotation = scene.target_maps.rotation.transpose(1, 2).contiguous()
     return Poses(torch.full((len(rotation),), _VIEW_SCALE), rotation, torch.zeros(len(rotation), 3))

@@ -31,12 +31,12 @@ class SearchSchedule:
     """Number and widths of the steps of a search.
 
     Attributes:
-        rounds: number of rounds.
-        samples: steps per round and pose.
-        rotation: standard deviation of each component of the rotation vector, in degrees, in the first round.
-        translation: standard deviation of each component, in working units, in the first round.
-        scale: standard deviation of the logarithm of the scale, in the first round.
-        decay: factor on all three after each round.
+        rounds: Number of rounds.
+        samples: Steps per round and pose.
+        rotation: Standard deviation of each component of the rotation vector, in degrees, in the first round.
+        translation: Standard deviation of each component, in working units, in the first round.
+        scale: Standard deviation of the logarithm of the scale, in the first round.
+        decay: Factor on all three after each round.
     """
 
     rounds: int
@@ -90,10 +90,10 @@ def refine(
     Rotations are about the centroid of the reference's points, which is the origin in working units.
 
     Args:
-        poses: poses to start from.
-        score: function to maximise.
-        schedule: number and widths of the steps.
-        seed: seed or generator of the steps.
+        poses: Poses to start from.
+        score: Function to maximise.
+        schedule: Number and widths of the steps.
+        seed: Seed or generator of the steps.
 
     Returns:
         The refined poses and their scores, which are at least those of the given poses.
@@ -139,7 +139,7 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
 def _score_function(
     scene: Scene, weights: ScoreWeights, counts: tuple[int, int]
 ) -> Callable[[Poses], Float[Tensor, " m"]]:
-    """A function that scores poses by about `counts` points of the reference and of the targets."""
+    """Return a function that scores poses by about `counts` points of the reference and of the targets."""
     totals = len(scene.reference_points), len(scene.target_points)
     stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
     return lambda poses: weights.score(score_terms(scene, poses, stride))

@@ -43,12 +43,12 @@ class Scene:
         target_weight: (m,) share of the surface that each target point represents; they sum to 1.
         similarity: (n, columns) double-centred feature similarity of each reference point to each foreground patch of
             all targets (see `double_centre`).
-        reference_maps: per-pixel maps of the reference.
-        target_maps: per-pixel maps of the targets.
-        reference_to_working: reference camera to working units.
-        target_to_working: first target camera to working units.
-        target_cameras: cameras of the targets.
-        matches: per target, the matched points of reference and target, working units.
+        reference_maps: Per-pixel maps of the reference.
+        target_maps: Per-pixel maps of the targets.
+        reference_to_working: Reference camera to working units.
+        target_to_working: First target camera to working units.
+        target_cameras: Cameras of the targets.
+        matches: Per target, the matched points of reference and target, working units.
         view_similarity: (v,) feature similarity of each target view to the reference less their mean (see
             `view_similarity`).
     """
@@ -93,10 +93,10 @@ def build_scene(
     """Prepare the scene of a reference view and its target views.
 
     Args:
-        reference: reference view.
-        targets: target views.
-        similarities: per target, (patches of the reference, patches of the target) as from `matching.similarities`.
-        matches: per target, on the patch grids; matches without a known depth on both sides are dropped.
+        reference: Reference view.
+        targets: Target views.
+        similarities: Per target, (patches of the reference, patches of the target) as from `matching.similarities`.
+        matches: Per target, on the patch grids; matches without a known depth on both sides are dropped.
 
     Raises:
         InputError: If the reference, or all targets together, have fewer than MIN_POINTS foreground patches of known
@@ -160,10 +160,10 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
 
 
 def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
-    """Mean of each foreground patch's highest similarity in the other view, averaged over both directions.
+    """Average each foreground patch's highest similarity in the other view, in both directions.
 
     Args:
-        similarity: similarity between the foreground patches of two views.
+        similarity: Similarity between the foreground patches of two views.
 
     Returns:
         A scalar in [-1, 1]; -1 if one of the views has no foreground.
@@ -186,7 +186,7 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
 
 
 def _relative_pose(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Rotation and translation from the first camera's frame to the second's."""
+    """Return the rotation and translation from the first camera's frame to the second's."""
     rotation = second.R @ first.R.T
     return rotation, second.t - rotation @ first.t
 
@@ -197,14 +197,14 @@ def _patch_cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.nd
 
 
 def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:
-    """Consecutive numbers from `start` for the selected entries, -1 for the others."""
+    """Number the selected entries consecutively from `start`, -1 for the others."""
     return np.where(selected, start + np.cumsum(selected) - 1, -1)
 
 
 def _matched_patches(
     reference: View, target: View, matches: Matches
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Flat indices of the matched patches of both views, for the matches with known depth on both sides."""
+    """Return the flat indices of the matched patches of both views, for the matches with known depth on both sides."""
     u = np.ravel_multi_index(tuple(matches.reference.T), reference.features.grid)
     v = np.ravel_multi_index(tuple(matches.target.T), target.features.grid)
     known = reference.patch_points[1].ravel()[u] & target.patch_points[1].ravel()[v]
@@ -214,7 +214,7 @@ def _matched_patches(
 def _normalisation(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], valid: Sequence[Bool[np.ndarray, " _"]], name: str
 ) -> tuple[Sim3, list[Bool[np.ndarray, " _"]]]:
-    """The similarity that gives the valid points mean 0 and unit spread, and which of them are not outliers."""
+    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark those that are not outliers."""
     points = np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)])
     if len(points) < MIN_POINTS:
         raise InputError(f"{name}: {len(points)} foreground patches of known depth, expected at least {MIN_POINTS}")

@@ -29,10 +29,10 @@ def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, feature_w
     """Align every pose to the local optimum, independently of the others.
 
     Args:
-        scene: scene with the point clouds and their feature similarity.
-        poses: poses to start from.
-        iterations: number of iterations.
-        feature_weight: lambda in the affinity; 0 aligns by shape alone.
+        scene: Scene with the point clouds and their feature similarity.
+        poses: Poses to start from.
+        iterations: Number of iterations.
+        feature_weight: Factor lambda in the affinity; 0 aligns by shape alone.
     """
     rows = evenly_spaced_indices(len(scene.reference_points), _MAX_POINTS[0])
     columns = evenly_spaced_indices(len(scene.target_points), _MAX_POINTS[1])
@@ -61,5 +61,5 @@ def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, feature_w
 
 
 def evenly_spaced_indices(n: int, max_count: int) -> Int[Tensor, " count"]:
-    """At most `max_count` of the indices 0 to n - 1, evenly spaced."""
+    """Select at most `max_count` of the indices 0 to n - 1, evenly spaced."""
     return torch.arange(min(n, max_count)) * n // min(n, max_count)

@@ -147,7 +147,7 @@ class VerifiedSolver:
     def _hypotheses(
         self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
     ) -> tuple[tuple[Hypothesis, ...], Float[np.ndarray, " n"]]:
-        """Hypotheses of ranked poses, and the view angles of the best one."""
+        """Build the hypotheses of ranked poses, and return them with the view angles of the best one."""
         score = self.weights.score(terms).double().numpy()
         angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
         calibration = self.calibration or calibration_for(len(order))
@@ -199,7 +199,7 @@ def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[s
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
-    """The targets sorted by a hash of their content, which neither their order nor the world's axes change."""
+    """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
     content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
     keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
     return tuple(sorted(range(len(targets)), key=keys.__getitem__))

@@ -112,7 +112,7 @@ class PointTerms:
     """The parts of the terms for each point in each view, before averaging (see the module's docstring).
 
     Attributes:
-        projection: where the n points fall in the v views under m poses.
+        projection: Where the n points fall in the v views under m poses.
         surface: (m, v, n), a: weight in [0, 1] with which the point lies on the measured surface.
         silhouette: (m, v, n), c: in [0, 1].
         free_space: (m, v, n), b: in [0, 1].
@@ -155,9 +155,9 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
     """Compute the terms of every pose.
 
     Args:
-        scene: the scene to score against.
-        poses: m poses.
-        stride: step through the reference points and the target points; larger is faster and less exact.
+        scene: The scene to score against.
+        poses: The m poses.
+        stride: Step through the reference points and the target points; larger is faster and less exact.
     """
     rows = torch.arange(0, len(scene.reference_points), stride[0])
     indices = torch.arange(0, len(scene.target_points), stride[1])
@@ -182,9 +182,13 @@ def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
-    """Point terms of a projection.
+    """Compute the point terms of a projection.
 
-    offset: index of each point's first entry in the flattened similarity matrix.  patch_stride: step to the next patch.
+    Args:
+        scene: The scene to score against.
+        projection: Where the n points fall.
+        offset: Index of each point's first entry in the flattened similarity matrix.
+        patch_stride: Step from there to the next patch of the views that the points are projected into.
     """
     delta = projection.depth - projection.surface_depth
     surface = projection.weight * torch.exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2))

@@ -36,12 +36,12 @@ class StageFigure:
     """One figure of the page: an image with its alternative text, or HTML that draws it.
 
     Attributes:
-        title: heading.
-        caption: text below the figure.
-        image: data URI of the image, or None.
-        alt: alternative text of the image.
-        html: markup of the figure if there is no image.
-        wide: whether it spans both columns.
+        title: Heading.
+        caption: Text below the figure.
+        image: Data URI of the image, or None.
+        alt: Alternative text of the image.
+        html: Markup of the figure if there is no image.
+        wide: Whether it spans both columns.
     """
 
     title: str
@@ -56,11 +56,11 @@ def write_report(path: str | Path, results: Sequence[DemoResult], data: str, dat
     """Write the HTML page.
 
     Args:
-        path: file to write; missing folders are created.
-        results: one result per pair.
-        data: folder of the data.
-        data_note: a remark on the data, printed after the folder.
-        backbone: name of the backbone.
+        path: File to write; missing folders are created.
+        results: One result per pair.
+        data: Folder of the data.
+        data_note: Remark on the data, printed after the folder.
+        backbone: Name of the backbone.
 
     Returns:
         The path.
@@ -109,8 +109,8 @@ def write_overview(path: str | Path, results: Sequence[DemoResult]) -> Path:
     """Write a JPEG with one row per result: reference, chosen target view, and the pose in the target sequence.
 
     Args:
-        path: file to write; missing folders are created.
-        results: one result per pair.
+        path: File to write; missing folders are created.
+        results: One result per pair.
 
     Returns:
         The path.
@@ -140,7 +140,7 @@ def stage_figures(result: DemoResult, scene_id: str) -> list[StageFigure]:
     """Draw the figures of one result, in the order of the method's stages.
 
     Args:
-        result: the result.
+        result: The result.
         scene_id: HTML id of the 3D scene, unique on the page.
     """
     estimate, category, chosen = result.estimate, result.pair.category, f"target view {result.estimate.view + 1}"
@@ -257,7 +257,7 @@ def _sequence_figure(result: DemoResult) -> Figure:
 
 
 def _chosen_views(result: DemoResult) -> list[View]:
-    """The reference and the chosen target view."""
+    """Return the reference and the chosen target view."""
     return [result.estimate.reference_view, result.estimate.target_views[result.estimate.view]]
 
 
