@@ -214,7 +214,7 @@ def _matched_patches(
 def _normalisation(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], valid: Sequence[Bool[np.ndarray, " _"]], name: str
 ) -> tuple[Sim3, list[Bool[np.ndarray, " _"]]]:
-    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark those that are not outliers."""
+    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the outliers as invalid."""
     points = np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)])
     if len(points) < MIN_POINTS:
         raise InputError(f"{name}: {len(points)} foreground patches of known depth, expected at least {MIN_POINTS}")
