@@ -1,11 +1,14 @@
 """Rows of one's own: what they may be and may return, and how a row, a backbone or a function is told from another."""
 
+import dis
 import enum
 import functools
+import inspect
 import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +17,18 @@ import torch
 from benchmark_folder import own_method, small_folder
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite.benchmark import baseline_rows, provenance
 from zsp_lite.benchmark.database import read_records
 from zsp_lite.benchmark.extractors import EXTRACTORS
 from zsp_lite.benchmark.extractors import fingerprint as extractor_fingerprint
 from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, fingerprint, resolve
 from zsp_lite.benchmark.problem import Answer, as_answer
+from zsp_lite.benchmark.robustness import Damaged
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.verified import VerifiedSolver
 
 BACKBONE = CoordinateBackbone(grid=8)
 TESTS = Path(__file__).parent
@@ -144,6 +150,81 @@ def test_comments_and_docstrings_do_not_make_another_function():
         exec(f"def own(problem):\n    {text}\n    return problem, {result}", space)
         made.append(digest_of(space["own"]))
     assert made[0] == made[1] != made[2]
+
+
+def compile_otherwise(monkeypatch, function):
+    """Give a function other bytecode, as another version of Python does."""
+    function = inspect.unwrap(function)
+    code = function.__code__
+    monkeypatch.setattr(function, "__code__", code.replace(co_code=code.co_code + bytes([dis.opmap["NOP"], 0])))
+
+
+def test_a_function_with_source_is_known_by_it_whatever_the_bytecode(monkeypatch):
+    before = digest_of(own_method)
+    compile_otherwise(monkeypatch, own_method)
+    assert digest_of(own_method) == before != digest_of(one_way)
+    first, second = lambda problem: 1, lambda problem: 2
+    assert digest_of(first) != digest_of(second)
+
+
+@dataclass(frozen=True)
+class Settled:
+    k: int
+
+    def estimate(self, reference, targets):
+        return self.k
+
+
+def test_what_dataclass_generates_does_not_tell_classes_apart(monkeypatch):
+    before = digest_of(Settled(1))
+    compile_otherwise(monkeypatch, Settled.__init__)
+    assert digest_of(Settled(1)) == before != digest_of(Settled(2))
+
+
+def test_the_code_of_the_library_is_known_by_its_version_not_by_the_row(monkeypatch):
+    names = ("icp", "sift", "posecontrast", "ours-holes", "verified-noicp")
+    before = {name: fingerprint(METHODS[name]) for name in names}
+    assert len(set(before.values())) == len(names)
+    for name in ("icp", "sift", "posecontrast"):
+        compile_otherwise(monkeypatch, getattr(baseline_rows, name))
+    monkeypatch.setattr(Damaged, "__call__", lambda self, problem: 3)
+    monkeypatch.setattr(VerifiedSolver, "code_of_another_version", lambda self: 3, raising=False)
+    assert {name: fingerprint(METHODS[name]) for name in names} == before
+    assert digest_of(Damaged("holes")) != digest_of(Damaged("holes", {"k": 30}))
+
+
+def git(folder, *arguments):
+    author = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    subprocess.run(["git", "-C", str(folder), *author, *arguments], check=True, capture_output=True)
+
+
+def test_the_revision_is_that_of_the_librarys_folder(tmp_path, monkeypatch):
+    package, docs = tmp_path / "package", tmp_path / "docs"
+    monkeypatch.setattr(provenance, "_PACKAGE", package)
+    revision = provenance.git_revision.__wrapped__
+    for path in (package, docs):
+        path.mkdir()
+        (path / "__init__.py").write_text("a = 1\n")
+    git(tmp_path, "init")
+    assert revision() is None
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "first")
+    first = revision()
+    assert first and "modified" not in first
+
+    (docs / "__init__.py").write_text("a = 2\n")
+    git(tmp_path, "commit", "-am", "docs")
+    (docs / "__init__.py").write_text("a = 3\n")
+    assert revision() == first
+
+    found = [first]
+    for name, text in (("new.py", "b = 1\n"), ("new.py", "b = 2\n"), ("__init__.py", "a = 2\n")):
+        (package / name).write_text(text)
+        found.append(revision())
+    assert len(set(found)) == 4 and all(one.startswith(f"{first}-modified-") for one in found[1:])
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "library")
+    assert revision() not in found and "modified" not in revision()
 
 
 def test_another_process_finds_the_same_identity():

@@ -9,6 +9,7 @@ from safetensors.torch import load, save
 
 from zsp_lite.benchmark.extractors import fingerprint
 from zsp_lite.benchmark.identity import digest_of
+from zsp_lite.benchmark.provenance import library_version
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
@@ -21,8 +22,8 @@ _UNCACHED = ("rootsift",)  # computed faster than read
 class FeatureCache:
     """A folder of feature maps in full precision: results with it equal those without it.
 
-    A file's name is a hash of the extractor and of its input: the crop's pixels, and for extractors with `describe`
-    also the depth, the mask and the camera. Only results of the type FeatureMap are kept.
+    A file's name is a hash of the library's version, of the extractor and of its input: the crop's pixels, and for
+    extractors with `describe` also the depth, the mask and the camera. Only results of the type FeatureMap are kept.
 
     Args:
         folder: The folder; made where it does not exist.
@@ -39,7 +40,7 @@ class FeatureCache:
         if hasattr(self.extractors[features], "describe"):
             camera = frame.camera
             seen += [frame.depth, frame.mask, camera.R, camera.t, camera.focal_length, camera.principal_point]
-        name = digest_of((self._fingerprints[features], seen))
+        name = digest_of((library_version(), self._fingerprints[features], seen))
         return self.folder / name[:2] / f"{name}.safetensors"
 
     def read(self, features: str, frame: Frame) -> FeatureMap | None:

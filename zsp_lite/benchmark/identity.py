@@ -1,9 +1,12 @@
-"""Digests of backbones, functions and objects. Equal digests mean equal results."""
+"""Digests of backbones, functions and objects. Equal digests mean equal results of one version of the library."""
 
+import ast
+import dataclasses
 import functools
 import hashlib
 import inspect
 import re
+import textwrap
 import types
 from collections.abc import Mapping
 from typing import Any
@@ -36,9 +39,11 @@ def backbone_digest(backbone: Backbone) -> str:
 def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     """Describe a value as text.
 
-    A function is described by its bytecode, defaults and closure, without its docstring and the globals it uses. An
-    object is described by its `__repr__`, if its class defines one, otherwise by its class and its public attributes
-    except cached properties. Arrays and weights are described by hashes.
+    A function is described by its source, defaults and closure, without comments, docstrings and the globals it uses;
+    a lambda or a function without source by its bytecode, which depends on the version of Python. Functions and classes
+    of the library are described by their names: a run records the library's version. An object is described by its
+    `__repr__`, if its class defines one, otherwise by its class and its public attributes except cached properties.
+    Arrays and weights are described by hashes.
     """
     value = inspect.unwrap(value) if callable(value) else value
     if id(value) in _within:
@@ -68,10 +73,11 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
         return f"{description(value.__self__, _within)}.{value.__name__}"
     if inspect.isfunction(value):
         cells = [cell.cell_contents for cell in value.__closure__ or () if cell != types.CellType()]
-        return _code(value.__code__, value.__doc__) + description(
-            (value.__defaults__, value.__kwdefaults__, cells), _within
-        )
+        code = _library_name(value) or _source(value) or _code(value.__code__, value.__doc__)
+        return code + description((value.__defaults__, value.__kwdefaults__, cells), _within)
     if inspect.isclass(value):
+        if name := _library_name(value):
+            return name
         return f"{value.__qualname__} {description(_members(value), _within)}"
     kind = type(value)
     attributes = _attributes(value)
@@ -99,12 +105,41 @@ def _bytes(tensor: torch.Tensor) -> bytes:
 
 
 def _members(kind: type) -> dict[str, Any]:
-    """Functions and public attributes that a class defines itself."""
+    """Functions and public attributes that a class defines itself, without the functions that `dataclass` generates."""
     unwrapped = {
         name: getattr(one, "__func__", getattr(one, "fget", getattr(one, "func", one)))
         for name, one in vars(kind).items()
     }
-    return {name: one for name, one in unwrapped.items() if inspect.isfunction(one) or not name.startswith("_")}
+    return {
+        name: one for name, one in unwrapped.items()
+        if not name.startswith("_") or (inspect.isfunction(one) and not _generated(kind, name, one))
+    }  # fmt: skip
+
+
+def _generated(kind: type, name: str, function: types.FunctionType) -> bool:
+    if "__dataclass_fields__" not in vars(kind) or not name.startswith("__"):
+        return False
+    return function.__code__.co_filename in ("<string>", dataclasses.__file__)
+
+
+def _library_name(value: Any) -> str | None:
+    """Name of a function or class of the library, None for others."""
+    module = value.__module__ or ""
+    return f"{module}.{value.__qualname__}" if module.split(".")[0] == __name__.split(".")[0] else None
+
+
+def _source(function: types.FunctionType) -> str | None:
+    """Source without comments and docstrings. None where it is unknown, and for lambdas: two may share a line."""
+    if function.__name__ == "<lambda>" or function.__code__.co_filename == "<string>":
+        return None
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError):
+        return None
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and ast.get_docstring(node):
+            node.body = node.body[1:]
+    return ast.unparse(tree)  # unlike ast.dump, equal in all versions of Python
 
 
 def _code(code: types.CodeType, docstring: str | None = None) -> str:

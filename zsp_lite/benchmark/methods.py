@@ -186,6 +186,8 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
 def fingerprint(method: Method) -> str:
     """Return a hash of all that determines a row's results: its settings, functions and objects.
 
+    The code of the library is not part of it (see `provenance.library_version`).
+
     Two rows with the same name and different fingerprints must not be stored in one run.
     """
     if method.solve is not None or any(callable(value) for value in method.settings.values()):

@@ -35,27 +35,36 @@ def environment() -> dict[str, Any]:
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
         "versions": versions,
-        "git": git_revision(),
+        "git": {"commit": _git("rev-parse", "HEAD"), "revision": git_revision()},
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
     }
 
 
 @functools.cache
 def git_revision() -> str | None:
-    """Return the git commit of the library, None outside a checkout.
+    """Return the git tree of the library's folder, None outside a checkout.
 
-    Where files of the library differ from the commit, "+" and a hash of the difference follow.
+    Commits that change only other folders, such as the documentation, leave it as it is. Where files of the library
+    differ from the last commit, "-modified-" and a hash of its Python files follow.
     """
+    tree = _git("rev-parse", "HEAD:./")
+    if tree is None or not _git("status", "--porcelain", "--", "."):
+        return tree
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
+    return f"{tree}-modified-{digest.hexdigest()[:8]}"
 
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(_PACKAGE), *arguments]
+
+def _git(*arguments: str) -> str | None:
+    """Output of a git command in the library's folder, None outside a checkout."""
+
+    def run(*words: str) -> str:
+        command = ["git", "-C", str(_PACKAGE), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
         # An installed copy may lie inside the repository of another project, whose revision says nothing.
-        if not git("ls-files", "__init__.py"):
-            return None
-        difference = git("diff", "HEAD", "--", ".")
-        return git("rev-parse", "HEAD") + (f"+{hashlib.sha256(difference.encode()).hexdigest()[:8]}" * bool(difference))
+        return run(*arguments) if run("ls-files", "__init__.py") else None
     except (OSError, subprocess.SubprocessError):
         return None
