@@ -59,6 +59,11 @@ def test_the_readme_has_at_most_150_lines():
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
+def test_no_page_has_a_placeholder(page):
+    assert not re.findall(r"<<\w+>>", page.read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page):
     for link in _LINK.findall(markdown(page)):
         if "://" in link:
