@@ -96,6 +96,7 @@ def test_a_block_is_two_convolutions_and_a_shortcut():
     assert torch.allclose(block(x), torch.relu(second + x), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path):
     state = {f"module.{key}": x for key, x in random_state(torchvision_shapes()).items()}
     heads = {"projection_head.0.weight": (8, 2048), "projection_head.0.bias": (8,), "prototypes.weight": (5, 8)}
@@ -166,6 +167,7 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
     assert above @ (0, 0, 1) == pytest.approx((0, 0, -1), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path):
     network, head = ResNet(ResNetConfig(outputs=128)), ViewpointHead(2048)
     path = tmp_path / "posecontrast.pth"

@@ -16,6 +16,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 
+pytestmark = pytest.mark.slow
+
 BACKBONE = CoordinateBackbone(grid=8)
 ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
 

@@ -68,6 +68,7 @@ def kill(process: subprocess.Popen) -> None:
     process.wait()
 
 
+@pytest.mark.slow
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
     stored = 0
     for workers, more in ((2, 1), (1, 3)):
@@ -115,6 +116,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert read_records(run) == before
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path):
     seen = []
 
@@ -159,6 +161,7 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
     assert summary["methods"] == undisturbed[1]["methods"]
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path):
     seen = []
 
@@ -426,6 +429,7 @@ def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
     assert len(frames.timings["reading"]) == 4  # frame 1 was dropped, as it had not been used for longest
 
 
+@pytest.mark.slow
 def test_a_cache_keeps_features_for_other_runs_and_changes_nothing(undisturbed, tmp_path, monkeypatch):
     def never(self, images):
         raise AssertionError("all is in the cache")

@@ -43,6 +43,8 @@ from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, bootstrap_ci, object_weights, paired_test
 
+pytestmark = pytest.mark.slow
+
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
 PAIRS = 8
 ROWS = [*GROUPS["table1"], *GROUPS["ablations"], *GROUPS["views"], "ours-bv", "rootsift", "verified"]

@@ -145,6 +145,7 @@ def test_the_doctor_lists_every_check_and_what_is_missing(capsys, ellipsoids):
     assert (code == 0) == ("Everything required is installed." in text)
 
 
+@pytest.mark.slow
 def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
@@ -162,6 +163,7 @@ def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellip
     assert all(name in text and row["n"] == 2 for name, row in summary["methods"].items())
 
 
+@pytest.mark.slow
 def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypatch, capsys):
     """The summary names the options, and a run with other options needs another folder."""
     monkeypatch.setenv("COLUMNS", "200")
@@ -223,6 +225,7 @@ def test_benchmark_list_has_every_method_and_group(capsys):
     assert lines == {*METHODS, *GROUPS, "Groups:"}
 
 
+@pytest.mark.slow
 def test_a_run_is_planned_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("zsp_lite.benchmark.run.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setenv("COLUMNS", "200")

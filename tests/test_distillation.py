@@ -28,6 +28,8 @@ from zsp_lite.training.renders import training_and_held_out
 from zsp_lite.training.train import held_out_accuracy
 from zsp_lite.training.trainee import Trainee, as_trainee, initialise
 
+pytestmark = pytest.mark.slow
+
 TINY = DistillationConfig(
     steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64, hidden=64, bottleneck=64,
     teacher_momentum=(0.97, 1.0),

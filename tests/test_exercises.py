@@ -14,6 +14,8 @@ from nbgrader.apps.api import NbGraderAPI
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from traitlets.config import PyFileConfigLoader
 
+pytestmark = pytest.mark.slow
+
 EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 

@@ -317,6 +317,7 @@ def test_a_window_without_a_display_is_an_input_error(root, monkeypatch):
         label_category(labelling, lambda _: "q", lambda _: None)
 
 
+@pytest.mark.slow
 def test_the_method_proposes_an_alignment_with_a_confidence(tmp_path):
     """With features that are functions of the object coordinates, the proposal is correct."""
     from synthetic_views import CoordinateBackbone, look_at, render

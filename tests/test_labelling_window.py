@@ -43,6 +43,7 @@ def screen(tmp_path):
     server.wait(timeout=60)
 
 
+@pytest.mark.slow
 def test_clicks_in_the_window_pick_points_and_remove_picks(screen):
     def act(*words):
         subprocess.run(["xdotool", *map(str, words)], env=screen, timeout=180, check=True, stdout=subprocess.DEVNULL)

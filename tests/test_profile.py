@@ -15,6 +15,8 @@ from zsp_lite.cli.profile import (
     ransac_by_loop,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_loop_that_ransac_is_timed_against_finds_as_good_a_pose():
     rng = np.random.default_rng(1)

@@ -13,6 +13,8 @@ from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.points import object_cloud
 from zsp_lite.viz.report import COLUMNS, _views_figure, render_page, table_row, write_overview, write_report
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def results(ellipsoids):

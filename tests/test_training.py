@@ -27,6 +27,8 @@ from zsp_lite.training.renders import SIZE, VIEWS
 from zsp_lite.training.train import train
 from zsp_lite.training.trainee import Trainee, fit_heads, initialise
 
+pytestmark = pytest.mark.slow
+
 TINY = TrainingConfig(
     objects=4, embed_dim=24, depth=2, num_heads=2, layer=0,
     stages=(Stage(2, 32, 2, 2, (0.5, 1.0), helpers=1.0), Stage(2, 32, 1, 8, (0.5, 1.0), view=1.0)),

@@ -22,6 +22,8 @@ from zsp_lite.training.object_crops import SIZE, VIEWS, object_crops, render_obj
 from zsp_lite.training.posecontrast import PoseContrastConfig, pose_contrast, sample, viewpoint_loss
 from zsp_lite.training.swav import SwavConfig, multi_crop, swapped_prediction
 
+pytestmark = pytest.mark.slow
+
 WEIGHTS = Path(zsp_lite.__file__).parent / "weights"
 
 

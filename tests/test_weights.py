@@ -75,6 +75,7 @@ def iou(backbone, crops) -> float:
     return float(np.mean(values))
 
 
+@pytest.mark.slow
 def test_its_attention_finds_objects_that_it_has_never_seen(crops):
     """The paper's rule, saliency above 0.05, on the sample categories; random weights for comparison."""
     tiny = load_backbone("zsp-tiny", device="cpu")
