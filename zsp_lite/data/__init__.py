@@ -9,5 +9,6 @@ labels: pose labels and ground-truth poses
 pairs: evaluation pairs
 label_import: import of published labels, transfer of labels from CO3D v1 to v2
 check: missing and broken files
-samples: default data folders
+samples: default data folders, and a photograph with depth
+photograph: depth and mask of that photograph
 """

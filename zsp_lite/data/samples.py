@@ -1,10 +1,24 @@
-"""Default data folders: the user's CO3D folder, or the sample data of the repository."""
+"""Sample data: the default data folders (the user's, or that of the repository), and a photograph with depth.
+
+`zsp-lite doctor` imports this module, also where a package is missing: packages are imported by the functions.
+"""
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from zsp_lite.data.frames import Frame
 
 DATA_VARIABLE = "ZSP_LITE_DATA"  # environment variable with the path of the user's CO3D folder
 REPOSITORY = Path(__file__).resolve().parents[2]
+
+PHOTOGRAPH_CATEGORY = "motorcycle"
+# Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
+# judged by eye from the rear wheel, since the front wheel is turned, and may be wrong by 10 degrees. Up is the normal
+# of the floor; the motorcycle leans on its side stand by a few degrees.
+PHOTOGRAPH_FRONT = (0.97, 0.06, -0.24)
+PHOTOGRAPH_UP = (0.01, -0.97, -0.26)
 
 
 def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
@@ -23,3 +37,26 @@ def sample_data() -> Path:
     """Return the sample data folder: `data_samples/` in the current folder, or else in the repository."""
     here = Path("data_samples")
     return here if here.is_dir() else REPOSITORY / "data_samples"
+
+
+def motorcycle_photograph() -> "Frame":
+    """Load a photograph of a motorcycle with dense depth in metres and an object mask.
+
+    The photograph and its disparities, measured with structured light, come with scikit-image
+    (`skimage.data.stereo_motorcycle`). They are a scene of the Middlebury 2014 stereo data:
+
+        D. Scharstein, H. Hirschmueller, Y. Kitajima, G. Krathwohl, N. Nesic, X. Wang and P. Westling.
+        High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
+
+    The mask is that of `zsp_lite.data.photograph.motorcycle_frame`. `PHOTOGRAPH_FRONT` and `PHOTOGRAPH_UP` are the
+    front and the top of the motorcycle in the camera's frame, judged by eye.
+
+    Returns:
+        Frame of 500 x 741 pixels. Its world is the camera's frame.
+    """
+    import skimage.data
+
+    from zsp_lite.data.photograph import motorcycle_frame
+
+    rgb, _, disparity = skimage.data.stereo_motorcycle()
+    return motorcycle_frame(rgb, disparity)

@@ -1,0 +1,119 @@
+"""The photograph of a motorcycle: depth, mask, directions, and where it comes from."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from zsp_lite.data import samples
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.photograph import fit_plane, motorcycle_frame
+from zsp_lite.errors import InputError
+
+CLEAR_OF_THE_FLOOR = np.s_[450:, :]  # the motorcycle does not reach the lowest rows
+
+
+def angle(first, second) -> float:
+    first, second = np.asarray(first), np.asarray(second)
+    return float(np.degrees(np.arccos(first @ second / np.linalg.norm(first) / np.linalg.norm(second))))
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return samples.motorcycle_photograph()
+
+
+def test_the_depth_is_that_of_a_garage(frame):
+    known = frame.depth[frame.depth > 0]
+    assert frame.rgb.shape == (500, 741, 3)
+    assert 0.9 < len(known) / frame.depth.size < 0.95
+    assert 2 < known.min() and known.max() < 5.1
+
+
+def test_the_mask_is_one_object_of_the_size_of_a_motorcycle(frame):
+    on = frame.mask > 0
+    points = unproject_depth(frame.depth, frame.camera)[on]
+    assert 0.23 < on.mean() < 0.28 and (frame.depth[on] > 0).all()
+    length, height = np.ptp(points, axis=0)[:2]
+    assert 1.2 < length < 2.2 and 0.7 < height < 1.2  # metres
+    rows, cols = np.nonzero(on)
+    assert 0 < cols.min() and cols.max() < 740 and 0 < rows.min() and rows.max() < 499
+
+
+def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_bench(frame):
+    seat, rear_tyre, front_tyre, floor, bench = (240, 230), (320, 135), (370, 675), (470, 300), (160, 100)
+    assert [frame.mask[pixel] for pixel in (seat, rear_tyre, front_tyre, floor, bench)] == [1, 1, 1, 0, 0]
+
+
+def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
+    floor = frame.depth[CLEAR_OF_THE_FLOOR] > 0
+    normal, _ = fit_plane(unproject_depth(frame.depth, frame.camera)[CLEAR_OF_THE_FLOOR][floor], 0.01)
+    assert angle(-np.sign(normal[1]) * normal, samples.PHOTOGRAPH_UP) < 2
+    assert abs(angle(samples.PHOTOGRAPH_FRONT, samples.PHOTOGRAPH_UP) - 90) < 1
+
+
+def test_front_is_the_direction_from_the_rear_to_the_front_along_the_longest_axis(frame):
+    points = unproject_depth(frame.depth, frame.camera)[frame.mask > 0]
+    longest = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
+    assert angle(np.sign(longest[0]) * longest, samples.PHOTOGRAPH_FRONT) < 10
+
+
+def test_the_frame_is_the_same_at_every_call(frame):
+    again = samples.motorcycle_photograph()
+    assert all(np.array_equal(getattr(frame, name), getattr(again, name)) for name in ("rgb", "depth", "mask"))
+
+
+def test_depth_follows_from_the_disparity_by_the_calibration(frame):
+    import skimage.data
+
+    _, right, disparity = skimage.data.stereo_motorcycle()
+    row, col = 330, 390  # on the engine
+    point = frame.camera.unproject_camera(np.array([col + 0.5, row + 0.5]), frame.depth[row, col])
+    # The right camera stands 0.193001 m to the right; its principal point lies 31.086 pixels farther right.
+    seen = 994.978 * (point[0] - 0.193001) / point[2] + 311.193 + 31.086
+    assert seen == pytest.approx(col + 0.5 - disparity[row, col], abs=1e-3)
+    unknown = ~np.isfinite(disparity)
+    assert unknown.any() and (frame.depth[unknown] == 0).all()
+    assert motorcycle_frame(frame.rgb, disparity).name == frame.name
+
+
+def test_no_file_of_the_photograph_is_in_the_repository():
+    import skimage.data
+
+    folder = Path(skimage.data.__file__).parent
+    originals = {path.stat().st_size: path for path in folder.glob("motorcycle_*") if path.is_file()}
+    assert len(originals) == 3
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=samples.REPOSITORY, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a clone")
+    for name in filter(None, listed.stdout.split("\0")):
+        path = samples.REPOSITORY / name
+        assert not path.name.startswith("motorcycle_")
+        if path.is_file() and (same := originals.get(path.stat().st_size)):
+            digests = {hashlib.sha256(one.read_bytes()).hexdigest() for one in (path, same)}
+            assert len(digests) == 2, f"{path} is {same.name} of scikit-image"
+
+
+def test_the_doctor_can_import_the_module_without_any_package():
+    code = "import sys; import zsp_lite.data.samples; assert not {'numpy', 'cv2', 'skimage'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_plane_is_found_among_outliers():
+    rng = np.random.default_rng(0)
+    normal, offset = np.array([0.6, 0, 0.8]), 2.0
+    points = rng.uniform(-3, 3, (3000, 3))
+    points[::2] += np.outer(offset - points[::2] @ normal, normal) + rng.normal(0, 0.002, (1500, 3))
+    found, found_offset = fit_plane(points, 0.01)
+    sign = np.sign(found @ normal)
+    assert angle(sign * found, normal) < 0.1 and sign * found_offset == pytest.approx(offset, abs=0.002)
+
+
+def test_too_few_and_collinear_points_span_no_plane():
+    with pytest.raises(InputError, match="got 2 points, expected at least 3"):
+        fit_plane(np.zeros((2, 3)), 0.01)
+    with pytest.raises(InputError, match="no plane"):
+        fit_plane(np.arange(9.0)[:, None] * np.ones(3), 0.01)
