@@ -12,6 +12,7 @@ from zsp_lite.data import samples
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.photograph import fit_plane, motorcycle_frame
 from zsp_lite.errors import InputError
+from zsp_lite.points import axis_deviation, object_points
 
 CLEAR_OF_THE_FLOOR = np.s_[450:, :]  # the motorcycle does not reach the lowest rows
 
@@ -23,7 +24,11 @@ def angle(first, second) -> float:
 
 @pytest.fixture(scope="module")
 def frame():
-    return samples.motorcycle_photograph()
+    """The photograph with depth in metres."""
+    import skimage.data
+
+    rgb, _, disparity = skimage.data.stereo_motorcycle()
+    return motorcycle_frame(rgb, disparity)
 
 
 def test_the_depth_is_that_of_a_garage(frame):
@@ -61,9 +66,13 @@ def test_front_is_the_direction_from_the_rear_to_the_front_along_the_longest_axi
     assert angle(np.sign(longest[0]) * longest, samples.PHOTOGRAPH_FRONT) < 10
 
 
-def test_the_frame_is_the_same_at_every_call(frame):
-    again = samples.motorcycle_photograph()
-    assert all(np.array_equal(getattr(frame, name), getattr(again, name)) for name in ("rgb", "depth", "mask"))
+def test_the_photograph_is_scaled_as_scenes_of_co3d_and_is_the_same_at_every_call(frame):
+    first, second = samples.motorcycle_photograph(), samples.motorcycle_photograph()
+    assert axis_deviation(object_points(first)) == pytest.approx(1, abs=1e-4)
+    unit = axis_deviation(object_points(frame))
+    assert unit == pytest.approx(0.22, abs=0.005)  # metres, as the documentation says
+    np.testing.assert_allclose(first.depth * unit, frame.depth, rtol=1e-5)
+    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("rgb", "depth", "mask"))
 
 
 def test_depth_follows_from_the_disparity_by_the_calibration(frame):
@@ -77,7 +86,6 @@ def test_depth_follows_from_the_disparity_by_the_calibration(frame):
     assert seen == pytest.approx(col + 0.5 - disparity[row, col], abs=1e-3)
     unknown = ~np.isfinite(disparity)
     assert unknown.any() and (frame.depth[unknown] == 0).all()
-    assert motorcycle_frame(frame.rgb, disparity).name == frame.name
 
 
 def test_no_file_of_the_photograph_is_in_the_repository():

@@ -1,5 +1,7 @@
 """Depth and object mask of the stereo photograph of `samples.motorcycle_photograph`."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -39,6 +41,15 @@ def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndar
     height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
     mask = _largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))
     return Frame(rgb, depth, mask.astype(np.float32), camera, "motorcycle photograph")
+
+
+def scale_to_unit_deviation(frame: Frame) -> Frame:
+    """Scale the depth of a frame whose camera is at the origin: the object's points get unit standard deviation.
+
+    The deviation is averaged over the axes, as in CO3D (supplement).
+    """
+    points = unproject_depth(frame.depth, frame.camera)[(frame.mask > 0) & (frame.depth > 0)]
+    return replace(frame, depth=frame.depth / np.float32(points.std(axis=0).mean()))
 
 
 def fit_plane(

@@ -40,7 +40,7 @@ def sample_data() -> Path:
 
 
 def motorcycle_photograph() -> "Frame":
-    """Load a photograph of a motorcycle with dense depth in metres and an object mask.
+    """Load a photograph of a motorcycle with dense depth and an object mask.
 
     The photograph and its disparities, measured with structured light, come with scikit-image
     (`skimage.data.stereo_motorcycle`). They are a scene of the Middlebury 2014 stereo data:
@@ -48,15 +48,16 @@ def motorcycle_photograph() -> "Frame":
         D. Scharstein, H. Hirschmueller, Y. Kitajima, G. Krathwohl, N. Nesic, X. Wang and P. Westling.
         High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
 
-    The mask is that of `zsp_lite.data.photograph.motorcycle_frame`. `PHOTOGRAPH_FRONT` and `PHOTOGRAPH_UP` are the
-    front and the top of the motorcycle in the camera's frame, judged by eye.
+    The mask is that of `photograph.motorcycle_frame`. `PHOTOGRAPH_FRONT` and `PHOTOGRAPH_UP` are the front and the top
+    of the motorcycle in the camera's frame, judged by eye.
 
     Returns:
-        Frame of 500 x 741 pixels. Its world is the camera's frame.
+        Frame of 500 x 741 pixels. Its world is the camera's frame. Lengths are scaled as in CO3D, so that the points of
+        the object have unit standard deviation, averaged over the axes; one unit is about 0.22 m.
     """
     import skimage.data
 
-    from zsp_lite.data.photograph import motorcycle_frame
+    from zsp_lite.data.photograph import motorcycle_frame, scale_to_unit_deviation
 
     rgb, _, disparity = skimage.data.stereo_motorcycle()
-    return motorcycle_frame(rgb, disparity)
+    return scale_to_unit_deviation(motorcycle_frame(rgb, disparity))

@@ -20,7 +20,7 @@ from zsp_lite.errors import InputError
 # The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 CHOSEN = ORANGE
-_AXIS_COLOURS = {"x": VERMILLION, "y": GREEN, "z": BLUE}
+_AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
@@ -248,8 +248,9 @@ def draw_axes(
     to_camera: Callable[[np.ndarray], np.ndarray],
     origin: Real[np.ndarray, "3"],
     length: float,
+    names: Sequence[str] = ("x", "y", "z"),
 ) -> None:
-    """Draw the x, y and z axis of a coordinate frame. Axes with an end behind the camera are left out.
+    """Draw the three axes of a coordinate frame. Axes with an end behind the camera are left out.
 
     Args:
         axis: Axis of the camera's image.
@@ -257,10 +258,11 @@ def draw_axes(
         to_camera: Maps (n, 3) points of the frame to the camera's frame, for example `Sim3.apply`.
         origin: Origin of the axes in the frame.
         length: Length of the axes, in units of the frame.
+        names: Labels of the axes.
     """
     ends = np.asarray(to_camera(np.asarray(origin) + length * np.vstack([np.zeros(3), np.eye(3)])))
     pixels, depth = camera.project(camera.to_world(ends))
-    for name, end, near in zip("xyz", pixels[1:], depth[1:]):
+    for name, colour, end, near in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
         if min(near, depth[0]) <= 0:
             continue
         axis.annotate(
@@ -271,7 +273,7 @@ def draw_axes(
             annotation_clip=False,
             arrowprops={
                 "arrowstyle": "-|>",
-                "color": _AXIS_COLOURS[name],
+                "color": colour,
                 "linewidth": 2,
                 "shrinkA": 0,
                 "shrinkB": 0,
@@ -280,7 +282,7 @@ def draw_axes(
         axis.text(
             *end,
             name,
-            color=_AXIS_COLOURS[name],
+            color=colour,
             fontsize=_FONT,
             weight="bold",
             zorder=7,

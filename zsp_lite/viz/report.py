@@ -17,12 +17,13 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from zsp_lite.data.frames import Frame
-from zsp_lite.demo import DemoResult
+from zsp_lite.demo import DemoResult, PhotographResult
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.points import axis_deviation, object_cloud
 from zsp_lite.views import View, frame_defect, object_crop
 from zsp_lite.viz import plots
+from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
 from zsp_lite.viz.scene3d import aligned_clouds
 
 COLUMNS = ("category", "chosen view", "inliers", "rotation error", "time")
@@ -52,7 +53,14 @@ class StageFigure:
     wide: bool = False
 
 
-def write_report(path: str | Path, results: Sequence[DemoResult], data: str, data_note: str, backbone: str) -> Path:
+def write_report(
+    path: str | Path,
+    results: Sequence[DemoResult],
+    data: str,
+    data_note: str,
+    backbone: str,
+    photograph: Sequence[PhotographResult] = (),
+) -> Path:
     """Write the HTML page.
 
     Args:
@@ -61,16 +69,23 @@ def write_report(path: str | Path, results: Sequence[DemoResult], data: str, dat
         data: Folder of the data.
         data_note: Remark on the data, printed after the folder.
         backbone: Name of the backbone.
+        photograph: Results on the photograph, with which the page begins; may be empty.
 
     Returns:
         The path.
     """
     path = Path(path)
-    write_atomic(path, render_page(results, data, data_note, backbone).encode())
+    write_atomic(path, render_page(results, data, data_note, backbone, photograph).encode())
     return path
 
 
-def render_page(results: Sequence[DemoResult], data: str, data_note: str, backbone: str) -> str:
+def render_page(
+    results: Sequence[DemoResult],
+    data: str,
+    data_note: str,
+    backbone: str,
+    photograph: Sequence[PhotographResult] = (),
+) -> str:
     """Return the HTML page as text; the arguments are those of `write_report`."""
     loader = PackageLoader("zsp_lite.viz")
     template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("report.html")
@@ -89,8 +104,26 @@ def render_page(results: Sequence[DemoResult], data: str, data_note: str, backbo
         for index, result in enumerate(results, 1)
     ]
     return template.render(
-        plotly=Markup(get_plotlyjs()), data=data, data_note=data_note, backbone=backbone, columns=COLUMNS, pairs=pairs
-    )
+        plotly=Markup(get_plotlyjs()), data=data, data_note=data_note, backbone=backbone, columns=COLUMNS, pairs=pairs,
+        photograph=_photograph_section(photograph) if photograph else None,
+    )  # fmt: skip
+
+
+def _photograph_section(results: Sequence[PhotographResult]) -> dict:
+    return {
+        "sequence": results[0].sequence,
+        "columns": PHOTOGRAPH_COLUMNS,
+        "rows": photograph_rows(results),
+        "stage": StageFigure(
+            "Estimated directions and aligned point cloud",
+            "Points: the synthetic motorcycle after the estimated pose, from its rear (dark) to its front (bright). "
+            f"{PHOTOGRAPH_CREDIT}",
+            _data_uri(photograph_figure(results)),
+            f"A photograph of a motorcycle with the aligned cloud of {results[0].sequence} and arrows to the front, "
+            "left and up, for two foregrounds and two solvers.",
+            wide=True,
+        ),
+    }
 
 
 def table_row(result: DemoResult) -> tuple[str, str, str, str, str]:

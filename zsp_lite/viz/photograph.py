@@ -1,0 +1,81 @@
+"""Figure of the photographed motorcycle, posed by a synthetic one."""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
+from zsp_lite.demo import PHOTOGRAPH_SOLVERS, PhotographResult
+from zsp_lite.points import object_points
+from zsp_lite.viz import plots
+
+PHOTOGRAPH_CREDIT = "Photograph and depth: Middlebury stereo data 2014 (Scharstein et al.), from scikit-image."
+PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
+_POINTS = 1500
+_LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
+
+
+def photograph_rows(results: Sequence[PhotographResult]) -> list[tuple[str, str, str, str, str]]:
+    """Format each result: foreground, solver, errors and confidence (see `PHOTOGRAPH_COLUMNS`)."""
+    rows = []
+    for result in results:
+        confidence = result.estimate.confidence
+        errors = f"{result.front_error:.0f}°", f"{result.up_error:.0f}°"
+        rows.append((_foreground(result), result.solver, *errors, "–" if confidence is None else f"{confidence:.2f}"))
+    return rows
+
+
+def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) -> Figure:
+    """Draw the aligned cloud and the estimated front, left and up on the photograph, one panel per result.
+
+    The left column shows a view of the synthetic motorcycle, and the directions judged by eye. The colour of a point is
+    its position from the rear (dark) to the front (bright) of the synthetic motorcycle.
+
+    Args:
+        results: All results of one synthetic motorcycle, see `demo.run_photograph`.
+        size: Width of a panel in inches.
+    """
+    photograph, sequence = results[0].photograph, results[0].sequence
+    view = results[0].estimate.target_views[results[0].estimate.view].frame.rgb
+    height, width = photograph.rgb.shape[:2]
+    margin = round((view.shape[0] * width / height - view.shape[1]) / 2)  # to the aspect of the photograph
+    left = [np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255), photograph.rgb]
+    titles = [f"a view of the synthetic motorcycle,\n{sequence}", "directions judged by eye\n"]
+    columns, pictures, texts = len(PHOTOGRAPH_SOLVERS), [], []
+    for row, start in enumerate(range(0, len(results), columns)):
+        found = results[start : start + columns]
+        pictures += [left[row], *[photograph.rgb] * columns]
+        texts += [titles[row], *map(_title, found)]
+    figure, axes = plots.show_images(pictures, texts, columns=1 + columns, size=size)
+    up, front = np.array(PHOTOGRAPH_UP), np.array(PHOTOGRAPH_FRONT)
+    centre = np.median(object_points(photograph), axis=0)
+    _draw(axes[1 + columns], photograph.camera, np.stack([front, np.cross(up, front), up], axis=1), centre)
+    for index, result in enumerate(results):
+        axis = axes[index // columns * (1 + columns) + 1 + index % columns]
+        chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
+        colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
+        plots.draw_points(axis, photograph.camera, result.cloud[chosen], colours, size=2.5)
+        _draw(axis, photograph.camera, result.axes, result.cloud.mean(axis=0))
+    return figure
+
+
+def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray) -> None:
+    """Draw three directions, the columns of a matrix, as arrows."""
+    plots.draw_axes(
+        axis, camera, lambda ends: origin + ends @ directions.T, np.zeros(3), _LENGTH, ("front", "left", "up")
+    )
+    for artist in axis.texts:  # arrows that leave the picture do not move the panels
+        artist.set_in_layout(False)
+
+
+def _title(result: PhotographResult) -> str:
+    errors = f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
+    return f"{_foreground(result)}, {result.solver} solver\n{errors}"
+
+
+def _foreground(result: PhotographResult) -> str:
+    return {"mask": "mask", "saliency": "own saliency"}[result.foreground]
