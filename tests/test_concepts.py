@@ -1,0 +1,101 @@
+"""Training, validation and evaluation have no concept and no model file in common (`tools/concepts.csv`)."""
+
+import csv
+import json
+
+import pytest
+
+from zsp_lite.data.samples import REPOSITORY
+from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.synthetic.export import PRESETS, SPLITS
+from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
+from zsp_lite.synthetic.validation_categories import VALIDATION
+
+TOOLS = REPOSITORY / "tools"
+with (TOOLS / "concepts.csv").open(newline="") as _file:
+    ROWS = list(csv.DictReader(_file))
+SIDE_OF = {row["name"]: row["side"] for row in ROWS}
+CONCEPT_OF = {row["name"]: row["concept"] for row in ROWS}
+# Catalogues of model files: name to {category: {model: entry}}.
+CATALOGUES = {
+    path.stem: content["models"]
+    for path in sorted(TOOLS.glob("*.json"))
+    if "models" in (content := json.loads(path.read_text()))
+}
+
+
+def sides_of_concepts(rows: list[dict[str, str]]) -> dict[str, set[str]]:
+    sides: dict[str, set[str]] = {}
+    for row in rows:
+        sides.setdefault(row["concept"], set()).add(row["side"])
+    return sides
+
+
+def test_no_name_is_listed_twice_and_every_side_is_known():
+    assert len(SIDE_OF) == len(ROWS)
+    assert set(SIDE_OF.values()) == {"training", "validation", "evaluation"}
+    assert all(row["name"] and row["concept"] for row in ROWS)
+
+
+def test_no_concept_is_on_two_sides():
+    assert {concept: sides for concept, sides in sides_of_concepts(ROWS).items() if len(sides) > 1} == {}
+    planted = {"name": "kart", "side": "training", "concept": CONCEPT_OF["car"]}
+    assert sides_of_concepts([*ROWS, planted])["motor vehicle"] == {"training", "evaluation"}
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_every_generator_is_listed_on_its_side(split):
+    assert {SIDE_OF.get(name) for name in SPLITS[split]} == {split}
+
+
+def test_the_random_assemblies_are_listed_for_training():
+    assert SIDE_OF[random_assembly.__name__] == "training"
+
+
+def test_every_category_of_a_preset_and_of_the_sample_data_is_listed_for_evaluation():
+    names = {name for preset in PRESETS.values() for name in preset.categories}
+    names |= {path.parent.name for path in (REPOSITORY / "data_samples").glob("*/frame_annotations.jgz")}
+    assert names and {name: SIDE_OF.get(name) for name in names} == dict.fromkeys(names, "evaluation")
+
+
+def test_every_category_of_a_catalogue_of_models_is_listed_for_evaluation():
+    assert "artists" in CATALOGUES
+    for catalogue in ("artists", "samples"):
+        for category in CATALOGUES.get(catalogue, ()):
+            assert SIDE_OF.get(category) == "evaluation", f"{catalogue}: {category}"
+    for models in CATALOGUES.values():
+        assert models.keys() <= SIDE_OF.keys()
+
+
+def test_no_model_file_is_in_two_catalogues():
+    owners: dict[str, set[str]] = {}
+    for catalogue, categories in CATALOGUES.items():
+        for category, models in categories.items():
+            for model, entry in models.items():
+                owners.setdefault(entry["sha256"], set()).add(f"{catalogue}: {category}/{model}")
+    assert {digest: names for digest, names in owners.items() if len(names) > 1} == {}
+
+
+def test_no_model_of_the_sample_data_is_in_the_catalogue_of_artists():
+    records = REPOSITORY / "data_samples" / "rendered_models.json"
+    if not records.is_file():
+        pytest.skip("the sample data are procedural")
+    sequences = json.loads(records.read_text())["sequences"]
+    shown = {record["sha256"] for models in sequences.values() for record in models.values()}
+    known = {entry["sha256"] for models in CATALOGUES["artists"].values() for entry in models.values()}
+    assert shown and not shown & known
+
+
+def test_near_concepts_exist_on_another_side():
+    sides = sides_of_concepts(ROWS)
+    for row in ROWS:
+        for near in filter(None, row["near"].split("; ")):
+            assert sides[near] - {row["side"]}, row
+        assert bool(row["near"]) <= bool(row["remark"]), row
+
+
+def test_concepts_that_are_kept_for_evaluation_are_not_trained_on_under_another_name():
+    reserved = "armchair bench bicycle bus car chair motorcycle scooter sofa stool toilet truck van washbasin aircraft"
+    assert {SIDE_OF[name] for name in reserved.split()} == {"evaluation"}
+    assert not (TRAINING | VALIDATION).keys() & {name for name, side in SIDE_OF.items() if side == "evaluation"}
+    assert EVALUATION.keys() <= SIDE_OF.keys()
