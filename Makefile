@@ -47,7 +47,7 @@ test: lint
 	  --nbval-cell-timeout=600 --durations=10 $(wildcard notebooks) tests
 
 check: $(STAMP)
-	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile -m "not slow and not browser" tests
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile -p no:nbval -m "not slow and not browser" tests
 
 lint: $(STAMP)
 	$(RUN) -m ruff format --check .

@@ -40,6 +40,7 @@ def run(folder, tmp_path_factory):
     return out, summary, seen
 
 
+@pytest.mark.slow
 def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_not(run):
     _, summary, _ = run
     ours, view = summary["methods"]["ours"], summary["methods"]["ours-bv"]

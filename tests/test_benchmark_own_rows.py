@@ -227,6 +227,7 @@ def test_the_revision_is_that_of_the_librarys_folder(tmp_path, monkeypatch):
     assert revision() not in found and "modified" not in revision()
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_same_identity():
     code = """
 import logging

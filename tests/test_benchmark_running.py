@@ -38,6 +38,8 @@ from zsp_lite.data.labels import read_labels, write_label
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 BACKBONE = CoordinateBackbone(grid=8)
 QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
@@ -68,7 +70,6 @@ def kill(process: subprocess.Popen) -> None:
     process.wait()
 
 
-@pytest.mark.slow
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
     stored = 0
     for workers, more in ((2, 1), (1, 3)):
@@ -116,7 +117,6 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert read_records(run) == before
 
 
-@pytest.mark.slow
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path):
     seen = []
 
@@ -140,7 +140,6 @@ def _children(pid: int) -> set[int]:
     return {int(child) for child in listed.split()}
 
 
-@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path):
     from distributed import LocalCluster
 
@@ -161,7 +160,6 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
     assert summary["methods"] == undisturbed[1]["methods"]
 
 
-@pytest.mark.slow
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path):
     seen = []
 
@@ -429,7 +427,6 @@ def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
     assert len(frames.timings["reading"]) == 4  # frame 1 was dropped, as it had not been used for longest
 
 
-@pytest.mark.slow
 def test_a_cache_keeps_features_for_other_runs_and_changes_nothing(undisturbed, tmp_path, monkeypatch):
     def never(self, images):
         raise AssertionError("all is in the cache")

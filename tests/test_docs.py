@@ -202,6 +202,7 @@ def test_a_command_line_with_a_wrong_name_option_or_value_is_not_accepted():
             parse(line.split())
 
 
+@pytest.mark.slow
 def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     from zsp_lite.data.frames import write_image, write_mask
 

@@ -217,6 +217,7 @@ def test_no_attention_matrix_is_ever_made(kind, folders, pictures):
     assert watch.seen
 
 
+@pytest.mark.slow
 def test_bfloat16_gives_nearly_the_same_features(kind, folders, pictures, monkeypatch):
     monkeypatch.setattr("zsp_lite.backbones.precision.bfloat16_is_fast", lambda device_type: True)
     full = load_backbone(f"hf:{folders[kind]}", "cpu", layer=0)(pictures)

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -33,6 +34,8 @@ LAYERS = [
 ]
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
 
+parse = cache(ast.parse)
+
 
 def read_sources() -> dict[str, str]:
     """Read the source of every module of the package but its `__init__`, by dotted name without "zsp_lite."."""
@@ -50,7 +53,7 @@ def imports(source: str, modules: set[str], module_level: bool = False) -> Itera
     `module_level` leaves out imports inside functions and for type checkers, which do not run when the module is
     imported.
     """
-    nodes = [ast.parse(source)]
+    nodes = [parse(source)]
     while nodes:
         node = nodes.pop()
         if isinstance(node, ast.Import):

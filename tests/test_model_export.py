@@ -198,6 +198,7 @@ def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folde
     (tmp_path / RENDERED_FILE).rename(data[0].root / RENDERED_FILE)
 
 
+@pytest.mark.slow
 def test_the_command_line_renders_checks_and_turns_models(folder, tmp_path, capsys):
     out, mine = tmp_path / "data", tmp_path / "mine"
     write_wedge(mine / "chair" / "a.obj")
@@ -222,6 +223,7 @@ def test_the_command_line_renders_checks_and_turns_models(folder, tmp_path, caps
         assert cli.main(wrong) == 2 and message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_code_of_the_page_on_own_models_runs(tmp_path, monkeypatch, capsys):
     page = (REPOSITORY / "docs" / "own_models.md").read_text()
     renderer, dataset = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

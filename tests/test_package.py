@@ -22,6 +22,7 @@ PROMISED = """
 """.split()
 
 
+@pytest.mark.slow
 def test_every_promised_name_is_an_attribute_after_a_bare_import():
     names = [*PROMISED, *zsp_lite.__all__]
     code = f"import operator, zsp_lite\nfor name in {names}: operator.attrgetter(name)(zsp_lite)"

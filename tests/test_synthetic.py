@@ -389,6 +389,7 @@ def test_an_unknown_preset_is_an_input_error(tmp_path):
         export.export_preset("imagenet", tmp_path, 0)
 
 
+@pytest.mark.slow
 def test_the_preset_reproduces_the_shipped_samples():
     """Rendered again, two sequences of data_samples have the same pictures, with wall, floor and shadows."""
     preset, dataset = export.PRESETS["samples"], Co3D(sample_data())

@@ -25,6 +25,7 @@ def fourier(surface, seed=0):
     return torch.where(surface[..., :1].isnan(), noise, known)
 
 
+@pytest.mark.slow
 def test_an_object_is_rendered_the_same_in_every_process_and_differs_from_the_next(renders):
     for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
         np.testing.assert_array_equal(array, rows[1])

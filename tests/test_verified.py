@@ -19,6 +19,8 @@ from zsp_lite.verified.solver import tied_hypotheses
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 from zsp_lite.views import extract_views, object_crop
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def method():

@@ -12,6 +12,8 @@ pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip ins
 
 from zsp_lite.widgets.alignment import one_outlier, ransac_settings
 
+pytestmark = pytest.mark.slow
+
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 

@@ -15,6 +15,8 @@ matplotlib.use("agg")
 from tools import widget_examples as examples
 from zsp_lite.widgets import features  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def truth():

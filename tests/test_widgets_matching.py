@@ -14,6 +14,8 @@ matplotlib.use("agg")
 from tools import widget_examples as examples
 from zsp_lite.widgets import matching  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def views():

@@ -10,6 +10,8 @@ pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip ins
 
 from zsp_lite.widgets.metrics import measured_accuracy, order_probabilities, rotated_distance, symmetry_rotation
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def closed_figures():

@@ -11,6 +11,8 @@ from tools.widget_examples import ranked_hypotheses as example
 from tools.widget_examples import sample_solution
 from zsp_lite.widgets.verified import ranked_hypotheses
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def widget():

@@ -14,6 +14,8 @@ from tools import widget_examples as examples
 from zsp_lite.widgets import views
 from zsp_lite.widgets.views import best_view, evenly_spaced, match_canvas, viewpoints_from_above
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def example():

@@ -24,9 +24,10 @@ logger = logging.getLogger(__name__)
 def bfloat16_is_fast(device_type: str) -> bool:
     """Tell whether bfloat16 matrix products are faster than float32 ones on a device.
 
-    On a CPU, both are timed once per process on a small linear layer (about 50 ms). The minimum over several
-    interleaved repeats is compared, so that other load on the machine does not change the result. On CUDA, native
-    support of bfloat16 decides. On other devices the result is False.
+    On a CPU, both are timed once per process on a small linear layer (about 50 ms). The minimum of the CPU time over
+    several interleaved repeats is compared, so that other load on the machine does not change the result. (On Windows,
+    the clock of the CPU time is too coarse, and the result is False.) On CUDA, native support of bfloat16 decides. On
+    other devices the result is False.
 
     Args:
         device_type: "cpu", "cuda" or another value of `torch.device.type`.
@@ -59,15 +60,15 @@ def autocast(device_type: str, precision: Precision) -> torch.autocast:
 
 @torch.inference_mode()
 def _linear_times() -> dict[Precision, float]:
-    """Shortest time in seconds of a linear layer of the size of zsp-tiny's MLP, per precision."""
+    """Shortest CPU time in seconds of a linear layer of the size of zsp-tiny's MLP, per precision."""
     layers = {}
     for precision, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16)):
         layers[precision] = torch.ones(128, 192, dtype=dtype), torch.ones(768, 192, dtype=dtype)
     shortest = dict.fromkeys(layers, float("inf"))
     for repeat in range(_REPEATS + 1):
         for precision, (x, weight) in layers.items():
-            start = time.perf_counter()
+            start = time.thread_time()
             F.linear(x, weight)
             if repeat:  # the first call includes one-time initialisation
-                shortest[precision] = min(shortest[precision], time.perf_counter() - start)
+                shortest[precision] = min(shortest[precision], time.thread_time() - start)
     return shortest
