@@ -60,15 +60,20 @@ def autocast(device_type: str, precision: Precision) -> torch.autocast:
 
 @torch.inference_mode()
 def _linear_times() -> dict[Precision, float]:
-    """Shortest CPU time in seconds of a linear layer of the size of zsp-tiny's MLP, per precision."""
+    """Shortest CPU time in seconds of a linear layer of the size of zsp-tiny's MLP on one thread, per precision."""
     layers = {}
     for precision, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16)):
         layers[precision] = torch.ones(128, 192, dtype=dtype), torch.ones(768, 192, dtype=dtype)
     shortest = dict.fromkeys(layers, float("inf"))
-    for repeat in range(_REPEATS + 1):
-        for precision, (x, weight) in layers.items():
-            start = time.thread_time()
-            F.linear(x, weight)
-            if repeat:  # the first call includes one-time initialisation
-                shortest[precision] = min(shortest[precision], time.thread_time() - start)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # CPU time of several threads includes their waiting for each other
+    try:
+        for repeat in range(_REPEATS + 1):
+            for precision, (x, weight) in layers.items():
+                start = time.thread_time()
+                F.linear(x, weight)
+                if repeat:  # the first call includes one-time initialisation
+                    shortest[precision] = min(shortest[precision], time.thread_time() - start)
+    finally:
+        torch.set_num_threads(threads)
     return shortest
