@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.meshes import Material, TexturedMesh, _smooth_normals
+from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.synthetic.primitives import Mesh, box
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 
@@ -60,7 +60,7 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
 
 def painted(mesh: Mesh, colour=(0.7, 0.4, 0.3, 1.0)) -> TexturedMesh:
     """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
-    n, normals = len(mesh.faces), _smooth_normals(mesh.vertices, mesh.faces)
+    n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
     uv, white, material = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32), np.zeros(n, int)
     return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (Material(np.array(colour)),))
 

@@ -18,7 +18,8 @@ from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.desktop import label_category
 from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.metrics import rotation_error
-from zsp_lite.synthetic.export import POSES_FILE, export_categories
+from zsp_lite.synthetic.export import export_categories
+from zsp_lite.synthetic.recording import POSES_FILE
 
 # Keypoints of a chair in canonical coordinates: corners of the seat, ends of the back and of legs.
 KEYPOINTS = np.array(

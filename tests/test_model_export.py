@@ -14,25 +14,16 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic import raytracing, room, textures
 from zsp_lite.synthetic.ground_truth import ground_truth_pair, object_poses
-from zsp_lite.synthetic.model_export import RENDERED_FILE, export_models, render_model, render_views
+from zsp_lite.synthetic.model_export import RENDERED_FILE, export_models
 from zsp_lite.synthetic.model_sheet import label_overlay, sheet_views, write_contact_sheet, write_label_overlay
 from zsp_lite.synthetic.models import list_models, turn_model
 from zsp_lite.synthetic.raytracing import HARD_SHADOWS
 from zsp_lite.synthetic.sensor import simulate_capture
+from zsp_lite.synthetic.sequences import render_sequence, render_views
 
 FRAMES, SIZE = 8, 64
-
-
-@pytest.fixture(scope="module", autouse=True)
-def coarse_surroundings():
-    """Coarse textures and shadow maps: these tests look at the object."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "_FLOOR_PIXELS", 384)
-        patch.setattr(textures, "TILE", 192)
-        patch.setattr(raytracing, "_SHADOW_MAP", 64)
-        yield
+pytestmark = pytest.mark.usefixtures("coarse_rooms")
 
 
 def quick(mesh, cameras, rng):
@@ -171,8 +162,8 @@ def test_a_renderer_and_a_sensor_of_the_user_take_the_place_of_the_own_ones(fold
 
 def test_cameras_do_not_depend_on_the_renderer(folder):
     mesh = list_models(folder)[0].read()
-    one = render_model(mesh, 5, 3, 48, quick)
-    two = render_model(mesh, 5, 3, 48, lambda mesh, cameras, rng: quick(mesh, cameras, np.random.default_rng(0)))
+    one = render_sequence(mesh, 5, 3, 48, quick)
+    two = render_sequence(mesh, 5, 3, 48, lambda mesh, cameras, rng: quick(mesh, cameras, np.random.default_rng(0)))
     for first, second in zip(one.views, two.views, strict=True):
         assert (first.camera.matrix == second.camera.matrix).all()
         assert (first.mask == second.mask).all() and (first.depth == second.depth)[first.mask].all()

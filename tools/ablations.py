@@ -80,7 +80,7 @@ def evaluate_variants(start_from: str, out: Path, also: list[str]) -> dict[str, 
             state = read_checkpoint(checkpoint)["task"]
             last = {key.removeprefix("model."): x for key, x in state.items() if key.startswith("model.")}
             rows["no averaging of weights"] = _evaluate(_trainee(last), unseen)
-            first_shard = f"objects-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"
+            first_shard = f"views-{BASE.seed}-000000-*-{BASE.proportions:g}-{BASE.deformation:g}.npz"
             model.key_mean = positional_mean(model, load_render_set(sorted(renders.glob(first_shard))))
             rows["mean key at each grid position removed"] = _evaluate(model, unseen)
     return rows

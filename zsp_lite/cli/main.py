@@ -138,7 +138,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 
 @cli.command(
     epilog=examples(
-        "synth --preset samples --out data_samples",
+        "synth --preset samples --out outputs/samples",
         "synth --preset eval --out outputs/eval",
         "synth --preset paper --out outputs/paper",
         "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
@@ -148,7 +148,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="samples (the content of data_samples/), eval, or paper: 20 categories of 10 sequences of 100 frames, about "
+    help="samples, eval, or paper: 20 categories of 10 sequences of 100 frames, about "
     "half an hour and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(

@@ -12,7 +12,8 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
+from zsp_lite.synthetic.export import SETTINGS_FILE, make_object
+from zsp_lite.synthetic.recording import POSES_FILE
 
 
 def exact_frame(frame: Frame, root: str | Path, category: str, sequence: str) -> Frame:

@@ -1,32 +1,35 @@
 """Export of procedural categories as a folder in CO3D's layout, with pose labels and evaluation pairs."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
-from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
-from zsp_lite.synthetic.assembly import Shape, make_shape
+from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
-from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
+from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.meshes import TexturedMesh
+from zsp_lite.synthetic.recording import (
+    read_poses,
+    record_sequence,
+    stable_hash,
+    write_labels,
+    write_pairs,
+    write_sequence,
+)
+from zsp_lite.synthetic.sequences import RenderedSequence
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
 
 SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATION}
 GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
-POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
-JPEG_QUALITY = 88
+_RENDERER = 2  # folders that another renderer began are not completed
 LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
@@ -84,16 +87,8 @@ def export_preset(
     export_categories(
         wanted.categories, out, wanted.sequences, wanted.frames, seed, wanted.image_size, progress=progress
     )
-    write_pairs(wanted, out, seed)
-
-
-def write_pairs(preset: Preset, out: str | Path, seed: int) -> None:
-    """Sample the evaluation pairs of a preset and write them in the file format of the published evaluation."""
-    dataset = Co3D(out)
-    for category in preset.categories:
-        for n_targets in preset.targets:
-            pairs = sample_pairs(dataset, category, preset.pairs, n_targets, seed)
-            write_upstream_pairs(upstream_pairs_path(out, category, preset.pairs, n_targets), pairs, dataset)
+    for category in wanted.categories:
+        write_pairs(Path(out), category, wanted.pairs, wanted.targets, seed)
 
 
 def export_categories(
@@ -135,22 +130,16 @@ def export_categories(
             f"export has {sequences} sequences of {frames} frames of {image_size} pixels, expected at least 1, 1 and 32"
         )
     out = Path(out)
-    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout}
+    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout, "renderer": _RENDERER}
     _write_settings(out, settings)
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs) if progress else jobs:
         name = sequence_name(seed, category, index)
-        poses = _read_poses(out, category)
-        if name not in poses or name not in _complete_sequences(out, category):
-            data, exact = make_sequence(category, index, frames, seed, image_size)
-            # Annotations are written last; a sequence with annotations is complete.
-            poses[name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale}
-            write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-            write_co3d(out, category, [data], quality=JPEG_QUALITY, intrinsics_format=LAYOUTS[layout])
-        reference = sequence_name(seed, category, 0)
-        trans = np.array(poses[name]["trans"]) @ np.linalg.inv(poses[reference]["trans"])
-        trans = np.eye(4) if name == reference else np.round(trans, 12) + 0.0  # equal on all processors, without -0.0
-        write_label(out, category, PoseLabel(trans, name, reference))
+        if name not in read_poses(out, category) or name not in _complete_sequences(out, category):
+            recorded = make_sequence(category, index, frames, seed, image_size)
+            write_sequence(out, category, make_object(category, name, seed), recorded, LAYOUTS[layout])
+    for category in categories:
+        write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 
 
 def make_sequence(
@@ -161,14 +150,13 @@ def make_sequence(
     Returns:
         The sequence with simulated sensor errors, and its exact rendering in the same unit.
     """
-    key = _stable_hash(seed, category, index)
-    shape = _make_object(category, key)
-    rendered = render_sequence(shape, np.random.default_rng([key, 1]), frames, image_size)
-    return simulate_capture(rendered, sequence_name(seed, category, index), np.random.default_rng([key, 2]))
+    name = sequence_name(seed, category, index)
+    key = stable_hash(seed, category, index)
+    return record_sequence(make_object(category, name, seed), name, key, frames, image_size)
 
 
-def make_object(category: str, sequence: str, seed: int) -> Shape:
-    """Return the object of an exported sequence in canonical coordinates.
+def make_object(category: str, sequence: str, seed: int) -> TexturedMesh:
+    """Return the object of an exported sequence in canonical coordinates, with its materials.
 
     Args:
         category: Category of the sequence.
@@ -181,22 +169,14 @@ def make_object(category: str, sequence: str, seed: int) -> Shape:
     index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
     if category not in GENERATORS or index < 0 or sequence != sequence_name(seed, category, index):
         raise InputError(f"sequence {category}/{sequence} does not exist in an export with seed {seed}")
-    return _make_object(category, _stable_hash(seed, category, index))
-
-
-def _make_object(category: str, key: int) -> Shape:
-    return make_shape(GENERATORS[category], [key, 0])
+    key = stable_hash(seed, category, index)
+    return with_materials(make_shape(GENERATORS[category], [key, 0]), random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
     """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
-    digits = _stable_hash(seed, category, index)
+    digits = stable_hash(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
-
-
-def _stable_hash(seed: int, category: str, index: int) -> int:
-    """Return a 64-bit hash that is the same on every machine and in every process."""
-    return int.from_bytes(hashlib.sha256(f"{seed}/{category}/{index}".encode()).digest()[:8], "big")
 
 
 def _write_settings(out: Path, settings: dict) -> None:
@@ -207,11 +187,6 @@ def _write_settings(out: Path, settings: dict) -> None:
         if found != settings:
             raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())
-
-
-def _read_poses(out: Path, category: str) -> dict:
-    path = out / category / POSES_FILE
-    return decode(read_bytes(path, "object poses"), dict, path) if path.is_file() else {}
 
 
 def _complete_sequences(out: Path, category: str) -> set[str]:

@@ -22,8 +22,9 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
-from zsp_lite.synthetic.export import POSES_FILE, SETTINGS_FILE, make_object
+from zsp_lite.synthetic.export import SETTINGS_FILE, make_object
 from zsp_lite.synthetic.model_export import RENDERED_FILE
+from zsp_lite.synthetic.recording import POSES_FILE
 from zsp_lite.views import object_crop, patch_mask
 
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background

@@ -1,4 +1,4 @@
-"""Light of a room on the object and on the floor, and the radiance of the room along camera rays."""
+"""Light of a room on an object and on its floor, and the radiance of the room along camera rays."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from zsp_lite.synthetic.room import Room
 from zsp_lite.synthetic.sampling import look_up, pyramid, sample_image
 
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
+_FLOOR = 4  # index of the floor among the faces of a room
 _PANORAMA = (64, 128)
 _SIGMAS = (0.0, 1.5, 4.0, 9.0)  # blur of the panorama in pixels, for increasing roughness
 _ROUGHNESS = (0.25, 0.45, 0.65)  # limits between these blurs
@@ -27,18 +28,21 @@ class ShadowMap:
     light: Float[np.ndarray, "n n 2"]
     half: float
 
+    def at(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the visible shares (n,) of the key light and of the room at floor points (n, 2)."""
+        u, v = (point / (2 * self.half) + 0.5).T
+        sample = sample_image([self.light], u, v, None, cv2.BORDER_CONSTANT, (1.0, 1.0))
+        return sample[:, 0], sample[:, 1]
+
 
 class RoomLight:
-    """A room around an object: its radiance along rays and its irradiance at the object.
+    """Light of a room: its radiance along rays, and the light that an object at its origin receives.
 
-    Args:
-        room: Room.
-        origin: Position of the room's origin, on the floor below the object.
-        shadow: Shadow of the object.
+    All points are relative to the room's origin. An instance serves any number of objects.
     """
 
-    def __init__(self, room: Room, origin: Float[np.ndarray, "3"], shadow: ShadowMap):
-        self.room, self._origin, self._shadow = room, origin, shadow
+    def __init__(self, room: Room):
+        self.room = room
         self._images = [pyramid(image) for image in room.images]
         self._panoramas = self._make_panoramas()
 
@@ -46,33 +50,29 @@ class RoomLight:
         """Return the irradiance (n, 3) of the room at unblocked points with normals (n, 3)."""
         return look_up(self._irradiance, normal)
 
-    def towards(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def towards(self, origin: np.ndarray, directions: np.ndarray, shadow: ShadowMap) -> np.ndarray:
         """Return the radiance of the room in directions (n, 3); the floor near the object is in its shadow."""
         light = look_up(self._panoramas[-1], directions)  # the smooth one: few rays per sample, little noise
         down = np.flatnonzero(directions[:, 2] < -0.02)
-        reach = (self._origin[2] - origin[down, 2]) / directions[down, 2]
+        reach = -origin[down, 2] / directions[down, 2]
         point = origin[down, :2] + reach[:, None] * directions[down, :2]
-        key, around = self.floor_light(point)
-        cosine = max(float(self.room.light[2]), 0)
-        full = self.room.ambient + cosine * self.room.light_colour
-        shaded = around[:, None] * self.room.ambient + (key * cosine)[:, None] * self.room.light_colour
-        light[down] = light[down] * (shaded / full).astype(np.float32)
+        key, around = shadow.at(point)
+        light[down] *= self._floor_irradiance(key, around) / self._floor_irradiance(np.ones(1), np.ones(1))
         return light
+
+    def _floor_irradiance(self, key: np.ndarray, around: np.ndarray) -> Float[np.ndarray, "n 3"]:
+        """Return the irradiance of the floor for visible shares (n,) of the key light and of the room."""
+        shares = np.stack([around, key * max(float(self.room.light[2]), 0)], 1).astype(np.float32)
+        return shares @ np.stack([self.room.ambient, self.room.light_colour]).astype(np.float32)
 
     def reflection(self, direction: np.ndarray, roughness: np.ndarray) -> np.ndarray:
         """Return the radiance of the room in directions (n, 3), blurred by the roughness (n,)."""
         level = np.searchsorted(_ROUGHNESS, roughness)
         result = np.empty_like(direction)
-        for index in np.unique(level):
-            on = level == index
+        for index in np.flatnonzero(np.bincount(level)):
+            on = np.flatnonzero(level == index)
             result[on] = look_up(self._panoramas[index], direction[on])
         return result
-
-    def floor_light(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the visible shares (n,) of the key light and of the room at floor points (n, 2)."""
-        u, v = ((point - self._origin[:2]) / (2 * self._shadow.half) + 0.5).T
-        sample = sample_image([self._shadow.light], u, v, np.ones(len(u)), cv2.BORDER_CONSTANT, (1.0, 1.0))
-        return sample[:, 0], sample[:, 1]
 
     def _make_panoramas(self) -> list[np.ndarray]:
         """Return the radiance of the room around the object by direction, at several blurs."""
@@ -83,9 +83,7 @@ class RoomLight:
             [sine * np.cos(azimuth), sine * np.sin(azimuth), np.repeat(np.cos(polar)[:, None], cols, 1)], -1
         )
         directions = directions.reshape(-1, 3).astype(np.float32)
-        eye = self._origin + np.float32([0, 0, 1.5])
-        eye = np.broadcast_to(eye, directions.shape)
-        radiance, _ = self.radiance(eye, directions, pixel=0.1, reflections=False)
+        radiance, _ = self.radiance(np.array([0, 0, 1.5]), directions, pixel=0.1)
         radiance = radiance.reshape(rows, cols, 3)
         weight = (np.sin(polar)[:, None, None] * np.ones((1, cols, 1))).astype(np.float32)
         self.mean = ((radiance * weight).sum((0, 1)) / weight.sum((0, 1))).astype(np.float32)
@@ -104,54 +102,51 @@ class RoomLight:
                 for s in _SIGMAS]  # fmt: skip
 
     def radiance(
-        self, origin: np.ndarray, rays: np.ndarray, pixel: float, reflections: bool
+        self, eye: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"], pixel: float, shadow: ShadowMap | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of the box's faces along rays.
 
         Args:
-            origin: Origins (n, 3); those outside the box are moved into it.
-            rays: Directions (n, 3).
+            eye: Origin of the rays; moved into the box if it is outside.
+            rays: Directions.
             pixel: Angle between neighbouring rays in radians.
-            reflections: Whether a glossy floor reflects the room.
+            shadow: Shadow of the object. Without it, the room is empty, and a glossy floor does not reflect it.
 
         Returns:
             Radiance (n, 3), and the ray parameter (n,) where a ray meets the floor, 0 elsewhere.
         """
         room = self.room
-        low, high = (corner.astype(np.float32) + self._origin for corner in (room.low, room.high))
-        origin = np.clip(origin, low + 0.05, high - 0.05)
-        safe = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-        reach = np.where(safe > 0, high - origin, low - origin) / safe
-        axis = reach.argmin(1)
-        distance = reach[np.arange(len(rays)), axis]
-        point = origin + distance[:, None] * rays
-        side = axis * 2 + (rays[np.arange(len(rays)), axis] > 0)
-        share = (point - low) / (high - low)
-        radiance = np.empty((len(rays), 3), np.float32)
-        length = np.linalg.norm(rays, axis=1)
-        footprint = pixel * distance * length
+        low, high = room.low.astype(np.float32), room.high.astype(np.float32)
+        eye = np.clip(eye, low + 0.05, high - 0.05).astype(np.float32)
+        columns = [np.where(np.abs(ray) < 1e-9, np.float32(1e-9), ray) for ray in rays.T]
+        reach = [(np.where(ray > 0, high[k], low[k]) - eye[k]) / ray for k, ray in enumerate(columns)]
+        distance = np.minimum(np.minimum(reach[0], reach[1]), reach[2])
+        radiance, floor_depth = np.empty((len(rays), 3), np.float32), np.zeros(len(rays), np.float32)
+        length = np.sqrt(columns[0] ** 2 + columns[1] ** 2 + columns[2] ** 2)
+        floor = None
         for face in range(6):
-            if not len(on := np.flatnonzero(side == face)):
+            axis, along = face // 2, columns[face // 2]
+            on = np.flatnonzero((distance == reach[axis]) & ((along > 0) == face % 2))
+            if not len(on):
                 continue
-            u, v = (
-                (share[on, 1], 1 - share[on, 2])
-                if face < 2
-                else (share[on, 0], 1 - share[on, 2] if face < 4 else share[on, 1])
-            )
+            reached = distance[on]
+            x, y, z = ((eye[k] - low[k] + reached * columns[k][on]) / (high[k] - low[k]) for k in range(3))
+            u, v = y if axis == 0 else x, y if axis == 2 else 1 - z
             image = self._images[face]
-            extent = (high - low)[1 if face < 2 else 0]
+            extent = (high - low)[1 if axis == 0 else 0]
             # A surface that is seen at an angle is foreshortened along one axis only.
-            cosine = np.abs(rays[on, axis[on]]) / length[on]
-            texels = footprint[on] / np.sqrt(np.maximum(cosine, 0.04)) * image[0].shape[1] / extent
+            slant = np.sqrt(np.maximum(np.abs(along[on]) / length[on], 0.04))
+            texels = reached * length[on] / slant * (pixel * image[0].shape[1] / extent)
             radiance[on] = sample_image(image, u, v, texels, cv2.BORDER_REPLICATE)
-        floor = np.flatnonzero(side == 4)
-        key, around = self.floor_light(point[floor, :2])
-        light = around[:, None] * room.ambient + (key * max(float(room.light[2]), 0))[:, None] * room.light_colour
-        radiance[floor] *= light.astype(np.float32)
-        if room.gloss and reflections:
-            view = rays[floor] / length[floor, None]
-            mirrored = view * np.float32([1, 1, -1])
-            fresnel = room.gloss + (0.6 - room.gloss) * (1 + view[:, 2]) ** 5
+            if face == _FLOOR:
+                floor, point = on, np.stack([x, y], 1) * (high - low)[:2] + low[:2]
+                floor_depth[on] = np.where(reached < FLOOR_REACH, reached, 0)
+        if floor is None:
+            return radiance, floor_depth
+        key, around = shadow.at(point) if shadow else np.ones((2, len(floor)), np.float32)
+        radiance[floor] *= self._floor_irradiance(key, around)
+        if room.gloss and shadow:
+            mirrored = rays[floor] * np.float32([1, 1, -1])
+            fresnel = room.gloss + (0.6 - room.gloss) * (1 + columns[2][floor] / length[floor]) ** 5
             radiance[floor] += (fresnel * around)[:, None] * look_up(self._panoramas[1], mirrored)
-        floor_depth = np.where((side == 4) & (distance < FLOOR_REACH), distance, 0).astype(np.float32)
         return radiance, floor_depth

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -17,7 +18,17 @@ MAX_FACES = 2_000_000
 _TEXTURE_SIZE = 1024  # longer side in pixels; larger textures are reduced
 _MAX_TEXTURE_PIXELS = 2**28
 _CREASE = np.cos(np.radians(40))  # edges sharper than this stay sharp where the file has no normals
+_HALF_CREASE = np.cos(np.radians(20))
 _INVISIBLE = 0.02  # opacity below which a face is removed
+
+
+@runtime_checkable
+class Pattern(Protocol):
+    """Colour as a function of the position on an object."""
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the sRGB colours, in [0, 1], of points in object coordinates."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +38,7 @@ class Material:
     Attributes:
         colour: sRGB colour and opacity in [0, 1], a factor of the texture. An opacity below 1 means glass.
         texture: sRGB colour and opacity, rows from top to bottom. Opacity below 0.5 means a hole (cut-out).
+        pattern: Colour by position, another factor.
         specular: Reflectance at normal incidence, in [0, 1].
         roughness: Width of the highlight as in glTF: 0 for a mirror, 1 for a matte surface.
         metallic: 1 for metals, whose reflection has the colour of the surface.
@@ -34,6 +46,7 @@ class Material:
 
     colour: Float[np.ndarray, "4"]
     texture: UInt8[np.ndarray, "h w 4"] | None = None
+    pattern: Pattern | None = None
     specular: float = 0.04
     roughness: float = 0.7
     metallic: float = 0.0
@@ -164,7 +177,7 @@ def _part(mesh, transform: np.ndarray) -> TexturedMesh:
         )
         normals = np.where((np.abs(normals).sum(-1) > 0.1)[..., None], normals, flat[:, None].astype(np.float32))
     else:
-        normals = _smooth_normals(vertices, faces)
+        normals = smooth_normals(vertices, faces)
     uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
     visual = mesh.visual
     if visual.kind == "texture":
@@ -198,7 +211,8 @@ def _material(given) -> Material:
             texture = (
                 None if texture is None else np.dstack([texture[..., :3], np.full(texture.shape[:2], 255, np.uint8)])
             )
-        return Material(colour, texture, 0.04, float(np.clip(roughness, 0.05, 1)), float(metallic))
+        roughness = float(np.clip(roughness, 0.05, 1))
+        return Material(colour, texture, roughness=roughness, metallic=float(metallic))
     colour = _rgba(given.diffuse)
     texture = None if given.image is None else _image(given.image)
     if texture is not None and colour[:3].max() < 0.02:
@@ -208,7 +222,8 @@ def _material(given) -> Material:
     glossiness = max(float(given.glossiness), 1.0)
     # Phong's exponent n as roughness: n = 2 / roughness^4 - 2.
     roughness = (2 / (glossiness + 2)) ** 0.25
-    return Material(colour, texture, 0.02 + 0.12 * float(specular), float(np.clip(roughness, 0.15, 1)))
+    roughness = float(np.clip(roughness, 0.15, 1))
+    return Material(colour, texture, specular=0.02 + 0.12 * float(specular), roughness=roughness)
 
 
 def _opacity(keys: dict) -> float:
@@ -262,25 +277,40 @@ def _cleaned(mesh: TexturedMesh) -> TexturedMesh:
     return replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3), **corners)
 
 
-def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
     """Return corner normals: the mean normal of the faces around the corner that meet at less than 40 degrees."""
     size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
-    _, point = np.unique(np.round(vertices / size, 6), axis=0, return_inverse=True)  # equal positions
+    point = _merged(np.round(vertices / size, 6))[faces.ravel()]  # of each corner
     a, b, c = (vertices[faces[:, i]] / size for i in range(3))
     weighted = np.cross(b - a, c - a)
     unit = _unit(weighted)
-    corner = np.argsort(point.ravel()[faces.ravel()], kind="stable")
-    of = point.ravel()[faces.ravel()][corner]  # corners of one point are neighbours in this order
-    face, total = corner // 3, np.zeros((len(corner), 3))
-    counts = np.bincount(of)
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    for step in range(min(int(counts.max()), 32)):  # every corner with the step-th corner of its point
-        other = face[first[of] + step % counts[of]]
-        close = ((unit[face] * unit[other]).sum(1) > _CREASE) & (step < counts[of])
-        total += np.where(close[:, None], weighted[other], 0)
-    result = np.empty_like(total)
-    result[corner] = np.where((np.abs(total).sum(1) > 0)[:, None], total, unit[face])
-    return _unit(result).reshape(-1, 3, 3).astype(np.float32)
+    total = np.stack([np.bincount(point, np.repeat(axis, 3)) for axis in weighted.T], 1)[point]
+    # Where all faces around a point are within half the angle of their mean, all are averaged.
+    bent = np.einsum("nd,nd->n", np.repeat(unit, 3, axis=0), _unit(total)) < _HALF_CREASE
+    corner = np.flatnonzero(np.bincount(point, bent)[point])
+    if len(corner):
+        corner = corner[np.argsort(point[corner], kind="stable")]
+        _, of, counts = np.unique(point[corner], return_inverse=True, return_counts=True)
+        face, first = corner // 3, np.cumsum(counts) - counts
+        total[corner] = 0
+        several = np.arange(len(corner))
+        for step in range(min(int(counts.max()), 32)):  # every corner with the step-th corner of its point
+            several = several[counts[of[several]] > step]
+            other = face[first[of[several]] + step]
+            close = np.einsum("nd,nd->n", unit[face[several]], unit[other]) > _CREASE
+            total[corner[several[close]]] += weighted[other[close]]
+    alone = np.flatnonzero(np.abs(total).sum(1) == 0)
+    total[alone] = unit[alone // 3]
+    return _unit(total).reshape(-1, 3, 3).astype(np.float32)
+
+
+def _merged(vertices: np.ndarray) -> np.ndarray:
+    """Return the index of each vertex among the different positions."""
+    order = np.lexsort(vertices.T)
+    different = (np.diff(vertices[order], axis=0, prepend=np.nan) != 0).any(1)
+    index = np.empty(len(vertices), np.int64)
+    index[order] = np.cumsum(different) - 1
+    return index
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -33,7 +33,6 @@ _LINEAR = srgb_to_linear(np.arange(256) / 255)
 _LAYERS = 4  # surfaces that a ray passes through: glass, and holes in cut-out textures
 _CUT_OUT = 0.5  # opacity of a texture below which there is a hole
 _GLASS = 0.6  # opacity of a material below which it casts no shadow
-_SHADOW_MAP = 320  # texels along each side of the floor's shadow map
 _BLOCKED = 0.25  # light of a direction that another part of the object blocks, relative to the mean of the room
 
 
@@ -45,14 +44,17 @@ class Quality:
         samples: Samples per pixel along each axis.
         shadow_rays: Rays per sample towards the key light; with 1, shadows are hard.
         ambient_rays: Rays per sample towards the room; with 0, no part of the object blocks the light of the room.
+        shadow_map: Points along each side of the grid on which the shadow on the floor is known.
     """
 
     samples: int = 2
     shadow_rays: int = 3
     ambient_rays: int = 8
+    shadow_map: int = 320
 
 
 HARD_SHADOWS = Quality(shadow_rays=1, ambient_rays=0)
+FASTEST = Quality(samples=1, shadow_rays=1, ambient_rays=0, shadow_map=96)
 
 
 class _Hits(NamedTuple):
@@ -69,27 +71,39 @@ class MeshScene:
 
     Args:
         mesh: Mesh in canonical coordinates; its lowest vertex stands on the floor.
-        room: Surroundings.
+        room: Surroundings; a `RoomLight` if these were prepared before.
         quality: Numbers of rays.
         seed: Seed of the random directions.
+        coordinates: Object coordinates of each vertex, for a deformed copy of an object. Default: its position.
     """
 
-    def __init__(self, mesh: TexturedMesh, room: Room, quality: Quality = Quality(), seed: int = 0):
+    def __init__(
+        self,
+        mesh: TexturedMesh,
+        room: Room | RoomLight,
+        quality: Quality = Quality(),
+        seed: int = 0,
+        coordinates: Float[np.ndarray, "v 3"] | None = None,
+    ):
         o3d = load_open3d()
-        self.mesh, self.room, self.quality = mesh, room, quality
+        self.lighting = room if isinstance(room, RoomLight) else RoomLight(room)
+        self.mesh, self.room, self.quality = mesh, self.lighting.room, quality
         self._tensor = o3d.core.Tensor
         opacity = np.array([material.colour[3] for material in mesh.materials])
         self._holes = np.array([m.texture is not None and m.texture[..., 3].min() < 128 for m in mesh.materials])
         self._rays = self._raycasting(o3d, np.arange(len(mesh.faces)))
         solid = np.flatnonzero(opacity[mesh.material] >= _GLASS)
-        self._solid = self._raycasting(o3d, solid) if len(solid) else None
+        self._solid = self._rays if len(solid) == len(mesh.faces) else self._raycasting(o3d, solid)
         self._solid_faces, self._solid_holes = solid, self._holes[mesh.material[solid]].any()
         self.floor = float(mesh.vertices[:, 2].min())
         centre = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
         self._origin = np.array([centre[0], centre[1], self.floor], np.float32)  # of the room
         self._corners = mesh.vertices[mesh.faces].astype(np.float32)
+        self._flat = flat_normals(self._corners)
+        self._coordinates = self._corners if coordinates is None else coordinates[mesh.faces].astype(np.float32)
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._tint = np.array([srgb_to_linear(m.colour[:3]) for m in mesh.materials])
+        self._coloured = bool((mesh.colours != 1).any())
         self._opacity = opacity.astype(np.float32)
         self._surface = np.array([[m.specular, m.roughness, m.metallic] for m in mesh.materials], np.float32)
         self._texel_density = self._texels_per_area()
@@ -97,7 +111,6 @@ class MeshScene:
         self._light_sets = self._directions_to_light()
         self._ambient_sets = cosine_directions(self._rng, quality.ambient_rays)
         self.shadow = self._shadow_map()
-        self.lighting = RoomLight(room, self._origin, self.shadow)
         self._gain: float | None = None
 
     def render(self, camera: Camera, seed: int | np.random.Generator) -> Rendering:
@@ -111,19 +124,22 @@ class MeshScene:
             The picture and its exact geometry. The exposure is measured on the first view and varies little after it.
         """
         rng = np.random.default_rng(seed)
-        height, width = camera.size
-        top, left, bottom, right = self._object_box(camera)
-        radiance, depth = self._background(camera)
-        n = self.quality.samples
+        n, (top, left, bottom, right) = self.quality.samples, self._object_box(camera)
+        box = np.s_[top:bottom, left:right]
+        rays = _pixel_rays(camera, (0, 0, *camera.size), 1)
+        radiance, depth = self._background(camera, rays)
+        hits = self._first_hits(camera, rays[box].reshape(-1, 3))
+        exact = self._exact(camera, (top, left), rays[box], hits, depth)
         if bottom > top and right > left:
-            rays = _pixel_rays(camera, (top, left, bottom, right), n)
-            colour, through = self._shade_rays(camera, rays.reshape(-1, 3))
+            samples = rays[box]
+            if n > 1:
+                samples = _pixel_rays(camera, (top, left, bottom, right), n)
+                hits = self._first_hits(camera, samples.reshape(-1, 3))
+            colour, through = self._shade_rays(camera, samples.reshape(-1, 3), hits)
             size = (right - left, bottom - top)
-            colour = cv2.resize(colour.reshape(rays.shape), size, interpolation=cv2.INTER_AREA)
-            through = cv2.resize(through.reshape(rays.shape[:2]), size, interpolation=cv2.INTER_AREA)
-            box = np.s_[top:bottom, left:right]
+            colour = cv2.resize(colour.reshape(samples.shape), size, interpolation=cv2.INTER_AREA)
+            through = cv2.resize(through.reshape(samples.shape[:2]), size, interpolation=cv2.INTER_AREA)
             radiance[box] = colour + through[..., None] * radiance[box]
-        exact = self._exact(camera, (top, left, bottom, right), depth)
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(rng.normal(0, 0.025)), rng)
@@ -155,9 +171,12 @@ class MeshScene:
         weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)
         return _Hits(on, distance[on], hits["primitive_ids"].numpy()[on].astype(np.int64), weights)
 
+    def _first_hits(self, camera: Camera, rays: np.ndarray) -> _Hits:
+        return self._cast(np.broadcast_to(camera.centre.astype(np.float32), rays.shape), rays)
+
     def _occluded(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Return whether a solid surface blocks each ray."""
-        if self._solid is None or not len(rays):
+        if not len(rays):
             return np.zeros(len(rays), bool)
         if not self._solid_holes:
             return self._solid.test_occlusions(self._tensor(np.concatenate([origin, rays], 1))).numpy()
@@ -178,47 +197,50 @@ class MeshScene:
                 break
         return blocked
 
-    def _exact(self, camera: Camera, box: tuple[int, int, int, int], floor_depth: np.ndarray) -> dict:
-        """Return depth, mask, canonical coordinates and normals of the rays through the pixel centres."""
-        top, left, bottom, right = box
-        shape = (bottom - top, right - left)
+    def _exact(
+        self, camera: Camera, corner: tuple[int, int], rays: np.ndarray, hits: _Hits, floor_depth: np.ndarray
+    ) -> dict:
+        """Return depth, mask, object coordinates and normals of rays (h, w, 3) through the centres of pixels.
+
+        `corner` is the pixel (row, col) of the first ray, `hits` are the first surfaces of the rays.
+        """
         depth, mask = floor_depth.copy(), np.zeros(camera.size, bool)
         canonical, normals = np.full((*camera.size, 3), np.nan, np.float32), np.zeros((*camera.size, 3), np.float32)
-        rays = _pixel_rays(camera, box, 1).reshape(-1, 3)
+        row, col = np.divmod(np.arange(rays[..., 0].size), max(rays.shape[1], 1))
+        rays = rays.reshape(-1, 3)
         eye = np.broadcast_to(camera.centre.astype(np.float32), rays.shape).copy()
         active, passed = np.arange(len(rays)), np.zeros(len(rays), np.float32)
-        row, col = np.divmod(np.arange(len(rays)), max(shape[1], 1))
         for _ in range(_LAYERS):
-            if not len(active):
-                break
-            hits = self._cast(eye[active], rays[active])
             solid = self._texture_opacity(hits.face, hits.weights) >= _CUT_OUT
             ray, keep = active[hits.ray[solid]], hits.face[solid]
-            pixel = row[ray] + top, col[ray] + left
+            pixel = row[ray] + corner[0], col[ray] + corner[1]
             mask[pixel] = True
             depth[pixel] = passed[ray] + hits.distance[solid]  # rays have unit z in the camera frame
-            canonical[pixel] = np.einsum("nk,nkd->nd", hits.weights[solid], self._corners[keep])
-            normal = flat_normals(self._corners[keep])
-            normal *= -np.sign((normal * rays[ray]).sum(1, keepdims=True))
+            canonical[pixel] = _interpolated(hits.weights[solid], self._coordinates[keep])
+            normal = self._flat[keep]
+            normal *= -np.sign(_dot(normal, rays[ray]))[:, None]
             normals[pixel] = normal @ camera.R.T.astype(np.float32)
             active, step = active[hits.ray[~solid]], hits.distance[~solid] + 1e-3
             eye[active] += step[:, None] * rays[active]
             passed[active] += step
+            if not len(active):
+                break
+            hits = self._cast(eye[active], rays[active])
         return {"depth": depth, "mask": mask, "canonical": canonical, "normals": normals}
 
     # Shading
 
-    def _shade_rays(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the radiance (n, 3) of the object along camera rays, and the share of the background (n,)."""
+    def _shade_rays(self, camera: Camera, rays: np.ndarray, hits: _Hits) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radiance (n, 3) of the object along camera rays, and the share of the background (n,).
+
+        `hits` are the first surfaces of the rays.
+        """
         colour, through = np.zeros((len(rays), 3), np.float32), np.ones(len(rays), np.float32)
         origin = np.broadcast_to(camera.centre.astype(np.float32), rays.shape).copy()
         pixel = 1 / (camera.focal_length.mean() * self.quality.samples)
         active = np.arange(len(rays))
         passed = np.zeros(len(rays), np.float32)
         for _ in range(_LAYERS):
-            if not len(active):
-                break
-            hits = self._cast(origin[active], rays[active])
             ray = active[hits.ray]
             footprint = (passed[ray] + hits.distance) * pixel
             diffuse, mirror, opacity = self._shade(hits, origin[ray], rays[ray], footprint)
@@ -229,26 +251,30 @@ class MeshScene:
             active, step = ray[onwards], hits.distance[onwards] + 1e-3
             origin[active] += step[:, None] * rays[active]
             passed[active] += step
+            if not len(active):
+                break
+            hits = self._cast(origin[active], rays[active])
         return colour, through
 
     def _shade(self, hits: _Hits, origin: np.ndarray, rays: np.ndarray, footprint: np.ndarray):
         """Return the diffuse radiance (n, 3), the reflected radiance (n, 3) and the opacity (n,) of hits."""
         albedo, opacity = self._albedo(hits.face, hits.weights, footprint)
-        view = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        corners = self._corners[hits.face]
-        flat = flat_normals(corners)
-        flat *= -np.sign((flat * view).sum(1, keepdims=True))
-        normal = np.einsum("nk,nkd->nd", hits.weights, self.mesh.normals[hits.face])
-        normal *= np.where((normal * flat).sum(1, keepdims=True) < 0, -1, 1)
+        view = unit(rays)
+        flat = self._flat[hits.face]
+        flat *= -np.sign(_dot(flat, view))[:, None]
+        normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
+        normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         normal = unit(normal)
-        facing = -(normal * view).sum(1, keepdims=True)
-        normal = unit(normal + np.maximum(0.02 - facing, 0) * -view)  # visible points do not face away
-        facing = np.maximum(-(normal * view).sum(1), 0.02)
+        hidden = np.flatnonzero(_dot(normal, view) > -0.02)  # visible points do not face away
+        normal[hidden] -= (0.02 + _dot(normal[hidden], view[hidden]))[:, None] * view[hidden]
+        normal[hidden] = unit(normal[hidden])
+        facing = np.maximum(-_dot(normal, view), 0.02)
         point = origin + hits.distance[:, None] * rays + 2e-3 * flat
 
         light = self.room.light.astype(np.float32)
-        lit = self._light_visibility(point) * ((flat @ light) > 0)
-        key = np.maximum(normal @ light, 0) * lit
+        key = np.maximum(normal @ light, 0) * ((flat @ light) > 0)
+        lit = np.flatnonzero(key)
+        key[lit] *= self._light_visibility(point[lit])
         around, unblocked = self._ambient(point, normal, flat)
         diffuse = key[:, None] * self.room.light_colour.astype(np.float32) + around
 
@@ -257,7 +283,7 @@ class MeshScene:
         f0 = specular[:, None] * (1 - metallic) + albedo * metallic
         fresnel = f0 + (np.maximum(1 - roughness[:, None], f0) - f0) * ((1 - facing) ** 5)[:, None]
         half = unit(light - view)
-        highlight = _ggx(np.maximum((normal * half).sum(1), 0), facing, np.maximum(normal @ light, 0), roughness,
+        highlight = _ggx(np.maximum(_dot(normal, half), 0), facing, np.maximum(normal @ light, 0), roughness,
                          self.room.light_radius)  # fmt: skip
         reflected = view + 2 * facing[:, None] * normal
         mirror = self.lighting.reflection(reflected, roughness) * unblocked[:, None]
@@ -267,12 +293,18 @@ class MeshScene:
     def _albedo(self, face: np.ndarray, weights: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return linear colours and opacities of surface points; `footprint` is the width of a sample, in units."""
         material = self.mesh.material[face]
-        albedo = self._tint[material] * srgb_to_linear(np.einsum("nk,nkd->nd", weights, self.mesh.colours[face]))
+        albedo = self._tint[material]
+        if self._coloured:
+            albedo *= srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
         opacity = self._opacity[material].copy()
         for index, texture in enumerate(self._textures):
-            if texture is None or not len(on := np.flatnonzero(material == index)):
+            on = np.flatnonzero(material == index)
+            if len(on) and (pattern := self.mesh.materials[index].pattern):
+                points = _interpolated(weights[on], self._coordinates[face[on]])
+                albedo[on] *= srgb_to_linear(pattern(points))
+            if texture is None or not len(on):
                 continue
-            uv = np.einsum("nk,nkd->nd", weights[on], self.mesh.uv[face[on]])
+            uv = _interpolated(weights[on], self.mesh.uv[face[on]])
             texels = footprint[on] * self._texel_density[face[on]]
             sample = sample_image(texture, uv[:, 0], 1 - uv[:, 1], texels, cv2.BORDER_WRAP)
             albedo[on] *= _LINEAR[np.clip(sample[:, :3], 0, 255).astype(np.uint8)]
@@ -289,8 +321,8 @@ class MeshScene:
         material = self.mesh.material[face]
         for index in np.flatnonzero(self._holes):
             if len(on := np.flatnonzero(material == index)):
-                uv = np.einsum("nk,nkd->nd", weights[on], self.mesh.uv[face[on]])
-                sample = sample_image(self._textures[index], uv[:, 0], 1 - uv[:, 1], np.ones(len(on)), cv2.BORDER_WRAP)
+                uv = _interpolated(weights[on], self.mesh.uv[face[on]])
+                sample = sample_image(self._textures[index], uv[:, 0], 1 - uv[:, 1], None, cv2.BORDER_WRAP)
                 opacity[on] = sample[:, 3] / 255
         return opacity
 
@@ -340,7 +372,8 @@ class MeshScene:
         below = (directions * flat[:, None]).sum(-1) <= 0
         blocked = self._blocked(point, directions)
         blocked = np.where(below, 1, blocked)
-        light = self.lighting.towards(np.repeat(point, directions.shape[1], axis=0), directions.reshape(-1, 3))
+        origin = np.repeat(point - self._origin, directions.shape[1], axis=0)
+        light = self.lighting.towards(origin, directions.reshape(-1, 3), self.shadow)
         light = light.reshape(*directions.shape)
         radiance = light * (1 - blocked[..., None]) + blocked[..., None] * (_BLOCKED * self.lighting.mean)
         return radiance.mean(1), 1 - blocked.mean(1)
@@ -352,7 +385,7 @@ class MeshScene:
         half = reach + min(
             tall * max(float(np.linalg.norm(self.room.light[:2]) / max(self.room.light[2], 0.3)), 0.8), 5.0
         )
-        n = _SHADOW_MAP
+        n = self.quality.shadow_map
         axis = (np.arange(n, dtype=np.float32) + 0.5) / n * 2 * half - half
         x, y = np.meshgrid(axis, axis)
         point = np.stack([x, y, np.full_like(x, 2e-3)], -1).reshape(-1, 3) + self._origin
@@ -376,14 +409,15 @@ class MeshScene:
 
     # Background
 
-    def _background(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    def _background(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance (h, w, 3) of the room without the object, and the depth (h, w) of the floor."""
         height, width = camera.size
-        rays = _pixel_rays(camera, (0, 0, height, width), 1).reshape(-1, 3)
-        origin = np.broadcast_to(camera.centre.astype(np.float32), rays.shape)
-        radiance, floor_depth = self.lighting.radiance(origin, rays, 1 / camera.focal_length.mean(), reflections=True)
+        eye = camera.centre - self._origin
+        radiance, floor_depth = self.lighting.radiance(
+            eye, rays.reshape(-1, 3), 1 / camera.focal_length.mean(), self.shadow
+        )
         radiance, floor_depth = radiance.reshape(height, width, 3), floor_depth.reshape(height, width)
-        focus = float(np.linalg.norm(camera.centre - self._origin))
+        focus = float(np.linalg.norm(eye))
         far = np.where(floor_depth > 0, floor_depth, 3 * focus)
         amount = np.clip(np.abs(1 - focus / np.maximum(far, 1e-3)) * 1.8 - 0.2, 0, 1).astype(np.float32)[..., None]
         sigma = self.room.camera.defocus * min(height, width) / 256
@@ -396,9 +430,18 @@ def _pixel_rays(camera: Camera, box: tuple[int, int, int, int], n: int) -> Float
     top, left, bottom, right = box
     x = left + (np.arange((right - left) * n) + 0.5) / n
     y = top + (np.arange((bottom - top) * n) + 0.5) / n
-    x, y = np.meshgrid((x - camera.principal_point[0]) / camera.focal_length[0],
-                       (y - camera.principal_point[1]) / camera.focal_length[1])  # fmt: skip
-    return (np.stack([x, y, np.ones_like(x)], -1) @ camera.R).astype(np.float32)
+    x = (x - camera.principal_point[0]) / camera.focal_length[0]
+    y = (y - camera.principal_point[1]) / camera.focal_length[1]
+    return (x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])).astype(np.float32)
+
+
+def _interpolated(weights: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 c"]) -> Float[np.ndarray, "n c"]:
+    """Return values at surface points from those at the corners of their faces."""
+    return np.einsum("nk,nkc->nc", weights, corners)
+
+
+def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    return np.einsum("nd,nd->n", one, other)
 
 
 def _ggx(cos_half, cos_view, cos_light, roughness, light_radius: float) -> np.ndarray:

@@ -53,37 +53,43 @@ def pyramid(image: np.ndarray) -> list[np.ndarray]:
 
 
 def sample_image(
-    levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, texels: np.ndarray, border: int, fill=0
+    levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, texels: np.ndarray | None, border: int, fill=0
 ) -> Float[np.ndarray, "n c"]:
     """Look up points (u, v) in [0, 1] (v from the top) by bilinear interpolation in the level of fitting resolution.
 
     Args:
         levels: Image pyramid.
         u, v: Points (n,).
-        texels: Texels of the finest level that a sample covers (n,).
+        texels: Texels of the finest level that a sample covers (n,). Default: one.
         border: OpenCV's rule outside the image; BORDER_WRAP repeats it.
         fill: Value outside the image for BORDER_CONSTANT.
     """
     if border == cv2.BORDER_WRAP:
         u, v = u % 1, v % 1
-    level = np.clip(np.rint(np.log2(np.maximum(texels, 1))), 0, len(levels) - 1).astype(int)
+    if texels is None:
+        return _bilinear(levels[0], u, v, border, fill)
+    level = np.clip(np.rint(np.log2(np.maximum(texels, 1))), 0, len(levels) - 1).astype(np.int8)
     result = np.empty((len(u), levels[0].shape[2]), np.float32)
-    for index in np.unique(level):
+    for index in np.flatnonzero(np.bincount(level)):
         on = np.flatnonzero(level == index)
-        image = levels[index]
-        height, width = image.shape[:2]
-        x, y = (u[on] * width - 0.5).astype(np.float32), (v[on] * height - 0.5).astype(np.float32)
-        fold = 4096  # OpenCV's limit of rows and columns is 32767
-        padding = -len(on) % fold
-        grid = (np.pad(x, (0, padding)).reshape(-1, fold), np.pad(y, (0, padding)).reshape(-1, fold))
-        found = cv2.remap(image, *grid, cv2.INTER_LINEAR, borderMode=border, borderValue=fill)
-        result[on] = found.reshape(-1, levels[0].shape[2])[: len(on)]
+        result[on] = _bilinear(levels[index], u[on], v[on], border, fill)
     return result
+
+
+def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray, border: int, fill) -> np.ndarray:
+    if not len(u):
+        return np.empty((0, image.shape[2]), np.float32)
+    height, width = image.shape[:2]
+    x, y = (u * width - 0.5).astype(np.float32), (v * height - 0.5).astype(np.float32)
+    fold = 4096  # OpenCV's limit of rows and columns is 32767
+    padding = -len(u) % fold
+    grid = (np.pad(x, (0, padding)).reshape(-1, fold), np.pad(y, (0, padding)).reshape(-1, fold))
+    found = cv2.remap(image, *grid, cv2.INTER_LINEAR, borderMode=border, borderValue=fill)
+    return found.reshape(-1, image.shape[2])[: len(u)].astype(np.float32, copy=False)
 
 
 def look_up(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return the radiance of a panorama (rows from +z down) in directions (n, 3), bilinearly."""
-    directions = unit(directions)
-    v = np.arccos(np.clip(directions[:, 2], -1, 1)) / np.pi
-    u = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1
-    return sample_image([panorama], u, v, np.ones(len(u)), cv2.BORDER_WRAP)
+    x, y, z = directions.T
+    u, v = np.arctan2(y, x) / np.float32(2 * np.pi), np.arctan2(np.hypot(x, y), z) / np.float32(np.pi)
+    return sample_image([panorama], u, v, None, cv2.BORDER_WRAP)

@@ -1,16 +1,19 @@
 """Rendered sequences: a hand-held camera moves once around an object."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.appearance import random_appearance
-from zsp_lite.synthetic.assembly import Shape
+from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
-from zsp_lite.synthetic.render import Rendering, Scene, orbit_pose
+from zsp_lite.synthetic.raytracing import MeshScene, Quality
+from zsp_lite.synthetic.render import Rendering, orbit_pose
+from zsp_lite.synthetic.room import random_room
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
@@ -35,6 +38,15 @@ class RenderedSequence:
     def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map canonical object coordinates to world coordinates."""
         return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Renders a mesh from several cameras, for instance `render_views`."""
+
+    def __call__(self, mesh: TexturedMesh, cameras: Sequence[Camera], rng: np.random.Generator) -> Iterable[Rendering]:
+        """Return one rendering per camera; the cameras map from the coordinates of the mesh."""
+        ...
 
 
 def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
@@ -90,35 +102,52 @@ def handheld_sweep(
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
 
-def render_sequence(shape: Shape, seed: int | np.random.Generator, frames: int, image_size: int) -> RenderedSequence:
-    """Render views around an object; the same seed gives the same pictures.
-
-    The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
-    There is always a floor, because structure from motion needs a static background.
+def render_views(
+    mesh: TexturedMesh, cameras: Sequence[Camera], rng: np.random.Generator, quality: Quality = Quality()
+) -> Iterable[Rendering]:
+    """Render a mesh in a random room with the ray-casting renderer, see `zsp_lite.synthetic.raytracing`.
 
     Args:
-        shape: Object.
+        mesh: Mesh in canonical coordinates.
+        cameras: Cameras that map from these coordinates.
+        rng: Source of the room and of the noise.
+        quality: Numbers of rays.
+    """
+    scene = MeshScene(mesh, random_room(rng), quality, int(rng.integers(2**32)))
+    return [scene.render(camera, rng) for camera in cameras]
+
+
+def render_sequence(
+    mesh: TexturedMesh,
+    seed: int | np.random.Generator,
+    frames: int,
+    image_size: int,
+    renderer: Renderer = render_views,
+) -> RenderedSequence:
+    """Render views around an object; the same seed gives the same cameras.
+
+    The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
+
+    Args:
+        mesh: Object in canonical coordinates.
         seed: Seed or source of the draws.
         frames: Number of views.
         image_size: Shorter image side in pixels.
+        renderer: Makes the pictures and their geometry.
 
     Returns:
-        The exact views, without sensor errors other than pixel noise.
+        The exact views.
     """
     rng = np.random.default_rng(seed)
-    scene = Scene(shape)
-    appearance = replace(random_appearance(rng), has_ground=True)
-    cameras = handheld_sweep(scene.vertices, rng, frames, image_shape(image_size, rng))
+    cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
     rounded = partial(np.round, decimals=9)
     views = []
-    for camera in cameras:
-        exposed = replace(appearance, gain=appearance.gain * np.exp(rng.normal(0, 0.02)))
-        view = scene.render(camera, exposed, rng)
-        pose = rounded(camera.matrix @ to_object) + 0.0  # no negative zeros
-        views.append(replace(view, camera=replace(camera, R=pose[:3, :3], t=pose[:3, 3])))
+    for view in renderer(mesh, cameras, rng):
+        pose = rounded(view.camera.matrix @ to_object) + 0.0  # no negative zeros
+        views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
     return RenderedSequence(tuple(views), tuple(seconds.tolist()), rounded(first), 1.0)
 

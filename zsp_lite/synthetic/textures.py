@@ -1,5 +1,7 @@
 """Procedural textures of floors, which repeat without seams; sRGB colours in [0, 1] unless stated otherwise."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +13,10 @@ Texture = Float[np.ndarray, "n n 3"]
 def srgb_to_linear(colour) -> np.ndarray:
     """Convert sRGB colours in [0, 1] to linear ones."""
     colour = np.asarray(colour, np.float32)
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    if not colour.size:
+        return colour
+    curve = cv2.pow((colour.reshape(-1, 1) + np.float32(0.055)) / np.float32(1.055), 2.4).reshape(colour.shape)
+    return np.where(colour <= 0.04045, colour / np.float32(12.92), curve)
 
 
 def periodic_noise(
@@ -21,12 +26,17 @@ def periodic_noise(
 
     A `stretch` of (1, 8) makes structures eight times as long along the columns.
     """
+    spectrum = np.fft.rfft2(rng.standard_normal(size, np.float32)) * _amplitude(size, slope, stretch)
+    noise = np.fft.irfft2(spectrum, size)
+    return (noise / noise.std()).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _amplitude(size: tuple[int, int], slope: float, stretch: tuple[float, float]) -> np.ndarray:
     fy, fx = np.fft.fftfreq(size[0])[:, None] * size[0], np.fft.rfftfreq(size[1]) * size[1]
     frequency = np.hypot(fy * stretch[0], fx * stretch[1])
     frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.standard_normal(size, np.float32)) * frequency**-slope
-    noise = np.fft.irfft2(spectrum, size)
-    return (noise / noise.std()).astype(np.float32)
+    return (frequency**-slope).astype(np.float32)
 
 
 def hsv(hue: float, saturation: float, value: float) -> np.ndarray:

@@ -9,12 +9,12 @@ from jaxtyping import Float, UInt8
 from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_arrays
-from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import make_shape
-from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
+from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.renders import SEED_STRIDE
 from zsp_lite.training.shards import render_shards
+from zsp_lite.training.views import render_view
 
 SIZE = 128  # of a crop, pixels
 VIEWS = 4  # per object
@@ -48,7 +48,7 @@ class ObjectCrops:
 
 
 def render_object(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one object of a random training category from `VIEWS` sides, each view with its own appearance.
+    """Render one object of a random training category from `VIEWS` sides, each view with its own materials and room.
 
     Args:
         seed: Number of the object.
@@ -59,13 +59,12 @@ def render_object(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng([seed, 2])
     generators = list(TRAINING.values())
     shape = make_shape(generators[rng.integers(len(generators))], [seed, 3])
-    scene = Scene(shape)
     rows = []
     for view in range(VIEWS):
         azimuth = 2 * np.pi * (view + rng.uniform()) / VIEWS
-        R, t = orbit_pose(azimuth, rng.uniform(0.05, 0.8), rng.normal(0, 0.08), rng.uniform(5, 10), scene.centre)
-        camera = framed_camera(scene.vertices, R, t, _RENDER_SIZE, 1.3)
-        image = scene.render(camera, random_appearance(rng), rng)
+        R, t = orbit_pose(azimuth, rng.uniform(0.05, 0.8), rng.normal(0, 0.08), rng.uniform(5, 10), np.zeros(3))
+        camera = framed_camera(shape.vertices, R, t, _RENDER_SIZE, 1.3)
+        image = render_view(shape, camera, rng)
         crop = crop_to_object(Frame(image.rgb, None, image.mask.astype(np.float32), camera))
         height, width = crop.camera.size
         rows.append((resize_frame(crop, (SIZE, SIZE)).rgb, width / height, R))
@@ -92,7 +91,7 @@ def object_crops(folder: str | Path, objects: int, seed: int = 0, workers: int =
     shard = min(SHARD, objects)
     shards = {}
     for start in range(0, objects, shard):
-        path = folder / f"object-crops-{seed}-{start:06d}-{start + shard:06d}.npz"
+        path = folder / f"crops-{seed}-{start:06d}-{start + shard:06d}.npz"
         shards[path] = range(seed * SEED_STRIDE + start, seed * SEED_STRIDE + start + shard)
     render_shards(render_object, shards, ARRAYS, workers)
     columns = zip(*(read_arrays(path, ARRAYS, "crops") for path in shards), strict=True)

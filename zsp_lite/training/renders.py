@@ -9,11 +9,11 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_arrays
-from zsp_lite.synthetic.appearance import random_appearance
 from zsp_lite.synthetic.assembly import Shape, deform, make_shape, make_variant
-from zsp_lite.synthetic.render import Scene, framed_camera, orbit_pose
+from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
 from zsp_lite.training.shards import render_shards
+from zsp_lite.training.views import render_view
 
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels
@@ -55,7 +55,7 @@ def render_object(
     reference and the nearest of a few target views, and never more than two views of different pairs.
 
     Each view shows another instance of the same build: with other proportions (`make_variant`), deformed (`deform`),
-    sometimes without one of its parts, with its own materials, light and background.
+    sometimes without one of its parts, with its own materials and room.
 
     Args:
         seed: Number of the object.
@@ -77,14 +77,14 @@ def render_object(
     for view in range(VIEWS):
         if view % 2 == 0:
             azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
-            elevation = rng.uniform(-0.05, 0.9)
-        scene = _altered(shape, make_variant(generator, [seed, 1], rng, proportions), rng, deformation)
+            elevation = rng.uniform(0, 0.9)
+        seen, vertices = _altered(shape, make_variant(generator, [seed, 1], rng, proportions), rng, deformation)
         R, t = orbit_pose(
-            azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), -0.1, 1.1), rng.normal(0, 0.1),
-            rng.uniform(5, 10), scene.centre,
+            azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1), rng.normal(0, 0.1),
+            rng.uniform(5, 10), (vertices.max(0) + vertices.min(0)) / 2,
         )  # fmt: skip
-        camera = framed_camera(scene.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
-        image = scene.render(camera, random_appearance(rng), rng, shadows=rng.random() < 0.6)
+        camera = framed_camera(vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
+        image = render_view(seen, camera, rng, vertices)
         every = (slice(step // 2, None, step),) * 2
         depth, mask = image.depth[every], image.mask[every]
         spread = max(float(depth[mask].std()), 1e-6)
@@ -94,8 +94,10 @@ def render_object(
     return rgb, surface, geometry
 
 
-def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation: float) -> Scene:
-    """Make a scene of a deformed `sibling` in which each pixel has the surface coordinates of `shape`."""
+def _altered(
+    shape: Shape, sibling: Shape, rng: np.random.Generator, deformation: float
+) -> tuple[Shape, Float[np.ndarray, "v 3"]]:
+    """Return `shape` without some of its parts, and the vertices of its deformed `sibling`."""
     if not np.array_equal(shape.faces, sibling.faces):
         raise ValueError("the variant of an object has other parts than the object")
     vertices = deform(sibling, rng, deformation)
@@ -103,7 +105,7 @@ def _altered(shape: Shape, sibling: Shape, rng: np.random.Generator, deformation
     size = np.bincount(part)
     gone = (rng.random(len(size)) < 0.06) & (size < 0.3 * len(part))
     kept = ~gone[part]
-    return Scene(replace(shape, faces=shape.faces[kept], material=shape.material[kept]), vertices)
+    return replace(shape, faces=shape.faces[kept], material=shape.material[kept]), vertices
 
 
 def render_set(
@@ -135,7 +137,7 @@ def render_set(
     shard = min(SHARD, objects) if shard is None else shard
     shards = {}
     for start in range(first, first + objects, shard):
-        name = f"objects-{seed}-{start:06d}-{start + shard:06d}-{proportions:g}-{deformation:g}.npz"
+        name = f"views-{seed}-{start:06d}-{start + shard:06d}-{proportions:g}-{deformation:g}.npz"
         shards[folder / name] = range(seed * SEED_STRIDE + start, seed * SEED_STRIDE + start + shard)
     render = partial(render_object, proportions=proportions, deformation=deformation)
     render_shards(render, shards, ARRAYS, workers)

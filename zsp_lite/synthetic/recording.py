@@ -1,0 +1,109 @@
+"""Recording of one object as a sequence of a data folder, with object pose, labels and evaluation pairs."""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from zsp_lite.data.annotations import decode
+from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
+from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.synthetic.meshes import TexturedMesh
+from zsp_lite.synthetic.sensor import simulate_capture
+from zsp_lite.synthetic.sequences import RenderedSequence, Renderer, render_sequence, render_views
+
+POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
+JPEG_QUALITY = 88
+
+
+@runtime_checkable
+class Sensor(Protocol):
+    """Converts exact renderings to recorded frames, for instance `zsp_lite.synthetic.sensor.simulate_capture`."""
+
+    def __call__(
+        self, sequence: RenderedSequence, name: str, seed: np.random.Generator
+    ) -> tuple[SequenceData, RenderedSequence]:
+        """Return the recorded sequence, and the exact one in the same unit."""
+        ...
+
+
+def stable_hash(seed: int, category: str, item: int | str) -> int:
+    """Return a 64-bit hash that is the same on every machine and in every process."""
+    return int.from_bytes(hashlib.sha256(f"{seed}/{category}/{item}".encode()).digest()[:8], "big")
+
+
+def record_sequence(
+    mesh: TexturedMesh,
+    name: str,
+    key: int,
+    frames: int,
+    image_size: int,
+    renderer: Renderer = render_views,
+    sensor: Sensor = simulate_capture,
+) -> tuple[SequenceData, RenderedSequence]:
+    """Render an object and simulate the sensor.
+
+    Args:
+        mesh: Object in canonical coordinates.
+        name: Name of the sequence.
+        key: Seed of room, cameras and noise.
+        frames: Number of frames.
+        image_size: Shorter image side in pixels.
+        renderer: Makes the pictures and their geometry.
+        sensor: Makes depth, masks and point cloud from the exact renderings.
+
+    Returns:
+        The recorded sequence, and the exact one in the same unit.
+    """
+    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, renderer)
+    return sensor(exact, name, np.random.default_rng([key, 2]))
+
+
+def write_sequence(
+    out: Path,
+    category: str,
+    mesh: TexturedMesh,
+    recorded: tuple[SequenceData, RenderedSequence],
+    intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
+) -> None:
+    """Add a recorded sequence, with the pose and the bounding box of its object, to a data folder.
+
+    Annotations are written last: a sequence with annotations is complete.
+    """
+    data, exact = recorded
+    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
+    poses = read_poses(out, category)
+    poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
+    write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
+    write_co3d(out, category, [data], quality=JPEG_QUALITY, intrinsics_format=intrinsics_format)
+
+
+def read_poses(out: Path, category: str) -> dict:
+    """Return the entries of a category's file of object poses by sequence; empty without the file."""
+    path = out / category / POSES_FILE
+    return decode(read_bytes(path, "object poses"), dict, path) if path.is_file() else {}
+
+
+def write_labels(out: Path, category: str, names: Iterable[str]) -> None:
+    """Write the pose labels of sequences from their object poses; the first name is the reference."""
+    poses = {name: np.array(pose["trans"]) for name, pose in read_poses(out, category).items()}
+    reference, *others = names
+    write_label(out, category, PoseLabel(np.eye(4), reference, reference))
+    for name in others:
+        # Rounded, to be equal on all processors, and without negative zeros.
+        trans = np.round(poses[name] @ np.linalg.inv(poses[reference]), 12) + 0.0
+        write_label(out, category, PoseLabel(trans, name, reference))
+
+
+def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], seed: int) -> None:
+    """Sample evaluation pairs, a file per number of target views, in the format of the published evaluation."""
+    dataset = Co3D(out)
+    for n_targets in targets:
+        sampled = sample_pairs(dataset, category, pairs, n_targets, seed)
+        write_upstream_pairs(upstream_pairs_path(out, category, pairs, n_targets), sampled, dataset)

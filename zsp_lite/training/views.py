@@ -1,0 +1,47 @@
+"""Single views of procedural objects for training, rendered with few rays in a fixed set of rooms."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from zsp_lite.data.cameras import Camera
+from zsp_lite.synthetic.assembly import Shape
+from zsp_lite.synthetic.lighting import RoomLight
+from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.raytracing import FASTEST, MeshScene
+from zsp_lite.synthetic.render import Rendering
+from zsp_lite.synthetic.room import random_room
+
+ROOMS = 32  # a room takes ten times as long as a view
+
+
+def render_view(
+    shape: Shape, camera: Camera, rng: np.random.Generator, vertices: Float[np.ndarray, "v 3"] | None = None
+) -> Rendering:
+    """Render one view of an object with random materials in one of `ROOMS` rooms, which is turned at random.
+
+    Args:
+        shape: Object.
+        camera: Camera; maps from the coordinates of the vertices.
+        rng: Source of the draws.
+        vertices: Vertices of a deformed copy, which is rendered instead. The object coordinates of the view remain
+            those of `shape`.
+    """
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    vertices = shape.vertices if vertices is None else vertices
+    mesh = with_materials(shape, random_materials(rng), vertices @ turn.T)
+    scene = MeshScene(mesh, _room(int(rng.integers(ROOMS))), FASTEST, coordinates=shape.vertices)
+    view = scene.render(replace(camera, R=camera.R @ turn.T), rng)
+    return replace(view, camera=camera)
+
+
+@lru_cache(maxsize=ROOMS)
+def _room(index: int) -> RoomLight:
+    """Return a room in half the resolution, to save memory."""
+    room = random_room(index)
+    halves = (cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in room.images)
+    return RoomLight(replace(room, images=tuple(halves)))
