@@ -149,7 +149,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 @click.option(
     "--preset", metavar="NAME",
     help="samples, eval, or paper: 20 categories of 10 sequences of 100 frames, about "
-    "half an hour and 1.4 GB. An existing folder is completed.",
+    "an hour and a half and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(
     "--category", "categories", multiple=True, metavar="NAME",
