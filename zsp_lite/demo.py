@@ -17,8 +17,8 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.synthetic.recording import POSES_FILE
 from zsp_lite.synthetic.ground_truth import object_poses
+from zsp_lite.synthetic.recording import POSES_FILE
 
 N_TARGETS = 5
 _SEQUENCE_FRAMES = 6
