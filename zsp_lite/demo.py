@@ -11,7 +11,13 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.data.samples import PHOTOGRAPH_CATEGORY, PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, motorcycle_photograph
+from zsp_lite.data.samples import (
+    PHOTOGRAPH_CATEGORY,
+    PHOTOGRAPH_FRONT,
+    PHOTOGRAPH_TARGET,
+    PHOTOGRAPH_UP,
+    motorcycle_photograph,
+)
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
@@ -139,7 +145,8 @@ def run_photograph(
     Args:
         dataset: Data folder. Without a category of synthetic motorcycles there is no result.
         backbone: Computes the features.
-        sequence: Sequence of the synthetic motorcycle; by default the first, independently of its result.
+        sequence: Sequence of the synthetic motorcycle; by default `samples.PHOTOGRAPH_TARGET`, or the first of other
+            data. Both are independent of the results.
 
     Yields:
         One result for each of `PHOTOGRAPH_FOREGROUNDS` and `PHOTOGRAPH_SOLVERS`.
@@ -150,7 +157,7 @@ def run_photograph(
     if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
         return
     poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
-    sequence = sequence or min(poses)
+    sequence = sequence or (PHOTOGRAPH_TARGET if PHOTOGRAPH_TARGET in poses else min(poses))
     frames = dataset.frames(PHOTOGRAPH_CATEGORY, sequence)
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
     photograph, pose = motorcycle_photograph(), poses[sequence]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 DATA_VARIABLE = "ZSP_LITE_DATA"  # environment variable with the path of the user's CO3D folder
 REPOSITORY = Path(__file__).resolve().parents[2]
 
-PHOTOGRAPH_CATEGORY = "motorcycle"
+PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
 # judged by eye from the rear wheel, since the front wheel is turned, and may be wrong by 10 degrees. Up is the normal
 # of the floor; the motorcycle leans on its side stand by a few degrees.
