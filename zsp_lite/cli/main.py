@@ -29,6 +29,7 @@ SYNTHETIC_NOTE = (
     "synthetic objects, composed of primitives by zsp_lite.synthetic and rendered with depth holes and soft masks "
     "as in CO3D; no photographs."
 )
+MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D; no photographs."
 USER_NOTE = "the given folder in CO3D's layout."
 
 
@@ -102,12 +103,14 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo, run_photograph
     from zsp_lite.synthetic.export import SETTINGS_FILE
+    from zsp_lite.synthetic.model_export import RENDERED_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
     from zsp_lite.viz.report import table_row, write_overview, write_report
 
     console = Console()
     folder = data or sample_data()
-    note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
+    notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
+    note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     dataset, model = Co3D(folder), load_backbone(backbone_config(**backbone))
     out.mkdir(parents=True, exist_ok=True)
     name = getattr(model, "name", backbone["backbone"])
