@@ -7,7 +7,7 @@ RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks browser exercises doctor clean
+.PHONY: help demo test check lint format lab notebooks browser exercises doctor render-env clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -20,6 +20,7 @@ help:
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
+	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1.3 GB)"
 	@echo "make clean      remove .venv, caches and outputs/"
 	@echo "PYTHON=/path/to/python3.12 make demo   chooses the interpreter (3.11 or newer)"
 
@@ -75,6 +76,13 @@ exercises: $(STAMP)
 
 doctor: $(STAMP)
 	$(RUN) -m zsp_lite doctor
+
+# Blender's module (GPL) needs Python 3.11 and numpy below 2: an environment of its own.
+render-env:
+	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "Blender's module bpy 5.0.1 needs Python 3.11; '$(PYTHON)' is another one (set PYTHON=/path/to/python3.11)" >&2; exit 1; }
+	"$(PYTHON)" -m venv .render-env
+	.render-env/bin/python -m pip install --disable-pip-version-check bpy==5.0.1
 
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .hypothesis *.egg-info

@@ -107,10 +107,10 @@ def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_make_target_that_is_named_exists(page):
-    targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
     commands = [*_INLINE_CODE.findall(markdown(page)), *command_blocks(page)]
     for command in commands:
-        if words := re.findall(r"(?:^|\s)make ([a-z]+)", command):
+        if words := re.findall(r"(?:^|\s)make ([a-z-]+)", command):
             assert set(words) <= targets, command
 
 
@@ -127,7 +127,7 @@ def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
     runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
     assert runs == {"test": ["make test"], "avx2": ["make test"], "browser": ["make browser"]}
     assert jobs["avx2"]["env"] == {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
-    assert {"test", "browser"} <= set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    assert {"test", "browser"} <= set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
     assert (REPOSITORY / ".ci" / "run").read_text().endswith("exec make test\n")
 
 

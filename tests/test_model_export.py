@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from model_files import write_quad, write_wedge
@@ -158,6 +159,21 @@ def test_a_renderer_and_a_sensor_of_the_user_take_the_place_of_the_own_ones(fold
     dataset = Co3D(tmp_path)
     frame = dataset.load(dataset.frames("chair", "high")[1])
     assert frame.rgb.max() < 5 and set(np.unique(frame.mask)) == {0, 1}
+
+
+def test_landscape_pictures_and_coarse_depth_are_settings_of_an_export(folder, tmp_path):
+    for out, settings in (("fine", {}), ("coarse", {"landscape": True, "depth_bits": 6})):
+        export_models(folder, tmp_path / out, frames=1, image_size=SIZE, renderer=quick, **settings)
+    stored = {out: sorted((tmp_path / out).rglob("depths/*.png")) for out in ("fine", "coarse")}
+    dataset = Co3D(tmp_path / "coarse")
+    for annotation in (frame for s in dataset.sequences("chair") for frame in dataset.frames("chair", s.sequence_name)):
+        assert dataset.load(annotation).rgb.shape == (SIZE, 85, 3)
+    assert all(not (cv2.imread(str(path), -1) & 0b1111).any() for path in stored["coarse"])
+    assert any((cv2.imread(str(path), -1) & 0b1111).any() for path in stored["fine"])
+    with pytest.raises(InputError, match="was written with .*depth_bits"):
+        export_models(folder, tmp_path / "coarse", frames=1, image_size=SIZE, renderer=quick)
+    with pytest.raises(InputError, match="depth_bits is 11, expected an integer from 1 to 10"):
+        export_models(folder, tmp_path / "other", depth_bits=11)
 
 
 def test_cameras_do_not_depend_on_the_renderer(folder):

@@ -19,7 +19,7 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import read_upstream_pairs, upstream_pairs_path
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import evaluation_categories, export, training_categories, validation_categories
-from zsp_lite.synthetic.assembly import make_shape, surface_spread
+from zsp_lite.synthetic.assembly import N_MATERIALS, make_shape, surface_spread
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.export import (
     GENERATORS,
@@ -29,6 +29,7 @@ from zsp_lite.synthetic.export import (
     make_sequence,
     sequence_name,
 )
+from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.recording import write_pairs
 from zsp_lite.synthetic.sensor import soft_mask
 from zsp_lite.synthetic.sequences import handheld_sweep, rescaled
@@ -141,6 +142,21 @@ def test_front_and_back_of_an_object_differ(category):
     turned = shape.vertices * [-1, -1, 1]
     nearest = np.linalg.norm(shape.vertices[:, None] - turned[None, ::3], axis=-1).min(0)
     assert nearest.max() > 0.2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_materials_are_valid_and_depend_on_the_seed_alone(seed):
+    points = np.random.default_rng(0).normal(0, 1, (500, 3)).astype(np.float32)
+    first, again = random_materials(seed), random_materials(seed)
+    assert len(first) == N_MATERIALS
+    for material, other in zip(first, again, strict=True):
+        assert 0 <= material.specular <= 1 and 0 < material.roughness <= 1 and material.metallic in (0, 1)
+        assert (material.colour == other.colour).all() and material.colour[3] == 1
+        if material.pattern:
+            colours = material.pattern(points)
+            assert colours.min() >= 0 and colours.max() <= 1 and np.ptp(colours, axis=0).max() > 0
+            assert (colours == other.pattern(points)).all()
+    assert any((one.roughness != two.roughness) for one, two in zip(first, random_materials(seed + 100), strict=True))
 
 
 # Sequences
@@ -372,6 +388,12 @@ def test_bad_arguments_are_input_errors(tmp_path, arguments, named):
 def test_a_folder_with_other_settings_is_an_input_error(folder):
     with pytest.raises(InputError, match="was written with"):
         export_categories(["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
+
+
+def test_a_folder_of_the_former_renderer_is_not_completed(tmp_path):
+    (tmp_path / "synthetic.json").write_text(f'{{"seed": {SEED}, "frames": 2, "image_size": 48, "layout": "v1"}}')
+    with pytest.raises(InputError, match="expected .*'renderer': 2"):
+        export_categories(["chair"], tmp_path, 1, 2, SEED, 48)
 
 
 @pytest.mark.parametrize("name", ["synthetic.json", "chair/object_poses.json"])

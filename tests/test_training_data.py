@@ -186,7 +186,7 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
     shape, factors, offset = make_shape(TRAINING["teapot"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
     camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
-    one, two = (render_view(shape, camera, np.random.default_rng(seed), copy) for seed in (0, 1))
+    one, two = (render_view(0, shape, camera, np.random.default_rng(seed), copy) for seed in (0, 1))
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
     for drawn in (one, two):
         row, col = np.nonzero(drawn.mask)

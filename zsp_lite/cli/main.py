@@ -29,6 +29,7 @@ SYNTHETIC_NOTE = (
     "synthetic objects, composed of primitives by zsp_lite.synthetic and rendered with depth holes and soft masks "
     "as in CO3D; no photographs."
 )
+MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D; no photographs."
 USER_NOTE = "the given folder in CO3D's layout."
 
 
@@ -102,12 +103,14 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo, run_photograph
     from zsp_lite.synthetic.export import SETTINGS_FILE
+    from zsp_lite.synthetic.model_export import RENDERED_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
     from zsp_lite.viz.report import table_row, write_overview, write_report
 
     console = Console()
     folder = data or sample_data()
-    note = SYNTHETIC_NOTE if (folder / SETTINGS_FILE).is_file() else USER_NOTE
+    notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
+    note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     dataset, model = Co3D(folder), load_backbone(backbone_config(**backbone))
     out.mkdir(parents=True, exist_ok=True)
     name = getattr(model, "name", backbone["backbone"])
@@ -144,6 +147,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
         "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
         "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
         "synth --models path/to/models --image-size 320 --out outputs/models",
+        "synth --models path/to/models --engine cycles --image-size 240 --landscape --out outputs/photographs",
     )
 )
 @click.option(
@@ -168,17 +172,35 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     "--image-size", type=click.IntRange(min=32), metavar="PX", show_default="256",
     help="With --models: shorter image side in pixels.",
 )  # fmt: skip
+@click.option(
+    "--engine",
+    type=click.Choice(["raycasting", "cycles"]),
+    default="raycasting",
+    show_default=True,
+    help="With --models: the renderer. cycles traces paths with Blender's module, which `make render-env` installs.",
+)
+@click.option("--landscape", is_flag=True, help="With --models: all pictures are 4:3 landscape.")
+@click.option(
+    "--depth-bits",
+    type=click.IntRange(1, 10),
+    default=10,
+    metavar="N",
+    show_default=True,
+    help="With --models: bits of precision of stored depth; fewer bits make smaller files.",
+)
 @seed_option
 @click.option("--out", type=PATH, metavar="DIR", required=True, help="Folder to write.")
 def synth(
     preset: str | None, categories: tuple[str, ...], models_folder: Path | None, sequences: int | None,
-    frames: int | None, image_size: int | None, seed: int, out: Path,
+    frames: int | None, image_size: int | None, engine: str, landscape: bool, depth_bits: int, seed: int, out: Path,
 ) -> None:  # fmt: skip
     """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files."""
     if bool(preset) + bool(categories) + bool(models_folder) != 1:
         raise click.UsageError("expected either --preset or --category or --models")
     if image_size and not models_folder:
         raise InputError("--image-size goes with --models; --preset and --category fix the size of the images")
+    if (engine != "raycasting" or landscape or depth_bits < 10) and not models_folder:
+        raise InputError("--engine, --landscape and --depth-bits go with --models")
     from tqdm import tqdm
 
     from zsp_lite.synthetic.export import export_categories, export_preset
@@ -189,8 +211,16 @@ def synth(
         from zsp_lite.data.co3d import Co3D
         from zsp_lite.synthetic.model_export import export_models
         from zsp_lite.synthetic.model_sheet import write_contact_sheet, write_label_overlay
+        from zsp_lite.synthetic.path_tracing import path_traced_views, render_python
+        from zsp_lite.synthetic.sequences import render_views
 
-        print_left_out(export_models(models_folder, out, frames or 24, seed, image_size or 256, progress=tqdm))
+        if engine == "cycles":
+            render_python()  # missing: say so before any work
+        left_out = export_models(
+            models_folder, out, frames or 24, seed, image_size or 256, landscape=landscape, depth_bits=depth_bits,
+            renderer=path_traced_views if engine == "cycles" else render_views, progress=tqdm,
+        )  # fmt: skip
+        print_left_out(left_out)
         write_contact_sheet(models_folder, out / "models.html")
         write_label_overlay(out / "label_overlay.jpg", Co3D(out))
     elif preset:

@@ -25,12 +25,23 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> UInt16[np.ndarray, "h w"]:
-    """Encode depth as the bits of float16 values (relative precision 2^-11); the inverse of `decode_depth`."""
+def encode_depth(
+    depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
+) -> UInt16[np.ndarray, "h w"]:
+    """Encode depth as the bits of float16 values; the inverse of `decode_depth`.
+
+    Args:
+        depth: Depth, 0 where unknown.
+        scale_adjustment: Factor applied to the decoded depth.
+        bits: Bits of the mantissa to keep, 1 to 10. The relative precision is 2^-(bits + 1); files with fewer bits
+            are smaller.
+    """
     depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
-    return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
+    encoded = np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
+    step = np.uint16(1 << (10 - bits))
+    return (encoded + step // 2) // step * step
 
 
 def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:

@@ -89,8 +89,8 @@ class RoomLight:
         self.mean = ((radiance * weight).sum((0, 1)) / weight.sum((0, 1))).astype(np.float32)
         above, cosine = polar < np.pi / 2, weight * np.maximum(np.cos(polar), 0).astype(np.float32)[:, None, None]
         # The light from above is that of the room's settings, with the colours and directions of its faces.
-        scale = self.room.ambient.mean() / max(float(((radiance * cosine).sum((0, 1)) / cosine.sum()).mean()), 1e-6)
-        radiance = (radiance * np.where(above[:, None, None], scale, 1)).astype(np.float32)
+        self.gain = self.room.ambient.mean() / max(float(((radiance * cosine).sum((0, 1)) / cosine.sum()).mean()), 1e-6)
+        radiance = (radiance * np.where(above[:, None, None], self.gain, 1)).astype(np.float32)
         # Irradiance by normal: mean radiance of the half space, weighted by the cosine, over every second direction.
         flat = directions.reshape(rows, cols, 3)[::2, ::2].reshape(-1, 3)
         normals = directions.reshape(rows, cols, 3)[2::4, 2::4].reshape(-1, 3)

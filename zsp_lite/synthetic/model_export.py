@@ -60,6 +60,8 @@ def export_models(
     image_size: int = 256,
     renderer: Renderer = render_views,
     sensor: Sensor = simulate_capture,
+    landscape: bool = False,
+    depth_bits: int = 10,
     progress: Callable[[Iterable], Iterable] | None = None,
 ) -> dict[str, str]:
     """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
@@ -76,6 +78,8 @@ def export_models(
         image_size: Shorter image side in pixels.
         renderer: Makes the pictures and their geometry.
         sensor: Makes depth, masks and point cloud from the exact renderings.
+        landscape: Whether all pictures are 4:3 landscape; otherwise each sequence draws its format.
+        depth_bits: Bits of the mantissa of stored depth to keep, 1 to 10. Less precise depth makes smaller files.
         progress: Wraps the loop over models, as tqdm does.
 
     Returns:
@@ -88,8 +92,13 @@ def export_models(
     check_integer("frames", frames, 1)
     check_integer("image_size", image_size, 32)
     check_integer("seed", seed, 0)
+    if not (isinstance(depth_bits, int) and 1 <= depth_bits <= 10):
+        raise InputError(f"depth_bits is {depth_bits!r}, expected an integer from 1 to 10")
     models, out = list_models(folder), Path(out)
-    rendered = _read_rendered(out, {"seed": seed, "frames": frames, "image_size": image_size})
+    settings = {"seed": seed, "frames": frames, "image_size": image_size}
+    settings |= {"landscape": 1} if landscape else {}
+    settings |= {"depth_bits": depth_bits} if depth_bits < 10 else {}
+    rendered = _read_rendered(out, settings)
     left_out = {}
     for model in progress(models) if progress else models:
         record = _record(model, Path(folder))
@@ -102,8 +111,8 @@ def export_models(
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
         key = stable_hash(seed, model.category, model.name)
-        recorded = record_sequence(mesh, model.name, key, frames, image_size, renderer, sensor)
-        write_sequence(out, model.category, mesh, recorded)
+        recorded = record_sequence(mesh, model.name, key, frames, image_size, renderer, sensor, landscape)
+        write_sequence(out, model.category, mesh, recorded, depth_bits=depth_bits)
         # The record is written last; a sequence with a record is complete.
         rendered.sequences.setdefault(model.category, {})[model.name] = record
         write_atomic(out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1))

@@ -97,7 +97,7 @@ class MeshScene:
         self._solid_faces, self._solid_holes = solid, self._holes[mesh.material[solid]].any()
         self.floor = float(mesh.vertices[:, 2].min())
         centre = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
-        self._origin = np.array([centre[0], centre[1], self.floor], np.float32)  # of the room
+        self.origin = np.array([centre[0], centre[1], self.floor], np.float32)  # of the room
         self._corners = mesh.vertices[mesh.faces].astype(np.float32)
         self._flat = flat_normals(self._corners)
         self._coordinates = self._corners if coordinates is None else coordinates[mesh.faces].astype(np.float32)
@@ -144,6 +144,14 @@ class MeshScene:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(rng.normal(0, 0.025)), rng)
         return Rendering(rgb=rgb, camera=camera, **exact)
+
+    def geometry(self, camera: Camera) -> dict:
+        """Return the exact depth, mask, object coordinates and normals of a view, as in `Rendering`."""
+        top, left, bottom, right = self._object_box(camera)
+        rays = _pixel_rays(camera, (0, 0, *camera.size), 1)
+        inside = rays[top:bottom, left:right]
+        hits = self._first_hits(camera, inside.reshape(-1, 3))
+        return self._exact(camera, (top, left), inside, hits, self._background(camera, rays)[1])
 
     def _raycasting(self, o3d, faces: np.ndarray):
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -372,7 +380,7 @@ class MeshScene:
         below = (directions * flat[:, None]).sum(-1) <= 0
         blocked = self._blocked(point, directions)
         blocked = np.where(below, 1, blocked)
-        origin = np.repeat(point - self._origin, directions.shape[1], axis=0)
+        origin = np.repeat(point - self.origin, directions.shape[1], axis=0)
         light = self.lighting.towards(origin, directions.reshape(-1, 3), self.shadow)
         light = light.reshape(*directions.shape)
         radiance = light * (1 - blocked[..., None]) + blocked[..., None] * (_BLOCKED * self.lighting.mean)
@@ -388,7 +396,7 @@ class MeshScene:
         n = self.quality.shadow_map
         axis = (np.arange(n, dtype=np.float32) + 0.5) / n * 2 * half - half
         x, y = np.meshgrid(axis, axis)
-        point = np.stack([x, y, np.full_like(x, 2e-3)], -1).reshape(-1, 3) + self._origin
+        point = np.stack([x, y, np.full_like(x, 2e-3)], -1).reshape(-1, 3) + self.origin
         rays = 1 if self.quality.shadow_rays == 1 else 2 * self.quality.shadow_rays
         key = np.mean([self._light_visibility(point) for _ in range(max(1, rays // self.quality.shadow_rays))], 0)
         key = key.reshape(n, n)
@@ -398,7 +406,7 @@ class MeshScene:
             coarse = np.linspace(-half, half, n // 2 + 1, dtype=np.float32)
             coarse = (coarse[1:] + coarse[:-1]) / 2
             x, y = np.meshgrid(coarse, coarse)
-            point = np.stack([x, y, np.full_like(x, 2e-3)], -1).reshape(-1, 3) + self._origin
+            point = np.stack([x, y, np.full_like(x, 2e-3)], -1).reshape(-1, 3) + self.origin
             blocked = np.zeros(len(point), np.float32)
             for _ in range(3):
                 sets = self._ambient_sets[self._rng.integers(len(self._ambient_sets), size=len(point))]
@@ -412,7 +420,7 @@ class MeshScene:
     def _background(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance (h, w, 3) of the room without the object, and the depth (h, w) of the floor."""
         height, width = camera.size
-        eye = camera.centre - self._origin
+        eye = camera.centre - self.origin
         radiance, floor_depth = self.lighting.radiance(
             eye, rays.reshape(-1, 3), 1 / camera.focal_length.mean(), self.shadow
         )

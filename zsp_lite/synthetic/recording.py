@@ -46,6 +46,7 @@ def record_sequence(
     image_size: int,
     renderer: Renderer = render_views,
     sensor: Sensor = simulate_capture,
+    landscape: bool = False,
 ) -> tuple[SequenceData, RenderedSequence]:
     """Render an object and simulate the sensor.
 
@@ -57,11 +58,12 @@ def record_sequence(
         image_size: Shorter image side in pixels.
         renderer: Makes the pictures and their geometry.
         sensor: Makes depth, masks and point cloud from the exact renderings.
+        landscape: Whether the pictures are 4:3 landscape; otherwise their format is drawn.
 
     Returns:
         The recorded sequence, and the exact one in the same unit.
     """
-    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, renderer)
+    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, renderer, landscape)
     return sensor(exact, name, np.random.default_rng([key, 2]))
 
 
@@ -71,6 +73,7 @@ def write_sequence(
     mesh: TexturedMesh,
     recorded: tuple[SequenceData, RenderedSequence],
     intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
+    depth_bits: int = 10,
 ) -> None:
     """Add a recorded sequence, with the pose and the bounding box of its object, to a data folder.
 
@@ -81,7 +84,7 @@ def write_sequence(
     poses = read_poses(out, category)
     poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
     write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-    write_co3d(out, category, [data], quality=JPEG_QUALITY, intrinsics_format=intrinsics_format)
+    write_co3d(out, category, [data], JPEG_QUALITY, intrinsics_format, depth_bits)
 
 
 def read_poses(out: Path, category: str) -> dict:

@@ -59,10 +59,15 @@ class Room:
     camera: CheapCamera
 
 
-def random_room(seed: int | np.random.Generator) -> Room:
-    """Draw surroundings, independent of the object: mostly rooms, sometimes a yard."""
+def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
+    """Draw surroundings, independent of the object: mostly rooms, sometimes a yard.
+
+    Args:
+        seed: Seed or source of the draws.
+        plain: Whether it is always a room, with pale walls and without painted furniture.
+    """
     rng = np.random.default_rng(seed)
-    outdoors = rng.random() < 0.2
+    outdoors = rng.random() < 0.2 and not plain
     extent = rng.uniform(11.5, 17, 4) * (1.5 if outdoors else 1.0)
     height = rng.uniform(9, 12) * (2 if outdoors else 1)
     low, high = np.array([-extent[0], -extent[1], 0]), np.array([extent[2], extent[3], height])
@@ -82,13 +87,13 @@ def random_room(seed: int | np.random.Generator) -> Room:
     floors = (asphalt, paving, paving, grass, concrete) if outdoors else (
         planks, planks, planks, tiles, tiles, carpet, concrete)  # fmt: skip
     make = floors[rng.integers(len(floors))]
-    floor = _floor_image(make, rng, rug=not outdoors and rng.random() < 0.25)
-    wall_colour = _wall_colour(rng)
+    floor = _floor_image(make, rng, not outdoors and rng.random() < 0.25, 2 if plain else 1)
+    wall_colour = _wall_colour(rng, plain)
     sides = [(high - low)[1], (high - low)[1], (high - low)[0], (high - low)[0]]
     # The side of the window is the one that the light comes from.
     lit = int(np.abs(light[:2]).argmax()) * 2 + int(light[np.abs(light[:2]).argmax()] > 0)
     walls = [_facade(rng, width, height) if outdoors else
-             _wall(rng, width, height, wall_colour, window=(k == lit) or rng.random() < 0.15)
+             _wall(rng, width, height, wall_colour, (k == lit) or rng.random() < 0.15, plain)
              for k, width in enumerate(sides)]  # fmt: skip
     ceiling = np.empty((64, 64, 3), np.float32)
     ceiling[:] = (0.9, 1.15, 1.5) if outdoors else (0.72, 0.71, 0.69)
@@ -106,10 +111,14 @@ def random_room(seed: int | np.random.Generator) -> Room:
     return Room(low, high, (*walls, floor, ceiling), light, float(radius), colour, ambient, gloss, camera)
 
 
-def _floor_image(make: Callable, rng: np.random.Generator, rug: bool) -> np.ndarray:
-    """Return the linear albedo of the whole floor, with a rug below the object where `rug` is set."""
-    repeats = _FLOOR_PIXELS // textures.TILE
+def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, fineness: int) -> np.ndarray:
+    """Return the linear albedo of the whole floor, with a rug below the object where `rug` is set.
+
+    The texture is made `fineness` times smaller.
+    """
+    repeats = _FLOOR_PIXELS // textures.TILE * fineness
     texture = srgb_to_linear(np.clip(make(rng), 0, 1))
+    texture = cv2.resize(texture, None, fx=1 / fineness, fy=1 / fineness, interpolation=cv2.INTER_AREA)
     if rng.random() < 0.5:
         texture = texture.swapaxes(0, 1)
     image = np.tile(texture, (repeats, repeats, 1))
@@ -127,11 +136,11 @@ def _floor_image(make: Callable, rng: np.random.Generator, rug: bool) -> np.ndar
     return np.clip(image * stains[..., None], 0, 0.85)
 
 
-def _wall_colour(rng: np.random.Generator) -> np.ndarray:
-    """Draw the sRGB colour of a painted wall: mostly white, cream and pale tones."""
+def _wall_colour(rng: np.random.Generator, plain: bool) -> np.ndarray:
+    """Draw the sRGB colour of a painted wall: mostly, or with `plain` always, white, cream and pale tones."""
     if rng.random() < 0.75:
         return hsv(rng.uniform(25, 60), rng.uniform(0.01, 0.14), rng.uniform(0.72, 0.92))
-    return hsv(rng.uniform(0, 360), rng.uniform(0.12, 0.4), rng.uniform(0.45, 0.8))
+    return hsv(rng.uniform(0, 360), rng.uniform(0.12, 0.4) * (0.3 if plain else 1), rng.uniform(0.45, 0.8))
 
 
 def _canvas(width: float, height: float) -> tuple[int, int]:
@@ -150,7 +159,9 @@ def _box(image: np.ndarray, x: float, z: float, width: float, height: float, col
     return area
 
 
-def _wall(rng: np.random.Generator, width: float, height: float, colour: np.ndarray, window: bool) -> np.ndarray:
+def _wall(
+    rng: np.random.Generator, width: float, height: float, colour: np.ndarray, window: bool, plain: bool
+) -> np.ndarray:
     """Return the radiance of an inner wall: paint, skirting board, and furniture, pictures, a door or a window."""
     rows, cols = _canvas(width, height)
     image = np.empty((rows, cols, 3), np.float32)
@@ -163,7 +174,9 @@ def _wall(rng: np.random.Generator, width: float, height: float, colour: np.ndar
     while x < width - 2:
         kind, wide = rng.integers(5), rng.uniform(2, 4.5)
         wide = min(wide, width - x - 0.2)
-        if kind == 0:  # shelf with books
+        if plain and (window or kind in (0, 2)):
+            pass
+        elif kind == 0:  # shelf with books
             top = rng.uniform(3, 7)
             wood = srgb_to_linear(hsv(rng.uniform(20, 40), rng.uniform(0.05, 0.5), rng.uniform(0.2, 0.9)))
             _box(image, x, 0, wide, top, wood)

@@ -123,6 +123,7 @@ def render_sequence(
     frames: int,
     image_size: int,
     renderer: Renderer = render_views,
+    landscape: bool = False,
 ) -> RenderedSequence:
     """Render views around an object; the same seed gives the same cameras.
 
@@ -134,12 +135,14 @@ def render_sequence(
         frames: Number of views.
         image_size: Shorter image side in pixels.
         renderer: Makes the pictures and their geometry.
+        landscape: Whether the pictures are 4:3 landscape; otherwise their format is drawn.
 
     Returns:
         The exact views.
     """
     rng = np.random.default_rng(seed)
-    cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
+    size = (image_size, round(image_size * 4 / 3)) if landscape else image_shape(image_size, rng)
+    cameras = handheld_sweep(mesh.vertices, rng, frames, size)
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.

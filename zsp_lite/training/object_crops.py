@@ -64,7 +64,7 @@ def render_object(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         azimuth = 2 * np.pi * (view + rng.uniform()) / VIEWS
         R, t = orbit_pose(azimuth, rng.uniform(0.05, 0.8), rng.normal(0, 0.08), rng.uniform(5, 10), np.zeros(3))
         camera = framed_camera(shape.vertices, R, t, _RENDER_SIZE, 1.3)
-        image = render_view(shape, camera, rng)
+        image = render_view(seed, shape, camera, rng)
         crop = crop_to_object(Frame(image.rgb, None, image.mask.astype(np.float32), camera))
         height, width = crop.camera.size
         rows.append((resize_frame(crop, (SIZE, SIZE)).rgb, width / height, R))

@@ -84,7 +84,7 @@ def render_object(
             rng.uniform(5, 10), (vertices.max(0) + vertices.min(0)) / 2,
         )  # fmt: skip
         camera = framed_camera(vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
-        image = render_view(seen, camera, rng, vertices)
+        image = render_view(seed, seen, camera, rng, vertices)
         every = (slice(step // 2, None, step),) * 2
         depth, mask = image.depth[every], image.mask[every]
         spread = max(float(depth[mask].std()), 1e-6)

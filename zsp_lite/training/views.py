@@ -1,4 +1,4 @@
-"""Single views of procedural objects for training, rendered with few rays in a fixed set of rooms."""
+"""Single views of procedural objects for training, rendered with few rays."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -15,15 +15,20 @@ from zsp_lite.synthetic.raytracing import FASTEST, MeshScene
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.room import random_room
 
-ROOMS = 32  # a room takes ten times as long as a view
+ROOMS, SHARING = 16, 200  # so many rooms for so many consecutive objects: a room takes five times as long as a view
 
 
 def render_view(
-    shape: Shape, camera: Camera, rng: np.random.Generator, vertices: Float[np.ndarray, "v 3"] | None = None
+    number: int,
+    shape: Shape,
+    camera: Camera,
+    rng: np.random.Generator,
+    vertices: Float[np.ndarray, "v 3"] | None = None,
 ) -> Rendering:
-    """Render one view of an object with random materials in one of `ROOMS` rooms, which is turned at random.
+    """Render one view of an object with random materials in a random room, which is turned at random.
 
     Args:
+        number: Number of the object. Objects with neighbouring numbers share their rooms.
         shape: Object.
         camera: Camera; maps from the coordinates of the vertices.
         rng: Source of the draws.
@@ -34,7 +39,9 @@ def render_view(
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     vertices = shape.vertices if vertices is None else vertices
     mesh = with_materials(shape, random_materials(rng), vertices @ turn.T)
-    scene = MeshScene(mesh, _room(int(rng.integers(ROOMS))), FASTEST, coordinates=shape.vertices)
+    scene = MeshScene(
+        mesh, _room(number // SHARING * ROOMS + int(rng.integers(ROOMS))), FASTEST, coordinates=shape.vertices
+    )
     view = scene.render(replace(camera, R=camera.R @ turn.T), rng)
     return replace(view, camera=camera)
 

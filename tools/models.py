@@ -1,13 +1,12 @@
-"""Build the folder of models of the evaluation preset `artists` from unpacked Debian packages.
+"""Build a folder of models of a catalogue from unpacked Debian packages.
 
     apt-get download sweethome3d-furniture flightgear-data-ai
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
-    python tools/artists.py packages outputs/artists_models
-    zsp-lite synth --models outputs/artists_models --out outputs/artists
+    python tools/models.py tools/artists.json packages outputs/artists_models
 
-`tools/artists.json` names every model: package, file, licence, author and orientation. The models themselves are not
-part of this repository. Those under GPL may be rendered for evaluation only; neither they nor pictures of them are
-to be published.
+A catalogue names every model: package, file, licence, author and orientation. `artists.json` is that of the evaluation
+preset `artists`, `samples.json` that of `data_samples/`. The models themselves are not part of this repository. Those
+under GPL may be rendered for evaluation only; neither they nor pictures of them are to be published.
 """
 
 import hashlib
@@ -28,7 +27,12 @@ try:
 except ModuleNotFoundError:  # run as a script
     from ac3d import convert
 
-CATALOGUE = Path(__file__).with_name("artists.json")
+LICENCES = {
+    "CC0 1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
+    "CC BY 3.0": "https://creativecommons.org/licenses/by/3.0/",
+    "CC BY 3.0 US": "https://creativecommons.org/licenses/by/3.0/us/",
+    "Public Domain Mark 1.0": "https://creativecommons.org/publicdomain/mark/1.0/",
+}
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -44,6 +48,7 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
         member: Path of the model in the archive `file`.
         textures: Folder of the package with textures that are not beside the model.
         front: Front in the axes of the file; the top is +y.
+        title: Title that the author gave to the work, where there is one.
     """
 
     package: str
@@ -55,22 +60,25 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     member: str = ""
     textures: str = ""
     front: str = "+z"
+    title: str = ""
 
 
 class Catalogue(msgspec.Struct, frozen=True):
-    """The content of `artists.json`: versions of the packages, and the models by category and name."""
+    """The content of a catalogue: versions of the packages, and the models by category and name."""
 
     packages: dict[str, str]
     models: dict[str, dict[str, Entry]]
 
 
-def read_catalogue(path: Path = CATALOGUE) -> Catalogue:
+def read_catalogue(path: Path) -> Catalogue:
     """Return the catalogue. Raises InputError if it is damaged."""
     return decode(read_bytes(path, "catalogue"), Catalogue, path)
 
 
 def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
-    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/` and write `out/models.json`.
+    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/`.
+
+    `out` also receives `models.json` and `ATTRIBUTION.md`.
 
     Args:
         packages: Folder with one folder per unpacked package.
@@ -98,9 +106,47 @@ def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
                 folders = [packages / entry.package / entry.textures] if entry.textures else []
                 convert(source, target / f"{name}.obj", folders)
             origin = f"{entry.package} {catalogue.packages[entry.package]}: {entry.member or entry.file}"
-            changes = "" if entry.member else "converted from AC3D"
-            infos[f"{category}/{name}"] = ModelInfo(entry.front, "+y", entry.author, entry.licence, origin, changes)
+            infos[f"{category}/{name}"] = ModelInfo(
+                entry.front, "+y", entry.author, entry.licence, origin, _changes(entry)
+            )
     write_atomic(out / MODELS_FILE, msgspec.json.format(msgspec.json.encode(infos), indent=1))
+    write_atomic(out / "ATTRIBUTION.md", attribution(catalogue).encode())
+
+
+def attribution(catalogue: Catalogue) -> str:
+    """Return a page in Markdown with author, licence, source and changes of every model."""
+    packages = ", ".join(f"{name} {version}" for name, version in catalogue.packages.items())
+    lines = [
+        "# Attribution",
+        "",
+        f"The pictures show 3D models from Debian packages: {packages}.",
+        "Each model was rotated, centred, scaled, and rendered in a room with a simulated camera and depth sensor; the",
+        "table lists further changes. The licence was read in the file of the last column, in the archive of the model",
+        "or in the package.",
+        "",
+        "| model | title | author | licence | file | changes | licence read in |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for category, models in catalogue.models.items():
+        for name, entry in models.items():
+            licence = f"[{entry.licence}]({LICENCES[entry.licence]})" if entry.licence in LICENCES else entry.licence
+            file = f"{entry.file.rpartition('/')[2]}: {entry.member}" if entry.member else entry.file
+            columns = (
+                f"{category}/{name}",
+                entry.title,
+                entry.author,
+                licence,
+                file,
+                _changes(entry),
+                entry.licence_file,
+            )
+            lines.append(f"| {' | '.join(columns)} |".replace("|  |", "| |"))
+    return "\n".join(lines) + "\n"
+
+
+def _changes(entry: Entry) -> str:
+    changes = ["converted from AC3D"] * (not entry.member) + [f"{entry.front} taken as front"] * (entry.front != "+z")
+    return ", ".join(changes)
 
 
 def _extract(archive: Path, entry: Entry, target: Path, name: str) -> None:
@@ -126,6 +172,6 @@ def _check(entry: Entry, data: bytes, where: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        build(Path(sys.argv[1]), Path(sys.argv[2]), read_catalogue())
+        build(Path(sys.argv[2]), Path(sys.argv[3]), read_catalogue(Path(sys.argv[1])))
     except (InputError, IndexError) as error:
         sys.exit(__doc__ if isinstance(error, IndexError) else str(error))

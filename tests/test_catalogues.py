@@ -1,7 +1,8 @@
-"""The catalogue of artist-made models is complete and consistent, and its builder checks what it copies."""
+"""The catalogues of artist-made models are complete and consistent, and their builder checks what it copies."""
 
 import hashlib
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +10,15 @@ from model_files import write_quad
 from PIL import Image
 
 from tools.ac3d import convert
-from tools.artists import Catalogue, Entry, build, read_catalogue
+from tools.models import Catalogue, Entry, build, read_catalogue
 from zsp_lite.errors import InputError
+from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
+
+TOOLS = Path(__file__).parents[1] / "tools"
+ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
 
 # A world with one group, moved by 10 along x, of a square turned by a quarter about y; one polyline, one wrong count.
 AC3D = """AC3Db
@@ -64,7 +69,7 @@ def aircraft(tmp_path):
 
 
 def test_the_catalogue_has_eight_categories_of_six_models_under_free_licences():
-    catalogue = read_catalogue()
+    catalogue = read_catalogue(ARTISTS)
     assert len(catalogue.models) >= 8 and all(len(models) >= 6 for models in catalogue.models.values())
     entries = [entry for models in catalogue.models.values() for entry in models.values()]
     assert len({entry.sha256 for entry in entries}) == len(entries)  # no file twice
@@ -75,8 +80,25 @@ def test_the_catalogue_has_eight_categories_of_six_models_under_free_licences():
     )
 
 
+def test_the_sample_catalogue_has_four_of_the_papers_categories_of_four_models_that_may_be_shipped():
+    catalogue = read_catalogue(SAMPLES)
+    assert set(catalogue.models) <= set(EVALUATION) and "motorcycle" in catalogue.models
+    assert [len(models) for models in catalogue.models.values()] == [4] * 4
+    entries = [entry for models in catalogue.models.values() for entry in models.values()]
+    assert {entry.licence for entry in entries} <= {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
+    assert all(entry.author and entry.licence_file for entry in entries)
+
+
+def test_no_sample_is_in_the_catalogue_of_artists():
+    files = [{(entry.sha256, entry.member or entry.file) for models in read_catalogue(path).models.values()
+              for entry in models.values()} for path in (ARTISTS, SAMPLES)]  # fmt: skip
+    for part in range(2):  # neither the content nor the name of a file
+        artists, samples = ({entry[part] for entry in entries} for entries in files)
+        assert len(samples) == 16 and not artists & samples
+
+
 def test_no_category_of_the_catalogue_is_trained_on_or_used_for_model_selection():
-    assert not set(read_catalogue().models) & {*TRAINING, *VALIDATION}
+    assert not set(read_catalogue(ARTISTS).models) & {*TRAINING, *VALIDATION}
 
 
 def test_an_ac3d_model_keeps_its_placement_texture_and_opacity(aircraft, tmp_path):
@@ -115,9 +137,14 @@ def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
     catalogue = Catalogue({"home": "1.0", "sky": "2.0"}, {"sign": {"stop": sign}, "aircraft": {"plane": plane}})
     out = tmp_path / "models"
     build(packages, out, catalogue)
+    page = (out / "ATTRIBUTION.md").read_text()
+    assert (
+        "| sign/stop | | Ann | [CC0 1.0](" in page
+        and "| aircraft/plane | | Bob | GPL-2+ | plane.ac | converted" in page
+    )
     build(packages, out, catalogue)  # again into the same folder
     aircraft_model, sign_model = list_models(out)
-    assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D"
+    assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D, -x taken as front"
     assert sign_model.info.source == "home 1.0: set/sign/quad.obj" and sign_model.info.author == "Ann"
     assert len(sign_model.read().faces) == len(aircraft_model.read().faces) == 2
     aircraft.write_text(AC3D + " ")
