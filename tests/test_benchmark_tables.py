@@ -294,9 +294,9 @@ def test_rows_to_compare_may_have_colons_in_their_names():
 
 
 def test_the_names_of_objects_are_read_from_a_pairs_key():
-    pair = Pair("toytruck", "100_2601_9340", 4, "101_7848_2398", (1, 2, 3))
-    assert category_of(pair.key) == "toytruck"
-    assert objects_of(pair.key) == ("toytruck/100_2601_9340", "toytruck/101_7848_2398")
+    pair = Pair("car", "seat_leon", 4, "wooden_car", (1, 2, 3))
+    assert category_of(pair.key) == "car"
+    assert objects_of(pair.key) == ("car/seat_leon", "car/wooden_car")
 
 
 def test_intervals_of_a_run_come_from_resampled_objects(run):

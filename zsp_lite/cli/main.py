@@ -141,10 +141,10 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 
 @cli.command(
     epilog=examples(
-        "synth --preset samples --out outputs/samples",
+        "synth --preset samples --out outputs/procedural",
         "synth --preset eval --out outputs/eval",
         "synth --preset paper --out outputs/paper",
-        "synth --category chair --category teddybear --sequences 2 --seed 7 --out outputs/mine",
+        "synth --category chair --category car --sequences 2 --seed 7 --out outputs/mine",
         "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
         "synth --models path/to/models --image-size 320 --out outputs/models",
         "synth --models path/to/models --engine cycles --image-size 240 --landscape --out outputs/photographs",
