@@ -20,7 +20,7 @@ help:
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
-	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1.3 GB)"
+	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1 GB)"
 	@echo "make clean      remove .venv, caches and outputs/"
 	@echo "PYTHON=/path/to/python3.12 make demo   chooses the interpreter (3.11 or newer)"
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from functools import wraps
 
 import cv2
 import numpy as np
@@ -124,6 +125,7 @@ def test_pairs_and_ground_truth_matches_exist(data):
 def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path):
     rendered = []
 
+    @wraps(quick)
     def counting(mesh, cameras, rng):
         rendered.append(mesh.name)
         return quick(mesh, cameras, rng)
@@ -172,6 +174,8 @@ def test_landscape_pictures_and_coarse_depth_are_settings_of_an_export(folder, t
     assert any((cv2.imread(str(path), -1) & 0b1111).any() for path in stored["fine"])
     with pytest.raises(InputError, match="was written with .*depth_bits"):
         export_models(folder, tmp_path / "coarse", frames=1, image_size=SIZE, renderer=quick)
+    with pytest.raises(InputError, match="was written with .*'renderer': 'quick'"):
+        export_models(folder, tmp_path / "fine", frames=1, image_size=SIZE)
     with pytest.raises(InputError, match="depth_bits is 11, expected an integer from 1 to 10"):
         export_models(folder, tmp_path / "other", depth_bits=11)
 

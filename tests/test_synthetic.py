@@ -117,6 +117,7 @@ def test_no_split_imports_from_another(split):
     assert not [home for home in homes if home and home.startswith(others)]
 
 
+@pytest.mark.slow
 def test_the_name_of_a_split_stands_for_its_categories(tmp_path):
     main(["synth", "--category", "validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
     made = Co3D(tmp_path)

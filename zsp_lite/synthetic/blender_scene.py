@@ -6,7 +6,6 @@ FOLDER/scene.npz holds the scene, see `zsp_lite.synthetic.path_tracing.write_sce
 written to FOLDER/K.npy. THREADS 0 means all cores.
 """
 
-import os
 import sys
 from pathlib import Path
 
@@ -80,9 +79,8 @@ def object_material(name: str, tint, opacity, specular, roughness, metallic, tex
             cut = nodes.add("ShaderNodeMath", {0: sample["Alpha"], 1: 0.5}, operation="GREATER_THAN")[0]
             alpha = nodes.add("ShaderNodeMath", {0: cut, 1: alpha}, operation="MULTIPLY")[0]
     # Real surfaces reflect a few percent of all colours, as in the ray-casting renderer.
-    colour = nodes.add("ShaderNodeVectorMath", {0: colour, 1: (0.8,) * 3, 2: (0.015,) * 3}, operation="MULTIPLY_ADD")[
-        "Vector"
-    ]
+    scale, offset = (0.8,) * 3, (0.015,) * 3
+    colour = nodes.add("ShaderNodeVectorMath", {0: colour, 1: scale, 2: offset}, operation="MULTIPLY_ADD")["Vector"]
     inputs = {"Base Color": colour, "Alpha": alpha, "Roughness": roughness, "Metallic": metallic,
               "Specular IOR Level": specular / 0.08}  # fmt: skip
     return nodes.surface(nodes.add("ShaderNodeBsdfPrincipled", inputs)["BSDF"])
@@ -151,7 +149,7 @@ def prepare(samples: int, threads: int, size) -> None:
     scene.cycles.denoising_input_passes, scene.cycles.denoising_prefilter = "RGB_ALBEDO_NORMAL", "FAST"
     scene.cycles.denoising_quality = "BALANCED"
     scene.cycles.max_bounces, scene.cycles.transparent_max_bounces = 3, 8
-    scene.cycles.sample_clamp_indirect, scene.cycles.seed = 4.0, 0
+    scene.cycles.sample_clamp_indirect = 4.0
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     scene.cycles.use_light_tree = False  # with six lights it only costs time
     scene.cycles.filter_width = 1.2
@@ -195,8 +193,7 @@ def main(folder: Path, samples: int, threads: int) -> None:
         written = bpy.data.images.load(scene.render.filepath)
         pixels = np.empty(width * height * 4, np.float32)
         written.pixels.foreach_get(pixels)
-        np.save(folder / f"{k}.part.npy", pixels.reshape(height, width, 4)[::-1, :, :3])
-        os.replace(folder / f"{k}.part.npy", folder / f"{k}.npy")
+        np.save(folder / f"{k}.npy", pixels.reshape(height, width, 4)[::-1, :, :3])
         bpy.data.images.remove(written)
 
 

@@ -48,7 +48,7 @@ class ModelRecord(msgspec.Struct, frozen=True):
 
 
 class _Rendered(msgspec.Struct):
-    settings: dict[str, int]
+    settings: dict[str, int | str]
     sequences: dict[str, dict[str, ModelRecord]]
 
 
@@ -96,6 +96,8 @@ def export_models(
         raise InputError(f"depth_bits is {depth_bits!r}, expected an integer from 1 to 10")
     models, out = list_models(folder), Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
+    if renderer is not render_views:
+        settings["renderer"] = getattr(renderer, "__qualname__", type(renderer).__qualname__)
     settings |= {"landscape": 1} if landscape else {}
     settings |= {"depth_bits": depth_bits} if depth_bits < 10 else {}
     rendered = _read_rendered(out, settings)
@@ -133,7 +135,7 @@ def _record(model: Model, folder: Path) -> ModelRecord:
     return ModelRecord(file, digest, rotation, info.author, info.licence, info.source, info.changes)
 
 
-def _read_rendered(out: Path, settings: dict[str, int]) -> _Rendered:
+def _read_rendered(out: Path, settings: dict[str, int | str]) -> _Rendered:
     """Return the records of an earlier export. Raises InputError if the folder is another one's."""
     path = out / RENDERED_FILE
     if not path.is_file():

@@ -87,7 +87,7 @@ def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
     floors = (asphalt, paving, paving, grass, concrete) if outdoors else (
         planks, planks, planks, tiles, tiles, carpet, concrete)  # fmt: skip
     make = floors[rng.integers(len(floors))]
-    floor = _floor_image(make, rng, not outdoors and rng.random() < 0.25, 2 if plain else 1)
+    floor = _floor_image(make, rng, not outdoors and rng.random() < 0.25, plain)
     wall_colour = _wall_colour(rng, plain)
     sides = [(high - low)[1], (high - low)[1], (high - low)[0], (high - low)[0]]
     # The side of the window is the one that the light comes from.
@@ -111,20 +111,24 @@ def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
     return Room(low, high, (*walls, floor, ceiling), light, float(radius), colour, ambient, gloss, camera)
 
 
-def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, fineness: int) -> np.ndarray:
+def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, plain: bool) -> np.ndarray:
     """Return the linear albedo of the whole floor, with a rug below the object where `rug` is set.
 
-    The texture is made `fineness` times smaller.
+    With `plain`, the texture is finer, and carpet and rug have muted colours.
     """
-    repeats = _FLOOR_PIXELS // textures.TILE * fineness
-    texture = srgb_to_linear(np.clip(make(rng), 0, 1))
-    texture = cv2.resize(texture, None, fx=1 / fineness, fy=1 / fineness, interpolation=cv2.INTER_AREA)
+    repeats, texture = _FLOOR_PIXELS // textures.TILE, np.clip(make(rng), 0, 1)
+    texture = srgb_to_linear(_muted(texture) if plain and make is carpet else texture)
+    if plain:
+        repeats, texture = 2 * repeats, cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     if rng.random() < 0.5:
         texture = texture.swapaxes(0, 1)
     image = np.tile(texture, (repeats, repeats, 1))
     if rug:
-        cloth = srgb_to_linear(np.clip(carpet(rng), 0, 1))
-        border = srgb_to_linear(hsv(rng.uniform(0, 360), rng.uniform(0.03, 0.4), rng.uniform(0.2, 0.7)))
+        cloth = np.clip(carpet(rng), 0, 1)
+        cloth = srgb_to_linear(_muted(cloth) if plain else cloth)
+        border = srgb_to_linear(
+            hsv(rng.uniform(0, 360), rng.uniform(0.03, 0.4) * (0.4 if plain else 1), rng.uniform(0.2, 0.7))
+        )
         half, middle = (rng.uniform(0.09, 0.22, 2) * _FLOOR_PIXELS).astype(int), _FLOOR_PIXELS // 2
         (top, left), (bottom, right) = middle - half, middle + half
         patch = np.tile(cloth, (repeats, repeats, 1))[: bottom - top, : right - left].copy()
@@ -134,6 +138,13 @@ def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, fineness: 
         image[bottom : bottom + 3, left:right] *= 0.7
     stains = cv2.resize(1 + 0.05 * periodic_noise(rng, (256, 256), 1.5), (_FLOOR_PIXELS, _FLOOR_PIXELS))
     return np.clip(image * stains[..., None], 0, 0.85)
+
+
+def _muted(texture: np.ndarray, limit: float = 0.08) -> np.ndarray:
+    """Reduce the saturation of a texture, so that its mean colour has at most that of `limit`."""
+    mean, grey = texture.mean((0, 1)), texture.mean(-1, keepdims=True)
+    saturation = 1 - mean.min() / mean.max()
+    return texture if saturation <= limit else grey + (texture - grey) * (limit / saturation)
 
 
 def _wall_colour(rng: np.random.Generator, plain: bool) -> np.ndarray:

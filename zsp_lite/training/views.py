@@ -15,7 +15,7 @@ from zsp_lite.synthetic.raytracing import FASTEST, MeshScene
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.room import random_room
 
-ROOMS, SHARING = 16, 200  # so many rooms for so many consecutive objects: a room takes five times as long as a view
+ROOMS, SHARING = 8, 100  # so many rooms for so many consecutive objects: a room takes five times as long as a view
 
 
 def render_view(
