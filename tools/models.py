@@ -1,6 +1,7 @@
 """Build a folder of models of a catalogue from unpacked Debian packages.
 
     apt-get download sweethome3d-furniture flightgear-data-ai
+    mkdir packages
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
     python tools/models.py tools/artists.json packages outputs/artists_models
 
