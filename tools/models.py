@@ -172,7 +172,9 @@ def _check(entry: Entry, data: bytes, where: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     try:
         build(Path(sys.argv[2]), Path(sys.argv[3]), read_catalogue(Path(sys.argv[1])))
-    except (InputError, IndexError) as error:
-        sys.exit(__doc__ if isinstance(error, IndexError) else str(error))
+    except InputError as error:
+        sys.exit(str(error))
