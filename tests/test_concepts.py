@@ -59,12 +59,10 @@ def test_every_category_of_a_preset_and_of_the_sample_data_is_listed_for_evaluat
 
 
 def test_every_category_of_a_catalogue_of_models_is_listed_for_evaluation():
-    assert "artists" in CATALOGUES
-    for catalogue in ("artists", "samples"):
-        for category in CATALOGUES.get(catalogue, ()):
+    assert CATALOGUES.keys() == {"artists", "samples"}
+    for catalogue, models in CATALOGUES.items():
+        for category in models:
             assert SIDE_OF.get(category) == "evaluation", f"{catalogue}: {category}"
-    for models in CATALOGUES.values():
-        assert models.keys() <= SIDE_OF.keys()
 
 
 def test_no_model_file_is_in_two_catalogues():

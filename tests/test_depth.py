@@ -33,6 +33,12 @@ def test_fewer_bits_round_to_the_nearest_value_and_keep_unknown_pixels():
     assert abs((decode_depth(encoded)[depth > 0] / depth[depth > 0]).mean() - 1) < 3e-4
 
 
+@pytest.mark.parametrize("bits", [0, 11, 7.0])
+def test_a_precision_out_of_range_is_an_input_error(bits):
+    with pytest.raises(InputError, match=f"bits is {bits}, expected an integer from 1 to 10"):
+        encode_depth(np.ones((2, 2)), bits=bits)
+
+
 def test_values_that_are_not_positive_and_finite_are_unknown():
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
     assert not decode_depth(np.array([[infinite, nan, negative, 0]], np.uint16)).any()

@@ -11,6 +11,7 @@ from zsp_lite.synthetic.assembly import surface_spread
 from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo, list_models, read_infos, turn_model
 from zsp_lite.synthetic.primitives import box, ellipsoid
+from zsp_lite.synthetic.textures import srgb_to_linear
 
 CHECKS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
 
@@ -33,6 +34,16 @@ def test_dull_and_shiny_materials_differ_in_roughness_and_specular(tmp_path):
     path.with_suffix(".mtl").write_text(text.replace("Ks 0 0 0", "Ks 1 1 1").replace("Ns 1", "Ns 500"))
     shiny = read_mesh(path).materials[0]
     assert shiny.roughness < 0.5 < dull.roughness and shiny.specular > dull.specular
+
+
+def test_the_linear_colour_factor_of_gltf_becomes_srgb(tmp_path):
+    linear = np.array([5, 51, 255]) / 255
+    cube = box((1, 1, 1))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[*linear, 1.0])
+    visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(cube.vertices), 2)), material=material)
+    trimesh.Trimesh(cube.vertices, cube.faces, visual=visual).export(tmp_path / "cube.glb")
+    (read,) = read_mesh(tmp_path / "cube.glb").materials
+    assert srgb_to_linear(read.colour[:3]) == pytest.approx(linear, abs=1e-4)
 
 
 @pytest.mark.parametrize("extension", ["obj", "glb", "gltf", "ply", "stl"])

@@ -161,6 +161,8 @@ def test_a_renderer_and_a_sensor_of_the_user_take_the_place_of_the_own_ones(fold
     dataset = Co3D(tmp_path)
     frame = dataset.load(dataset.frames("chair", "high")[1])
     assert frame.rgb.max() < 5 and set(np.unique(frame.mask)) == {0, 1}
+    with pytest.raises(InputError, match="was written with .*'sensor': '.*exact_masks'"):
+        export_models(folder, tmp_path, 2, image_size=48, renderer=black)
 
 
 def test_landscape_pictures_and_coarse_depth_are_settings_of_an_export(folder, tmp_path):

@@ -1,6 +1,8 @@
 """Path tracing: what is handed to Blender, and, where Blender is installed, that both engines agree."""
 
 import os
+import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from model_files import painted, view, wedge, write_quad, write_wedge
 
+import zsp_lite
 from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
@@ -80,14 +83,31 @@ def test_the_command_says_in_one_line_that_blender_is_missing(tmp_path, monkeypa
     assert "make render-env" in message and message.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
-def test_a_failure_of_blender_is_reported_with_its_last_line(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("end", "message"),
+    [
+        ("echo 'No module named bpy' >&2; exit 1", "exit code 1: No module named bpy"),
+        ("kill -9 $$", "exit code -9: noise"),
+        ("exit 0", "exit code 0: noise"),  # without pictures
+    ],
+)
+def test_a_failure_of_blender_is_reported_with_its_last_line(tmp_path, monkeypatch, end, message):
     python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho noise >&2\necho 'No module named bpy' >&2\nexit 1\n")
+    python.write_text(f"#!/bin/sh\necho noise >&2\n{end}\n")
     python.chmod(0o755)
     monkeypatch.setenv(PYTHON_VARIABLE, str(python))
     mesh = painted(wedge())
-    with pytest.raises(InputError, match="Blender failed in .*: No module named bpy"):
+    with pytest.raises(InputError, match=f"Blender failed in .* with {message}"):
         path_traced_views(mesh, [view(mesh.vertices)], np.random.default_rng(0))
+
+
+def test_only_the_script_of_blender_imports_bpy_and_nothing_imports_the_script():
+    """Blender's module is under the GPL and runs in a process of its own."""
+    sources = {path.stem: path.read_text() for path in Path(zsp_lite.__file__).parent.rglob("*.py")}
+    imported = {name: set(re.findall(r"^\s*(?:import|from) (\S+)", text, re.M)) for name, text in sources.items()}
+    assert [name for name, modules in imported.items() if modules & {"bpy", "mathutils"}] == ["blender_scene"]
+    assert not [name for name, text in sources.items() if re.search(r"^\s*(import|from) .*blender_scene", text, re.M)]
+    assert imported["blender_scene"] <= set(sys.stdlib_module_names) | {"bpy", "mathutils", "numpy", "pathlib"}
 
 
 def holed_quad(tmp_path) -> TexturedMesh:
@@ -115,6 +135,10 @@ def test_both_engines_see_the_same_silhouette(tmp_path, monkeypatch, shape):
     scene = MeshScene(mesh, room, HARD_SHADOWS)
     write_scene(tmp_path / "scene.npz", scene, [camera])
     (radiance,) = trace(tmp_path, 1, samples=16)
+    # Linear, without a tone curve. The wedge is seen before the floor, whose albedo is 0.8 and which receives the key
+    # light at its slant and the light of the room; the cut-out before a wall, which gives off light.
+    brightest = 0.8 * (room.light[2] + 1) if shape == "wedge" else 2.0
+    assert np.percentile(radiance, 95) == pytest.approx(brightest, rel=0.02)
     mask = scene.geometry(camera)["mask"]
     assert 500 < mask.sum() < 0.5 * mask.size
     dark = radiance.max(-1) < 0.25

@@ -15,6 +15,7 @@ from zsp_lite.synthetic.primitives import cylinder
 from zsp_lite.synthetic.raytracing import HARD_SHADOWS, MeshScene, Quality, _pixel_rays
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.room import random_room, studio
+from zsp_lite.synthetic.sampling import look_up
 from zsp_lite.synthetic.textures import srgb_to_linear
 
 FAST = Quality(samples=1, shadow_rays=1, ambient_rays=0)
@@ -88,6 +89,23 @@ def test_a_deformed_copy_has_the_coordinates_and_the_pattern_of_the_original():
     clear = np.abs(original[:, 0]) > 0.1
     red = drawn.rgb[row, col, 0] > drawn.rgb[row, col, 2]
     assert (red == (original[:, 0] > 0))[clear].mean() > 0.98 and 0.2 < red.mean() < 0.8
+
+
+def test_the_zenith_of_a_panorama_does_not_blend_with_its_nadir():
+    panorama = np.zeros((16, 32, 3), np.float32)
+    panorama[:8] = np.linspace(1, 2, 32)[None, :, None]  # bright above the horizon, in all directions
+    panorama[:, [0, -1]] = panorama[:, [0, -1]].mean(1, keepdims=True)
+    up, tilted, down, azimuth_0 = look_up(panorama, np.float32([[0, 0, 1], [0.05, 0, 1], [0, 0, -1], [1, 0, 0.9]]))[
+        :, 0
+    ]
+    assert up == pytest.approx(1.5) and tilted == pytest.approx(1.5) and down == 0
+    assert azimuth_0 == pytest.approx(1.5)  # between the last and the first column
+
+
+def test_a_surface_that_faces_up_receives_the_light_of_the_room_on_its_floor():
+    room = RoomLight(random_room(0))
+    up, down = room.irradiance(np.float32([[0, 0, 1], [0, 0, -1]]))
+    assert up == pytest.approx(room.room.ambient, rel=0.1) and (down < 0.6 * up).all()
 
 
 def test_a_prepared_room_gives_the_same_pictures_as_the_room():

@@ -1,6 +1,7 @@
 """Build a folder of models of a catalogue from unpacked Debian packages.
 
     apt-get download sweethome3d-furniture flightgear-data-ai
+    mkdir packages
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
     python tools/models.py tools/artists.json packages outputs/artists_models
 
@@ -171,7 +172,9 @@ def _check(entry: Entry, data: bytes, where: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     try:
         build(Path(sys.argv[2]), Path(sys.argv[3]), read_catalogue(Path(sys.argv[1])))
-    except (InputError, IndexError) as error:
-        sys.exit(__doc__ if isinstance(error, IndexError) else str(error))
+    except InputError as error:
+        sys.exit(str(error))

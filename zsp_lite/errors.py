@@ -12,14 +12,20 @@ class InputError(ValueError):
     """
 
 
-def check_integer(name: str, value: object, minimum: int) -> None:
+def check_integer(name: str, value: object, minimum: int, maximum: int | None = None) -> None:
     """Check that a value is an integer (a Python or NumPy one, not a bool) of at least `minimum`.
 
     Raises:
-        InputError: The value is of another type or smaller.
+        InputError: The value is of another type, smaller, or greater than `maximum`.
     """
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < minimum:
-        raise InputError(f"{name} is {value!r}, expected an integer of at least {minimum}")
+    if (
+        not isinstance(value, numbers.Integral)
+        or isinstance(value, bool)
+        or value < minimum
+        or (maximum is not None and value > maximum)
+    ):
+        limits = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
+        raise InputError(f"{name} is {value!r}, expected an integer {limits}")
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:

@@ -194,7 +194,10 @@ def synth(
     preset: str | None, categories: tuple[str, ...], models_folder: Path | None, sequences: int | None,
     frames: int | None, image_size: int | None, engine: str, landscape: bool, depth_bits: int, seed: int, out: Path,
 ) -> None:  # fmt: skip
-    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files."""
+    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files.
+
+    With --engine cycles, the colours are the same only up to the rounding of the path tracer.
+    """
     if bool(preset) + bool(categories) + bool(models_folder) != 1:
         raise click.UsageError("expected either --preset or --category or --models")
     if image_size and not models_folder:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
@@ -35,7 +35,11 @@ def encode_depth(
         scale_adjustment: Factor applied to the decoded depth.
         bits: Bits of the mantissa to keep, 1 to 10. The relative precision is 2^-(bits + 1); files with fewer bits
             are smaller.
+
+    Raises:
+        InputError: `bits` is out of its range.
     """
+    check_integer("bits", bits, 1, 10)
     depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))

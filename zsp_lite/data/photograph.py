@@ -17,6 +17,7 @@ from zsp_lite.errors import InputError
 _FOCAL_LENGTH, _PRINCIPAL_POINT, _PRINCIPAL_DIFFERENCE, _BASELINE = 994.978, (311.193, 254.877), 31.086, 0.193001
 _FLOOR_ROWS = slice(300, None)  # lower part of the photograph, mostly floor
 _FLOOR_DISTANCE = 0.01  # metres; largest distance of a floor point from the plane
+_TRIALS = 500  # samples of three points to fit a plane to
 _CLEARANCE = 0.02  # metres; smallest height of an object point above the floor
 _FARTHEST = 2.75  # metres; the motorcycle is nearer, the bench and the shelf behind it are not
 
@@ -52,27 +53,23 @@ def scale_to_unit_deviation(frame: Frame) -> Frame:
     return replace(frame, depth=frame.depth / np.float32(points.std(axis=0).mean()))
 
 
-def fit_plane(
-    points: Float[np.ndarray, "n 3"], threshold: float, trials: int = 500, seed: int = 0
-) -> tuple[Float[np.ndarray, "3"], float]:
+def fit_plane(points: Float[np.ndarray, "n 3"], threshold: float) -> tuple[Float[np.ndarray, "3"], float]:
     """Fit a plane to points with outliers, by RANSAC and by least squares over the inliers of the best trial.
 
     Args:
         points: (N, 3) points, N >= 3. At most 4,000 of them, evenly spaced, are used.
         threshold: Largest distance of an inlier.
-        trials: Number of samples of three points.
-        seed: Seed of the samples.
 
     Returns:
         Unit normal and offset of the plane `normal @ x = offset`. The sign of the normal is arbitrary.
 
     Raises:
-        InputError: There are fewer than 3 points.
+        InputError: There are fewer than 3 points, or all lie on a line.
     """
     if len(points) < 3:
         raise InputError(f"got {len(points)} points, expected at least 3 to fit a plane")
     points = points[:: -(-len(points) // 4000)]
-    corners = points[np.random.default_rng(seed).integers(len(points), size=(trials, 3))]
+    corners = points[np.random.default_rng(0).integers(len(points), size=(_TRIALS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1)

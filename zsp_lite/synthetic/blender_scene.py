@@ -1,5 +1,8 @@
 """Render a scene file with Cycles. Runs in the Python of Blender's module `bpy`, and imports nothing of zsp_lite.
 
+This file was written for zsp-lite and is under its licence (MIT). Blender's module is under the GPL; no part of it
+is in zsp-lite.
+
     python blender_scene.py FOLDER SAMPLES THREADS
 
 FOLDER/scene.npz holds the scene, see `zsp_lite.synthetic.path_tracing.write_scene`. The linear radiance of view K is

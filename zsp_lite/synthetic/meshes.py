@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
 from zsp_lite.synthetic.assembly import surface_spread
+from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
 MAX_BYTES = 300_000_000  # of a model file
@@ -196,8 +197,7 @@ def _material(given) -> Material:
     """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
     if hasattr(given, "baseColorFactor"):
         colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
-        # glTF's factors are linear.
-        colour = np.append(np.where(colour[:3] > 0, colour[:3] ** (1 / 2.2), 0), colour[3])
+        colour = np.append(linear_to_srgb(colour[:3]), colour[3])  # glTF's factors are linear
         metallic, roughness = (
             1.0 if value is None else float(value) for value in (given.metallicFactor, given.roughnessFactor)
         )

@@ -92,12 +92,12 @@ def export_models(
     check_integer("frames", frames, 1)
     check_integer("image_size", image_size, 32)
     check_integer("seed", seed, 0)
-    if not (isinstance(depth_bits, int) and 1 <= depth_bits <= 10):
-        raise InputError(f"depth_bits is {depth_bits!r}, expected an integer from 1 to 10")
+    check_integer("depth_bits", depth_bits, 1, 10)
     models, out = list_models(folder), Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
-    if renderer is not render_views:
-        settings["renderer"] = getattr(renderer, "__qualname__", type(renderer).__qualname__)
+    for key, given, own in (("renderer", renderer, render_views), ("sensor", sensor, simulate_capture)):
+        if given is not own:
+            settings[key] = getattr(given, "__qualname__", type(given).__qualname__)
     settings |= {"landscape": 1} if landscape else {}
     settings |= {"depth_bits": depth_bits} if depth_bits < 10 else {}
     rendered = _read_rendered(out, settings)

@@ -68,12 +68,16 @@ def path_traced_views(mesh: TexturedMesh, cameras: Sequence[Camera], rng: np.ran
 
 
 def trace(folder: Path, views: int, samples: int) -> list[Float[np.ndarray, "h w 3"]]:
-    """Run Blender on the scene of a folder and return the linear radiance of its views."""
+    """Run Blender on the scene of a folder and return the linear radiance of its views.
+
+    Raises:
+        InputError: If Blender's module is missing, fails, or is killed.
+    """
     command = [render_python(), str(_SCRIPT), str(folder), str(samples), os.environ.get("OMP_NUM_THREADS") or "0"]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if done.returncode or not all((folder / f"{k}.npy").is_file() for k in range(views)):
-        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise InputError(f"Blender failed in {command[0]}: {lines[-1]}")
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        raise InputError(f"Blender failed in {command[0]} with exit code {done.returncode}: {lines[-1]}")
     return [np.load(folder / f"{k}.npy") for k in range(views)]
 
 

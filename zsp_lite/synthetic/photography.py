@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.synthetic.textures import linear_to_srgb
+
 
 @dataclass(frozen=True, eq=False)
 class CheapCamera:
@@ -67,5 +69,4 @@ def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
 def _tone_curve(x: np.ndarray) -> np.ndarray:
     """Return sRGB values of linear ones by a filmic curve (Narkowicz's fit to ACES)."""
     x = x * 0.9
-    y = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
-    return np.where(y <= 0.0031308, 12.92 * y, 1.055 * cv2.pow(y, 1 / 2.4) - 0.055)
+    return linear_to_srgb(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1))

@@ -141,7 +141,7 @@ def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, plain: boo
 
 
 def _muted(texture: np.ndarray, limit: float = 0.08) -> np.ndarray:
-    """Reduce the saturation of a texture, so that its mean colour has at most that of `limit`."""
+    """Reduce the saturation of a texture, so that the saturation of its mean colour is at most `limit`."""
     mean, grey = texture.mean((0, 1)), texture.mean(-1, keepdims=True)
     saturation = 1 - mean.min() / mean.max()
     return texture if saturation <= limit else grey + (texture - grey) * (limit / saturation)

@@ -92,4 +92,6 @@ def look_up(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return the radiance of a panorama (rows from +z down) in directions (n, 3), bilinearly."""
     x, y, z = directions.T
     u, v = np.arctan2(y, x) / np.float32(2 * np.pi), np.arctan2(np.hypot(x, y), z) / np.float32(np.pi)
+    half = np.float32(0.5 / len(panorama))
+    v = np.clip(v, half, 1 - half)  # only the azimuth wraps: the zenith does not blend with the nadir
     return sample_image([panorama], u, v, None, cv2.BORDER_WRAP)

@@ -19,6 +19,13 @@ def srgb_to_linear(colour) -> np.ndarray:
     return np.where(colour <= 0.04045, colour / np.float32(12.92), curve)
 
 
+def linear_to_srgb(colour) -> np.ndarray:
+    """Convert linear colours in [0, 1] to sRGB; the inverse of `srgb_to_linear`."""
+    colour = np.asarray(colour, np.float32)
+    curve = cv2.pow(colour.reshape(-1, 1), 1 / 2.4).reshape(colour.shape)
+    return np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * curve - 0.055)
+
+
 def periodic_noise(
     rng: np.random.Generator, size: tuple[int, int], slope: float, stretch: tuple[float, float] = (1, 1)
 ):
