@@ -152,7 +152,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="samples, eval, or paper: 20 categories of 10 sequences of 100 frames, about "
+    help="samples (4 categories), eval (10), or paper: 20 categories of 10 sequences of 100 frames, about "
     "an hour and a half and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(
