@@ -68,8 +68,11 @@ def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray
     plots.draw_axes(
         axis, camera, lambda ends: origin + ends @ directions.T, np.zeros(3), _LENGTH, ("front", "left", "up")
     )
-    for artist in axis.texts:  # arrows that leave the picture do not move the panels
+    size = np.array(camera.size[::-1])
+    for artist in axis.texts:  # arrows that leave the picture do not move the panels, and their names stay inside
         artist.set_in_layout(False)
+        if artist.get_text():
+            artist.set_position(np.clip(artist.get_position(), 0.08 * size, 0.92 * size))
 
 
 def _title(result: PhotographResult) -> str:
