@@ -9,7 +9,7 @@ from zsp_lite.data.depth import patch_points
 from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic.export import make_object
+from zsp_lite.synthetic.export import export_categories, make_object
 from zsp_lite.synthetic.ground_truth import (
     correct_matches,
     ground_truth_matches,
@@ -29,7 +29,7 @@ def dataset() -> Co3D:
 
 @pytest.fixture(scope="module")
 def pair(dataset):
-    return demo_pairs(dataset)[0]
+    return demo_pairs(dataset)[1]  # cars; bicycles are too thin for the statistics of patches
 
 
 def surface(shape, n=20_000):
@@ -41,16 +41,17 @@ def surface(shape, n=20_000):
     return np.einsum("nk,nkd->nd", weights, corners[rng.choice(len(area), n, p=area / area.sum())])
 
 
-def test_patch_coordinates_lie_on_the_mesh_of_the_object(dataset, pair):
-    sequence = pair.reference_sequence
-    crop = object_crop(dataset.load(dataset.frame(pair.category, sequence, pair.reference_frame)))
-    pose = object_poses(dataset, pair.category)[sequence]
-    coordinates, known = patch_coordinates(crop, pose, GRID)
+def test_patch_coordinates_lie_on_the_mesh_of_the_object(tmp_path):
+    export_categories(["toytruck"], tmp_path, sequences=1, frames=1, seed=0, image_size=128)
+    exported = Co3D(tmp_path)
+    ((sequence, pose),) = object_poses(exported, "toytruck").items()
+    (frame,) = exported.frames("toytruck", sequence)
+    coordinates, known = patch_coordinates(object_crop(exported.load(frame)), pose, GRID)
     points = coordinates[known] * (pose.high - pose.low) + pose.low
-    mesh = surface(make_object(pair.category, sequence, seed=0))
+    mesh = surface(make_object("toytruck", sequence, seed=0))
     distance = NearestNeighbors(n_neighbors=1).fit(mesh).kneighbors(points)[0]
     assert known.sum() > 100
-    # The bicycle is about 7 units long and 7 units away; the depth has an error of half a percent.
+    # The truck is several units long and several units away; the depth has an error of half a percent.
     assert np.median(distance) < 0.05 and np.percentile(distance, 95) < 0.1
 
 
