@@ -17,8 +17,10 @@ settings.load_profile("no deadline")
 
 # Accept an int for a float.
 typechecker = beartype(conf=BeartypeConf(is_pep484_tower=True))
-# Must precede the first import of zsp_lite. Outside the tests, nothing is checked.
-install_import_hook("zsp_lite", f"{__name__}.typechecker")
+# Must precede the first import of zsp_lite. Outside the tests, and in `make check`, which is to be quick, nothing is
+# checked.
+if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
+    install_import_hook("zsp_lite", f"{__name__}.typechecker")
 
 from zsp_lite.errors import InputError  # noqa: E402
 

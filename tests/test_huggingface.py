@@ -341,6 +341,7 @@ def test_the_pipeline_estimates_a_pose_with_it(folders):
     assert np.isfinite(estimate.sim3.matrix).all()
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_it(folders, ellipsoids, tmp_path, capsys):
     name = f"hf:{folders['dinov3_vit']}"
     assert cli.main(["weights", "verify", name]) == 0

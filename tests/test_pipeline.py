@@ -223,6 +223,7 @@ def test_collinear_points_fall_back_and_say_so(method, reference):
     assert not estimate.reliable and "collinear" in estimate.note
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["paper", "verified"])
 @pytest.mark.parametrize("foreground", ["saliency", "mask"])
 def test_a_target_with_an_empty_mask_is_left_out_with_a_flag(method, reference, targets, solver, foreground):
@@ -264,6 +265,7 @@ def test_a_function_can_be_the_solver(method, reference, targets):
     assert list(estimate.timings) == ["crop", "features", "matching", "solver"]
 
 
+@pytest.mark.slow
 def test_a_solver_by_name_is_the_same_as_the_object(method, reference, targets):
     named = replace(method, solver="verified").estimate(reference, targets[:2])
     given = replace(method, solver=VerifiedSolver()).estimate(reference, targets[:2])

@@ -214,6 +214,7 @@ def test_a_change_of_unit_scales_lengths_and_keeps_pixels(chairs):
 # Sensor
 
 
+@pytest.mark.slow
 def test_a_third_to_a_half_of_the_depth_is_missing_in_connected_regions():
     unknown, on_object, isolated = [], [], []
     for index, category in enumerate(sorted(EVALUATION)[::2]):

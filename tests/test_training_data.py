@@ -46,6 +46,7 @@ def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypat
     assert (apart.min(1) >= 45).all()
 
 
+@pytest.mark.slow
 def test_render_set_continues_where_it_stopped(render_folder, renders):
     paths = render_set(render_folder, 4, shard=1)
     kept = {path: path.stat().st_mtime_ns for path in paths[1:]}

@@ -109,6 +109,7 @@ def test_tie_statistics_count_pairs_with_a_rival_within_the_margin():
     assert rows == [(0.5, 1, 1.0), (1.0, 2, 0.5)]
 
 
+@pytest.mark.slow
 def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog):
     with caplog.at_level(logging.INFO):
         outcomes = collect_outcomes(str(ellipsoids.root), 2, CoordinateBackbone(), n_targets=3)

@@ -239,6 +239,7 @@ def test_outliers_far_behind_the_object_are_left_out(views):
 # Proposals
 
 
+@pytest.mark.slow
 @given(seeds)
 def test_matches_with_outliers_propose_the_true_pose(seed):
     rng = np.random.default_rng(seed)
