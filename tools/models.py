@@ -120,7 +120,7 @@ def attribution(catalogue: Catalogue) -> str:
     lines = [
         "# Attribution",
         "",
-        f"The pictures show 3D models from Debian packages: {packages}.",
+        f"The pictures show 3D models from these Debian packages: {packages}.",
         "Each model was rotated, centred, scaled, and rendered in a room with a simulated camera and depth sensor; the",
         "table lists further changes. The licence was read in the file of the last column, in the archive of the model",
         "or in the package.",

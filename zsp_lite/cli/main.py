@@ -27,9 +27,9 @@ from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
     "synthetic objects, composed of primitives by zsp_lite.synthetic and rendered with depth holes and soft masks "
-    "as in CO3D; no photographs."
+    "as in CO3D."
 )
-MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D; no photographs."
+MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D."
 USER_NOTE = "the given folder in CO3D's layout."
 
 
@@ -117,7 +117,9 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     with console.status("estimating the pose of the photographed motorcycle"):
         photograph = list(run_photograph(dataset, model))
     if photograph:
-        table = Table(title=f"A real motorcycle, told by the synthetic {photograph[0].sequence}; truth by eye")
+        table = Table(
+            title=f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"
+        )
         for column in PHOTOGRAPH_COLUMNS:
             table.add_column(column, justify="left" if column in PHOTOGRAPH_COLUMNS[:2] else "right")
         for row in photograph_rows(photograph):
@@ -152,7 +154,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="samples (4 categories), eval (10), or paper: 20 categories of 10 sequences of 100 frames, about "
+    help="Procedural objects: samples (4 categories; not data_samples/), eval (10), or paper: 20 categories of 10 sequences of 100 frames, about "
     "an hour and a half and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(
