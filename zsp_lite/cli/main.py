@@ -154,8 +154,8 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="Procedural objects: samples (4 categories; not data_samples/), eval (10), or paper: 20 categories of 10 sequences of 100 frames, about "
-    "an hour and a half and 1.4 GB. An existing folder is completed.",
+    help="Procedural objects: samples (4 categories; not data_samples/), eval (10), or paper: 20 categories of 10 "
+    "sequences of 100 frames, about an hour and a half and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(
     "--category", "categories", multiple=True, metavar="NAME",
