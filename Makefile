@@ -7,7 +7,7 @@ RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks browser exercises doctor render-env clean
+.PHONY: help demo test check lint format lab notebooks browser hostile exercises doctor render-env clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -18,6 +18,7 @@ help:
 	@echo "make lab        JupyterLab on the notebooks"
 	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
+	@echo "make hostile    damaged, oversized and malicious inputs, each in a process with limits (Linux; minutes)"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
 	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1 GB)"
@@ -69,6 +70,9 @@ notebooks: $(STAMP)
 # Skipped where there is no Chromium.
 browser: $(STAMP)
 	$(RUN) -m pytest -v -m browser tests/browser
+
+hostile: $(STAMP)
+	$(RUN) -m tests.hostile
 
 # nbgrader starts the program `alembic`, which is in the environment's bin folder.
 exercises: $(STAMP)

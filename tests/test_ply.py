@@ -100,5 +100,5 @@ def test_missing_files_and_positions_that_are_not_finite_are_refused(path):
     with pytest.raises(InputError, match="cannot be read"):
         read_ply(path)
     write_ply(path, np.full((5, 3), np.nan), COLOURS)
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(InputError, match="expected finite"):
         read_ply(path)

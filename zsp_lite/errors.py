@@ -3,6 +3,9 @@
 import math
 import numbers
 
+# Largest coordinate, in any unit of length or in pixels.
+MAX_LENGTH = 1e9
+
 
 class InputError(ValueError):
     """Bad input: one line that names the argument or file, what was given and what was expected.
@@ -37,6 +40,20 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not above < value < math.inf:
         expected = "a finite number" + (f" greater than {above:g}" if above > -math.inf else "")
         raise InputError(f"{name} is {value!r}, expected {expected}")
+
+
+def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None:
+    """Check that all numbers of an array are finite and not greater than `most` in magnitude.
+
+    Beyond about 1e150, squares overflow and LAPACK's SVD may never return.
+
+    Raises:
+        InputError: A value is greater or not finite.
+    """
+    import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
+
+    if not (np.abs(values) <= most).all():  # False for NaN too
+        raise InputError(f"{name} holds {np.max(np.abs(values))}, expected finite numbers of at most {most:g}")
 
 
 def check_seed(name: str, value: object) -> None:

@@ -3,7 +3,6 @@
 import gzip
 import json
 import logging
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from zsp_lite.benchmark.database import SETTINGS, Records, read_records, read_settings
 from zsp_lite.benchmark.summary import category_of, summarise_rows, summarise_run
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.io.files import decompress, read_bytes, write_atomic
 
 logger = logging.getLogger(__name__)
 
@@ -89,8 +88,8 @@ def read_results(path: str | Path) -> Results:
             raise InputError(f"{path / SETTINGS}: no {', '.join(missing)}, expected the settings of a run")
         return results_of(settings, records)
     try:
-        content = json.loads(gzip.decompress(read_bytes(path, "results")))
-    except (OSError, EOFError, zlib.error, ValueError) as error:
+        content = json.loads(decompress(read_bytes(path, "results"), "data"))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"results {path}: not a gzip file with JSON, or damaged ({error})") from error
     try:
         keys = content["pairs"]

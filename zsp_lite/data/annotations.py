@@ -6,8 +6,8 @@ name and number of each frame only; `FrameIndex.frame` decodes and validates a w
 
 import gzip
 import io
+import itertools
 import re
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import msgspec
 
 from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import decompress as decompress_gzip
 from zsp_lite.io.files import read_bytes
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
@@ -125,7 +126,7 @@ def read_frame_index(path: Path) -> FrameIndex:
     """Read the frame annotations of a category.
 
     Raises:
-        InputError: The file is missing or truncated, or a frame has no sequence name or number.
+        InputError: The file is missing or truncated, a frame has no sequence name or number, or two have the same.
     """
     data = decompress(path)
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
@@ -136,6 +137,12 @@ def read_frame_index(path: Path) -> FrameIndex:
         by_sequence.setdefault(key.sequence_name, []).append(position)
     for positions in by_sequence.values():
         positions.sort(key=lambda position: keys[position].frame_number)
+        for first, second in itertools.pairwise(positions):
+            if keys[first].frame_number == keys[second].frame_number:
+                raise InputError(
+                    f"annotations {path}: entries {first} and {second} are both frame {keys[first].frame_number} of "
+                    f"{keys[first].sequence_name}, expected each frame once"
+                )
     return FrameIndex(path, entries, keys, by_sequence)
 
 
@@ -154,7 +161,7 @@ def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
         raise InputError(f"annotations {where}: {error}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"annotations {where} are not valid JSON: {error}") from error
 
 
@@ -162,13 +169,9 @@ def decompress(path: Path) -> bytes:
     """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity.
 
     Raises:
-        InputError: The file is missing or truncated.
+        InputError: The file is missing or truncated, or grows too much.
     """
-    compressed = read_bytes(path, "annotations")
-    try:
-        data = gzip.decompress(compressed)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"annotations {path} are not complete gzip data: {error}") from error
+    data = decompress_gzip(read_bytes(path, "annotations"), f"annotations {path}")
     # Python's json writes NaN and Infinity, which are not valid JSON. Null is then accepted by optional fields, and
     # refused by the others with the name of the field.
     if b"NaN" in data or b"Infinity" in data:

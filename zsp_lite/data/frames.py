@@ -15,6 +15,7 @@ from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
+from zsp_lite.io.images import decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 
@@ -244,17 +245,10 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
 
 def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
-    # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
-    # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
-    starts, ends = {b"\xff\xd8": (b"\xff\xda", b"\xff\xd9"), b"\x89P": (b"IDAT", b"IEND")}.get(data[:2], (b"", b""))
-    complete = data and (not ends or data.rfind(ends) > data.rfind(starts))
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
-    except cv2.error:  # the size in the header is beyond OpenCV's limit
-        image = None
-    if image is None:
-        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected a complete JPEG or PNG")
-    return image
+        return decode_image(data, flags)
+    except InputError as error:
+        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes): {error}") from error
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:

@@ -2,10 +2,8 @@
 
 import hashlib
 import io
-import lzma
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
@@ -17,16 +15,12 @@ from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_lab
 from zsp_lite.data.pairs import check_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder, fetch
-from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import ARCHIVE_ERRORS, decompress, growth_limit, plain_name, read_bytes, write_atomic
 
 # Residual above which the camera centres of v1 and v2 are not related by a similarity.
 MAX_RESIDUAL = 0.05
 _MIN_CAMERAS = 4
 _EXTENSIONS = {"class_labels": ".json", "determ_eval": ".pt"}  # by folder
-# Exceptions of zipfile and tarfile for truncated, damaged or encrypted archives and unknown compression methods.
-_ARCHIVE_ERRORS = (
-    zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError,
-)  # fmt: skip
 
 
 def import_labels(
@@ -189,17 +183,21 @@ def _read_archive(path: Path, sha256: str | None) -> Iterator[tuple[str, bytes]]
     try:
         if zipfile.is_zipfile(io.BytesIO(data)):
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                for name in archive.namelist():
-                    if _is_label_or_pairs(name):
-                        yield name, archive.read(name)
+                members = [member for member in archive.infolist() if _is_label_or_pairs(member.filename)]
+                if sum(member.file_size for member in members) > growth_limit(len(data)):
+                    raise ValueError(f"its labels are longer than {growth_limit(len(data))} bytes")
+                for member in members:
+                    yield member.filename, archive.read(member)
             return
-        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+        content = decompress(data, "its contents") if data[:2] == b"\x1f\x8b" else data
+        with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as archive:
             for member in archive:
                 if member.isfile() and _is_label_or_pairs(member.name):
                     yield member.name, archive.extractfile(member).read()
-    except _ARCHIVE_ERRORS as error:
+    except (*ARCHIVE_ERRORS, tarfile.TarError) as error:
         raise InputError(
-            f"archive {path} of {len(data)} bytes is damaged, encrypted or of another format, expected .zip or .tar.gz"
+            f"archive {path} of {len(data)} bytes is damaged, encrypted or of another format, expected .zip or .tar.gz "
+            f"({error})"
         ) from error
 
 

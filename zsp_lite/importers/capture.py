@@ -1,5 +1,6 @@
 """A frame of an RGB-D capture, and functions that the readers of the formats share."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from jaxtyping import Float, Real
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import path_inside, read_bytes
+from zsp_lite.io.files import path_inside, read_bytes, read_npy
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -158,10 +159,11 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     if path.suffix == ".npy":
+        data = read_bytes(path, "depth")
         try:
-            values = np.asarray(np.load(path, allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"depth {path} cannot be read as .npy: {error}") from error
+            values = read_npy(io.BytesIO(data), len(data))
+        except InputError as error:
+            raise InputError(f"depth {path} cannot be read as .npy: {error}, expected numbers (H, W)") from error
     else:
         values = read_grey16(path)
     if values.ndim != 2 or values.dtype.kind not in "fiu":

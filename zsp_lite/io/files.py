@@ -1,10 +1,15 @@
-"""Atomic writes, reads with errors that name the file, and checks of paths and names.
+"""Atomic writes, reads with limits and errors that name the file, and checks of paths and names.
 
 The standard library has no atomic write, and the package `atomicwrites` is no longer maintained.
 """
 
+import gzip
+import io
+import lzma
+import math
 import os
 import secrets
+import stat
 import zipfile
 import zlib
 from pathlib import Path
@@ -12,6 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from zsp_lite.errors import InputError
+
+MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
+# Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
+_GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
+# Exceptions of zipfile and of decompression for truncated, damaged or encrypted files and unknown methods.
+ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError, KeyError)
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
@@ -40,11 +51,61 @@ def read_bytes(path: str | Path, what: str) -> bytes:
     Raises:
         InputError: The file cannot be read.
     """
+    if (size := file_size(path, what)) > MAX_FILE:
+        raise InputError(f"{what} {path} is {size} bytes long, expected at most {MAX_FILE}")
     try:
         return Path(path).read_bytes()
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"{what} {path} cannot be read: {reason.lower()}") from error
+
+
+def file_size(path: str | Path, what: str) -> int:
+    """Return the size of a regular file in bytes. A pipe or a device, which may never end, is not opened.
+
+    Raises:
+        InputError: There is no file at `path`.
+    """
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the path
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{what} {_shown(path)} cannot be read: {reason.lower()}") from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
+        raise InputError(f"{what} {path} cannot be read: {kind}")
+    return status.st_size
+
+
+def growth_limit(size: int) -> int:
+    """Return the number of bytes to which `size` compressed bytes may grow."""
+    return max(size, min(MAX_FILE, max(_GROWTH_ALLOWED, _GROWTH_FACTOR * size)))
+
+
+def decompress(data: bytes, where: str) -> bytes:
+    """Decompress gzip data of one or several members.
+
+    Args:
+        data: The compressed data.
+        where: Kind and name of the file, for error messages.
+
+    Raises:
+        InputError: The data is damaged or incomplete, or grows beyond `growth_limit`.
+    """
+    limit = growth_limit(len(data))
+    try:
+        member = zlib.decompressobj(wbits=31)  # 31: gzip
+        content = member.decompress(data, limit + 1)
+        if member.unused_data:
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+                content = file.read(limit + 1)
+        elif not member.eof and len(content) <= limit:
+            raise EOFError("the end is missing")
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{where} are not complete gzip data: {error}") from error
+    if len(content) > limit:
+        raise InputError(f"{where} grow from {len(data)} to more than {limit} bytes, expected less")
+    return content
 
 
 def read_arrays(path: str | Path, names: tuple[str, ...], what: str) -> list[np.ndarray]:
@@ -56,13 +117,47 @@ def read_arrays(path: str | Path, names: tuple[str, ...], what: str) -> list[np.
         what: Kind of the file for error messages.
 
     Raises:
-        InputError: The file is missing or damaged, or lacks an array.
+        InputError: The file is missing or damaged, lacks an array, has one that is not of numbers, or grows beyond
+            `growth_limit`.
+    """
+    limit = growth_limit(file_size(path, what))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [archive.getinfo(f"{name}.npy") for name in names]
+            if (grown := sum(member.file_size for member in members)) > limit:
+                raise InputError(f"arrays of {grown} bytes, expected at most {limit}")
+            arrays = []
+            for member in members:
+                with archive.open(member) as file:
+                    arrays.append(read_npy(file, member.file_size))
+            return arrays
+    except ARCHIVE_ERRORS as error:
+        raise InputError(f"{what} {path} cannot be read: {error}; delete the file to create it again") from error
+
+
+def read_npy(file: io.BufferedIOBase, size: int) -> np.ndarray:
+    """Read an array of numbers or truth values in NumPy's .npy format.
+
+    Args:
+        file: The file, at its start.
+        size: Its size in bytes, which the array's shape must fit.
+
+    Raises:
+        InputError: The file is damaged, or its array is of another type or size.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return [file[name] for name in names]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{what} {path} cannot be read: {error}; delete the file to create it again") from error
+        version = np.lib.format.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"version {version} of the format")
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = header(file)
+        expected = size - file.tell()
+        if dtype.kind not in "biuf" or min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != expected:
+            raise ValueError(f"{dtype} of shape {shape} in {expected} bytes")
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"not an array of numbers ({error})") from error
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
@@ -95,3 +190,9 @@ def plain_name(name: str, what: str) -> str:
     if not isinstance(name, str) or not name or name.startswith(".") or any(c in "/\\:\0" for c in name):
         raise InputError(f"{what} name is {name!r}, expected a plain folder name")
     return name
+
+
+def _shown(path: str | Path) -> str:
+    """Format a path that may be very long or hold control characters."""
+    text = str(path)
+    return text if text.isprintable() and len(text) < 500 else f"{text[:100]!r}..."

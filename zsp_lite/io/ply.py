@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
 _COLOURS = ("red", "green", "blue")
@@ -57,15 +57,15 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
         if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken as [0, 255] otherwise.
 
     Raises:
-        InputError: The file is missing, truncated, empty or not a point cloud, or has positions that are not finite.
+        InputError: The file is missing, truncated, empty or not a point cloud, or has positions that are not finite
+            or above 1e9.
     """
     data = read_bytes(path, "point cloud")
     try:
         points, colours = _parse(data)
     except Exception as error:  # trimesh raises IndexError, KeyError and others for malformed files
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
-    if not np.isfinite(points).all():
-        raise InputError(f"point cloud {path} has positions that are not finite, expected finite numbers")
+    check_magnitude(f"point cloud {path}", points)
     return points, colours
 
 
@@ -75,11 +75,16 @@ def _parse(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
     # trimesh takes a comment that contains "end_header" for the end of the header.
     header, end, body = data.partition(b"\nend_header")
     header = re.sub(rb"\n(comment|obj_info)[^\n]*", b"", header)
-    if b"\nformat ascii" in header:  # trimesh does not compare the number of lines with the header
+    # trimesh does not compare the numbers of elements with the data.
+    if re.search(rb"\nproperty\s+list\s+\S+\s+\S+\s+[xyz]\s", header):
+        raise ValueError("coordinates as lists")
+    counts = [int(count) for count in re.findall(rb"\nelement\s+\S+\s+(\S+)", header)]
+    if any(not 0 <= count <= len(body) for count in counts):
+        raise ValueError(f"{counts} elements in {len(body)} bytes")
+    if b"\nformat ascii" in header:
         found = sum(bool(line.strip()) for line in body.splitlines())
-        declared = sum(map(int, re.findall(rb"\nelement\s+\S+\s+(\d+)", header)))
-        if found != declared:
-            raise ValueError(f"{found} lines of data, expected {declared} as in the header")
+        if found != sum(counts):
+            raise ValueError(f"{found} lines of data, expected {sum(counts)} as in the header")
     loaded = load_ply(io.BytesIO(header + end + body), fix_texture=False, skip_materials=True)
     if "vertices" not in loaded:
         raise ValueError("no vertices")

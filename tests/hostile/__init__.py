@@ -1,0 +1,1 @@
+"""Hostile inputs: `python -m tests.hostile`, or `make hostile`."""

@@ -1,0 +1,123 @@
+"""Run every hostile input in a forked process with limits on memory and time, and print a table.
+
+    python -m tests.hostile [GROUP ...]
+
+The libraries are imported once, before the processes fork. A case fails by a traceback, by a wrong answer without an
+error, after 20 s, or with 1 GB more memory than the idle process. Linux only.
+"""
+
+import gc
+import os
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from pathlib import Path
+
+os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", "HF_HUB_OFFLINE": "1", "COLUMNS": "120"}
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the helpers of the other tests
+
+import cv2  # noqa: E402
+import torch  # noqa: E402
+import transformers  # noqa: E402, F401
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+from rich.text import Text  # noqa: E402
+
+from tests.hostile import cases_api, cases_data, cases_files, cases_models, cases_runs, cases_text  # noqa: E402
+from tests.hostile.harness import CASES, Wrong, prepare  # noqa: E402
+from zsp_lite.errors import InputError  # noqa: E402
+
+MODULES = (cases_files, cases_data, cases_models, cases_runs, cases_text, cases_api)  # each registers its cases
+SECONDS, MEMORY = 20, 1 << 30  # limits of a case, bytes
+KINDS = ("refused", "right", "traceback", "wrong", "hang", "memory")
+GOOD = KINDS[:2]
+
+
+def run_case(case, folder: Path, idle: int) -> tuple[str, str, float, int]:
+    """Run a case in a forked process.
+
+    Returns:
+        One of `KINDS`, the message, the processor time in seconds, and the memory beyond `idle` in bytes.
+    """
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        os.setsid()
+        for stream in (1, 2):
+            os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+        os.chdir(folder)
+        resource.setrlimit(resource.RLIMIT_CPU, (2 * SECONDS, 2 * SECONDS))
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)  # the machine's memory is not to fill up
+        try:
+            kind, message = case.outcome(folder)
+        except InputError as error:
+            kind, message = case.refused(error)
+        except Wrong as error:
+            kind, message = "wrong", str(error)
+        except BaseException as error:
+            lines = traceback.format_exc().strip().splitlines()
+            kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
+        os.write(writing, f"{kind}\n{message}".encode(errors="backslashreplace")[:4000])
+        os._exit(0)
+    os.close(writing)
+    end = time.monotonic() + SECONDS
+    done = 0
+    while not done and time.monotonic() < end:
+        done, _, used = os.wait4(child, os.WNOHANG)
+        time.sleep(0 if done else 0.003)
+    if not done:
+        os.killpg(child, signal.SIGKILL)
+        _, _, used = os.wait4(child, 0)
+    with open(reading, "rb") as pipe:
+        kind, _, message = pipe.read().decode(errors="replace").partition("\n") if done else ("hang", "", "")
+    more = max(0, 1024 * used.ru_maxrss - idle)
+    kind = "memory" if more > MEMORY else kind or "traceback"
+    return kind, message or ("the process died" if kind == "traceback" else ""), used.ru_utime + used.ru_stime, more
+
+
+def main(groups: list[str]) -> int:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(0)
+    start, work = time.monotonic(), Path(tempfile.mkdtemp(prefix="hostile-"))
+    try:
+        template = prepare(work / "template")
+        gc.freeze()  # a collection in a child would copy every page
+        idle, results = 0, []
+        for number, case in enumerate(case for case in CASES if not groups or case.group in groups):
+            folder = work / str(number)
+            shutil.copytree(template, folder, symlinks=True)
+            if not idle:
+                idle = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            results.append((case, *run_case(case, folder, idle)))
+            shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    console = Console(width=150 if not sys.stdout.isatty() else None)
+    table = Table(title=f"{len(results)} hostile inputs")
+    for column in ("group", "cases", *KINDS, "CPU s", "most MB"):
+        table.add_column(column, justify="left" if column == "group" else "right")
+    for group in [*dict.fromkeys(case.group for case in CASES), "all"]:
+        found = [result for result in results if group in (result[0].group, "all")]
+        if found:
+            counts = Counter(kind for _, kind, *_ in found)
+            times, most = sum(result[3] for result in found), max(result[4] for result in found) / 1e6
+            cells = (len(found), *(counts[kind] or "" for kind in KINDS), f"{times:.0f}", f"{most:.0f}")
+            table.add_row(group, *map(str, cells), end_section=group == list(dict.fromkeys(c.group for c in CASES))[-1])
+    console.print(table)
+    for case, kind, message, *_ in results:
+        if kind not in GOOD or "-v" in sys.argv:
+            console.print(Text(f"{kind}: {case.group}: {case.name}: {' '.join(message.split())[:700]}"))
+    bad = sum(kind not in GOOD for _, kind, *_ in results)
+    console.print(f"{len(results) - bad} of {len(results)} as expected, {time.monotonic() - start:.0f} s")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main([name for name in sys.argv[1:] if not name.startswith("-")]))
