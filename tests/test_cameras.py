@@ -150,7 +150,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"R": np.full((3, 3), np.nan)}, "R is not finite"),
         ({"t": [0, 0, np.inf]}, "t is not finite"),
         ({"t": "somewhere"}, "t is 'somewhere'"),
-        ({"focal_length": [500, 0]}, "expected positive pixels"),
+        ({"focal_length": [500, 0]}, "expected at least 0.001 pixels"),
         ({"principal_point": [np.nan, 0]}, "principal_point is not finite"),
         ({"size": (0, 5)}, "expected positive"),
         ({"size": 5}, "image size is 5"),

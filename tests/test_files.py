@@ -1,6 +1,7 @@
 """Limits on files: what is no file, grows too much, is too large or damaged is refused before it is read."""
 
 import gzip
+import io
 import os
 import struct
 import threading
@@ -9,14 +10,21 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
+import torch
 from co3d_folders import edit_json, sequence_data
 
+from zsp_lite.backbones.checkpoints import build_vit, read_checkpoint
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.data.annotations import read_frame_index
-from zsp_lite.data.co3d import write_co3d
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import read_image
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decompress, growth_limit, read_arrays, read_bytes
 from zsp_lite.io.ply import read_ply, write_ply
+from zsp_lite.io.tensors import load_torch
 
 PICTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
 
@@ -113,3 +121,73 @@ def test_coordinates_that_overflow_when_squared_are_refused(tmp_path):
     (tmp_path / "x.ply").write_text(text + "end_header\n1e155 0 0\n")
     with pytest.raises(InputError, match=r"holds 1e\+155, expected finite numbers of at most 1e\+09"):
         read_ply(tmp_path / "x.ply")
+
+
+def _saved(content) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+def test_a_tensor_with_more_values_than_its_file_stores_is_refused():
+    stored = torch.arange(6.0).reshape(2, 3)
+    assert torch.equal(load_torch(_saved({"a": [stored.T]}), "file")["a"][0], stored.T)
+    with pytest.raises(InputError, match=r"file: tensor of shape \(10000000000,\) is not dense"):
+        load_torch(_saved([{"a": (torch.zeros(1).expand(10**10),)}]), "file")
+
+
+def test_a_compressed_torch_file_is_refused(tmp_path):
+    with (
+        zipfile.ZipFile(io.BytesIO(_saved({"a": torch.zeros(9)}))) as old,
+        zipfile.ZipFile(tmp_path / "x.pth", "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    with pytest.raises(InputError, match="checkpoint .*x.pth: damaged, .*compressed entries"):
+        read_checkpoint(tmp_path / "x.pth")
+
+
+def test_blocks_that_are_not_numbered_from_zero_are_refused_before_a_network_is_built():
+    weights = VisionTransformer(16, 8, 64, 1, 1).state_dict()
+    with pytest.raises(InputError, match="2 blocks, not numbered from 0 to 1"):
+        build_vit(weights | {"blocks.100000000.norm1.weight": torch.zeros(64)})
+
+
+def test_a_long_message_keeps_its_beginning_and_end():
+    message = str(InputError("begin" + "x" * 100_000 + "end"))
+    assert len(message) < 1000 and message.startswith("begin") and message.endswith("end")
+
+
+@pytest.mark.parametrize("name, value", [("T", 1e155), ("focal_length", 1e-300), ("principal_point", 1e300)])
+def test_a_camera_of_absurd_magnitude_is_refused(name, value):
+    values = {"R": np.eye(3), "T": np.zeros(3), "focal_length": np.ones(2), "principal_point": np.zeros(2)}
+    with pytest.raises(InputError, match=f"{name} .*expected"):
+        Camera.from_pytorch3d(**values | {name: np.full(values[name].shape, value)}, size=(20, 20))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"target_seq_name": "a"}, "'a' is compared with itself"),
+        ({"all_target_id": [3, 4]}, "2 targets, expected 1 as in the name of its folder"),
+        ({"reference_frame_id": True}, "frame id is True"),
+    ],
+)
+def test_a_pair_that_cannot_be_evaluated_as_its_set_says_is_refused(tmp_path, change, message):
+    write_co3d(tmp_path, "cup", [sequence_data("a", 3), sequence_data("b", 3)])
+    pair = {"class": "cup", "reference_seq_name": "a", "reference_frame_id": 0, "target_seq_name": "b",
+            "all_target_id": [3]}  # fmt: skip
+    path = tmp_path / "determ_eval/1samples_1tgt/cup.pt"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(_saved([pair]))
+    assert read_upstream_pairs(path, Co3D(tmp_path))[0].target_frames == (0,)
+    path.write_bytes(_saved([pair | change]))
+    with pytest.raises(InputError, match=message):
+        read_upstream_pairs(path, Co3D(tmp_path))
+
+
+def test_labels_with_two_references_are_refused(tmp_path):
+    for name in "ab":
+        write_label(tmp_path, "cup", PoseLabel(np.eye(4), name, name))
+    with pytest.raises(InputError, match="have references a, b, expected one"):
+        read_labels(tmp_path, "cup")

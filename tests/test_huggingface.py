@@ -428,7 +428,7 @@ def test_pickles_are_not_read(tmp_path):
 @pytest.mark.parametrize(
     "file, content, match",
     [
-        ("model.safetensors", b"<html>404</html>", "cannot be loaded"),
+        ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), "cannot be loaded"),
         ("config.json", b"{", "config.json"),
         ("config.json", b'{"model_type": "no such"}', "config.json"),
         ("preprocessor_config.json", b"{", "preprocessor_config.json is not JSON"),

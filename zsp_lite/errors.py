@@ -5,14 +5,18 @@ import numbers
 
 # Largest coordinate, in any unit of length or in pixels.
 MAX_LENGTH = 1e9
+_LONGEST = 1000  # characters of a message
 
 
 class InputError(ValueError):
     """Bad input: one line that names the argument or file, what was given and what was expected.
 
     The command line prints that line on stderr and exits with code 2. Every other exception is a bug and shows its
-    traceback.
+    traceback. Of a very long message, such as one with a long path, the beginning and the end are kept.
     """
+
+    def __init__(self, message: str):
+        super().__init__(message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}")
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | None = None) -> None:

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import file_size
+from zsp_lite.io.tensors import load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -22,16 +24,15 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
         InputError: If the file is damaged or contains anything but tensors.
     """
     path = Path(path)
-    try:
-        if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
+        file_size(path, "checkpoint")
+        try:
             with safe_open(path, framework="pt") as file:
                 return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        # A damaged file can raise almost any exception. torch's own message recommends unsafe loading: not shown.
-        reason = (str(error).splitlines() or [""])[0]
-        reason = type(error).__name__ if not reason or reason.startswith("Weights only load failed") else reason
-        raise InputError(f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})") from error
+        except Exception as error:  # a damaged file can raise almost any exception
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})") from error
+    content = load_torch(path, f"checkpoint {path}")
     for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints contain teacher and student
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
@@ -76,7 +77,9 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: st
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
-        depth = 1 + max(int(key.split(".")[1]) for key in weights if key.startswith("blocks."))
+        blocks = {int(key.split(".")[1]) for key in weights if key.startswith("blocks.")}
+        if (depth := len(blocks)) == 0 or blocks != set(range(depth)):
+            raise ValueError(f"{depth} blocks, not numbered from 0 to {depth - 1}")
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"{name}: not a vision transformer in the DINO layout ({error})") from error
     if num_heads is None:

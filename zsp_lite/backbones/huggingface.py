@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from zsp_lite.backbones.facets import Facet
 from zsp_lite.backbones.vit import Tokens
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.io.files import file_size
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's
@@ -151,6 +152,7 @@ def load_huggingface(name: str, image_size: int | None = None) -> HuggingFaceViT
         ) from error
     vision = getattr(config, "vision_config", config)  # CLIP and similar models: the image encoder
     patch_size, _ = _sizes(vision, name)
+    _check_bytes(vision, folder, name)
     if hasattr(vision, "mask_ratio"):
         vision.mask_ratio = 0.0  # a masked autoencoder must see the whole image
     try:
@@ -286,6 +288,18 @@ def _sizes(config, name: str) -> tuple[int, int]:
     if getattr(config, "num_channels", 3) != 3:
         raise InputError(f"{name}: takes {config.num_channels} channels, expected 3")
     return patch, heads
+
+
+def _check_bytes(config, folder: Path, name: str) -> None:
+    """Raise InputError if the matrices that a configuration describes would not fit into the files of weights."""
+    size = sum(file_size(path, "weights") for path in folder.glob("model*.safetensors"))
+    width, layers = getattr(config, "hidden_size", None), config.num_hidden_layers
+    width = width if isinstance(width, int) else 1
+    described = max(layers, 1) * width * max(4 * width, getattr(config, "intermediate_size", None) or 0)
+    if described > size or min(width, layers) < 1:
+        raise InputError(
+            f"{name}: config.json describes {layers} layers of {width} channels, which do not fit into {size} bytes"
+        )
 
 
 def _projections(attention: nn.Module) -> dict[str, nn.Module]:

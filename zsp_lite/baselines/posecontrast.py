@@ -23,6 +23,7 @@ from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder
+from zsp_lite.io.tensors import load_torch
 
 FILE = "posecontrast.pth"  # in the cache folder; there is no permanent URL
 TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "posecontrast-tiny.safetensors"
@@ -107,10 +108,7 @@ def load_posecontrast(path: str | Path | None = None) -> PoseContrast:
         raise InputError(
             f"posecontrast: no checkpoint at {path}; copy the authors' file there, or use posecontrast-tiny"
         )
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch does not limit the types of its exceptions here
-        raise InputError(f"posecontrast {path}: damaged, or holds more than tensors") from error
+    content = load_torch(path, f"posecontrast {path}")
     parts = [content.get(part) if isinstance(content, dict) else None for part in ("net_feat", "net_vp")]
     if not all(isinstance(part, dict) for part in parts):
         raise InputError(f"posecontrast {path}: expected a dict with net_feat and net_vp")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_magnitude
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 
@@ -23,6 +23,7 @@ _AXES = np.array([-1.0, -1.0, 1.0])
 # decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
 _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
+_MIN_FOCAL_LENGTH = 1e-3  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +38,8 @@ class Camera:
         size: Image (height, width), pixels.
 
     Raises:
-        InputError: A value is not finite or has another shape, `R` is not a rotation, or a focal length or the size
-            is not positive.
+        InputError: A value is not finite, above 1e9 or of another shape, `R` is not a rotation, a focal length is
+            below 1e-3, or the size is not positive.
     """
 
     R: Float[np.ndarray, "3 3"]
@@ -56,8 +57,10 @@ class Camera:
         if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        if (self.focal_length <= 0).any():
-            raise InputError(f"camera focal_length is {self.focal_length.tolist()}, expected positive pixels")
+        if (self.focal_length < _MIN_FOCAL_LENGTH).any():
+            raise InputError(
+                f"camera focal_length is {self.focal_length.tolist()}, expected at least {_MIN_FOCAL_LENGTH} pixels"
+            )
         object.__setattr__(self, "size", _image_size(self.size))
 
     def __repr__(self) -> str:
@@ -221,6 +224,7 @@ def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> 
         raise InputError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
         raise InputError(f"{what} is not finite: {array.tolist()}")
+    check_magnitude(what, array)
     return array
 
 

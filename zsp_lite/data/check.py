@@ -7,7 +7,7 @@ from pathlib import Path
 from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
 from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import label_folder, read_labels
+from zsp_lite.data.labels import label_folder, read_label_files
 from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
@@ -113,7 +113,7 @@ def _check_category(dataset: Co3D, category: str, deep: bool) -> CategoryCheck:
 
 def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usable: set[str]) -> None:
     try:
-        labels = read_labels(dataset.root, check.category)
+        labels = read_label_files(dataset.root, check.category)
     except InputError as error:
         check.problems.append(str(error))
         labels = {}

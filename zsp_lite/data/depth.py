@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
@@ -20,7 +20,12 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
 
     Returns:
         (H, W) depth, float32; values that are not finite or not positive become 0 (unknown).
+
+    Raises:
+        InputError: The factor is not positive, or above 1e9.
     """
+    check_number("depth scale_adjustment", scale_adjustment, above=0)
+    check_magnitude("depth scale_adjustment", scale_adjustment)
     depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
-from zsp_lite.errors import InputError
+from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
 from zsp_lite.io.images import decode_image
@@ -48,7 +48,7 @@ class Frame:
         if rgb.shape[:2] != self.camera.size:
             raise InputError(f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's {self.camera.size}")
         object.__setattr__(self, "rgb", rgb)
-        for name, top in (("depth", np.inf), ("mask", 1.0)):
+        for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
             if getattr(self, name) is None:
                 continue
             values = np.asarray(getattr(self, name), dtype=np.float32)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 
 # Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
@@ -59,6 +59,7 @@ class PoseLabel:
         deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
         if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
             raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid transform")
+        check_magnitude(f"label of {self.seq}: trans", trans)
         object.__setattr__(self, "trans", trans)
 
 
@@ -80,8 +81,17 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
 
     Raises:
         InputError: A file cannot be read, lacks a field, is not rigid, or is the label of another sequence than its
-            name says.
+            name says; or the labels have several reference sequences.
     """
+    labels = read_label_files(root, category)
+    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
+        folder = label_folder(root, category)
+        raise InputError(f"labels in {folder} have references {', '.join(references)}, expected one")
+    return labels
+
+
+def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
+    """Read the labels of a category, also if they have several reference sequences (see `read_labels`)."""
     labels = {}
     for path in sorted(label_folder(root, category).glob("*.json")):
         label = parse_label(read_bytes(path, "label"), str(path))

@@ -6,6 +6,8 @@ code: torch files that refer to frames by their positions in the category's fram
 
 import hashlib
 import io
+import re
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +17,12 @@ import torch
 
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.tensors import load_torch
 
 _FIELDS = ("class", "reference_seq_name", "reference_frame_id", "target_seq_name", "all_target_id")
+_MOST_PAIRS = 100_000  # of a category
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,8 @@ def sample_pairs(
     Raises:
         InputError: Fewer than two sequences are labelled, or a sequence has fewer than `n_targets` frames.
     """
-    if n < 1 or n_targets < 1:
-        raise InputError(f"pairs to sample are {n} with {n_targets} targets each, expected at least 1 and 1")
+    check_integer("number of pairs", n, 1, _MOST_PAIRS)
+    check_integer("number of targets", n_targets, 1)
     if not isinstance(seed, np.random.Generator):
         seed = np.random.default_rng([seed, _stable_hash(category)])
     numbers: dict[str, list[int]] = {}
@@ -151,13 +155,19 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     The file is loaded with `weights_only=True`, so code in it is not executed.
 
     Raises:
-        InputError: The file holds more than plain data, has another structure, or does not fit the data set.
+        InputError: The file holds more than plain data, has another structure, compares a sequence with itself, has
+            another number of targets than its folder says, or does not fit the data set.
     """
     where = f"evaluation pairs {path}"
+    named = re.fullmatch(r".*_(\d{1,6})tgt", Path(path).resolve().parent.name)
     pairs = []
     for number, item in enumerate(check_upstream_pairs(read_bytes(path, "evaluation pairs"), where)):
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)
         place = f"{where}, pair {number}"
+        if reference == target:
+            raise InputError(f"{place}: {reference!r} is compared with itself, expected two sequences")
+        if named and len(target_ids) != int(named[1]):
+            raise InputError(f"{place}: {len(target_ids)} targets, expected {named[1]} as in the name of its folder")
         reference_frame = _frame_number(dataset, category, reference, reference_id, place)
         target_frames = tuple(_frame_number(dataset, category, target, position, place) for position in target_ids)
         pairs.append(Pair(category, reference, reference_frame, target, target_frames))
@@ -177,10 +187,7 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
     Raises:
         InputError: The file holds more than plain data, or has another structure.
     """
-    try:
-        items = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # torch does not limit the types of its exceptions here
-        raise InputError(f"{where} are not a torch file of plain data") from error
+    items = load_torch(data, where)
     if not isinstance(items, list):
         raise InputError(f"{where} hold a {type(items).__name__}, expected a list of dicts")
     for number, item in enumerate(items):
@@ -192,7 +199,9 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
         ids = item["all_target_id"]
         item["all_target_id"] = ids = ids.tolist() if isinstance(ids, torch.Tensor) else ids
         if not isinstance(ids, (list, tuple)) or not ids:
-            raise InputError(f"{where}, pair {number}: all_target_id is {ids!r}, expected positions in the frame list")
+            raise InputError(
+                f"{where}, pair {number}: all_target_id is {reprlib.repr(ids)}, expected positions in the frame list"
+            )
     return items
 
 
@@ -226,8 +235,8 @@ def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: 
     frames = dataset.frame_list(category)
     if isinstance(position, torch.Tensor) and position.numel() == 1:
         position = position.item()
-    if not isinstance(position, int) or not 0 <= position < len(frames):
-        raise InputError(f"{where}: frame id is {position!r}, expected 0 to {len(frames) - 1}")
+    if not isinstance(position, int) or isinstance(position, bool) or not 0 <= position < len(frames):
+        raise InputError(f"{where}: frame id is {reprlib.repr(position)}, expected 0 to {len(frames) - 1}")
     if frames[position].sequence_name != sequence:
         raise InputError(f"{where}: frame id {position} is of {frames[position].sequence_name}, expected {sequence}")
     return frames[position].frame_number

@@ -21,6 +21,7 @@ from zsp_lite.errors import InputError
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
 _GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
+_LONGEST_NAME, _LONGEST_PATH = 255, 4096  # bytes, on most file systems
 # Exceptions of zipfile and of decompression for truncated, damaged or encrypted files and unknown methods.
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError, KeyError)
 
@@ -168,6 +169,11 @@ def path_inside(root: str | Path, relative: str) -> Path:
     """
     resolved_root = Path(root).resolve()
     try:
+        if (
+            any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(relative).parts)
+            or len(relative) > _LONGEST_PATH
+        ):
+            raise ValueError("too long")
         resolved = (resolved_root / relative).resolve()
         inside = resolved.is_relative_to(resolved_root) and not Path(relative).is_absolute()
     except (ValueError, OSError, RuntimeError) as error:  # null byte, name too long, cyclic links
@@ -189,6 +195,8 @@ def plain_name(name: str, what: str) -> str:
     """
     if not isinstance(name, str) or not name or name.startswith(".") or any(c in "/\\:\0" for c in name):
         raise InputError(f"{what} name is {name!r}, expected a plain folder name")
+    if len(name.encode(errors="surrogateescape")) > _LONGEST_NAME:
+        raise InputError(f"{what} name has {len(name)} characters, expected at most {_LONGEST_NAME} bytes")
     return name
 
 
