@@ -3,13 +3,14 @@
 All trials of RANSAC are fitted by one batched SVD, so that a thousand of them take milliseconds.
 """
 
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError, check_integer, check_seed
+from zsp_lite.errors import InputError, check_integer, check_magnitude, check_seed, real_array
 
 # Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
 # paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
@@ -21,6 +22,7 @@ _COLLINEAR_SAMPLE = 1e-6
 _COLLINEAR = 1e-10
 # The same for a single cloud, as a ratio of widths: the rounding of float32 coordinates on a line stays below it.
 _COLLINEAR_CLOUD = 1e-5
+_MOST_TRIALS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +43,9 @@ class Sim3:
     t: Float[np.ndarray, "3"]
 
     def __post_init__(self):
-        scale = float(self.scale)
-        rotation, translation = np.asarray(self.R, dtype=np.float64), np.asarray(self.t, dtype=np.float64)
+        if not isinstance(self.scale, numbers.Real):
+            raise InputError(f"Sim3: scale is {self.scale!r}, expected a positive number")
+        scale, rotation, translation = float(self.scale), real_array("Sim3: R", self.R), real_array("Sim3: t", self.t)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise InputError(
                 f"Sim3: R and t have shapes {rotation.shape} and {translation.shape}, expected (3, 3) and (3,)"
@@ -181,12 +184,12 @@ def ransac(
         InputError: Shapes are wrong, there are too few points, values are not finite, a setting is out of range, or
             every sample is collinear or has a scale out of range.
     """
-    check_integer("ransac: trials", trials, 1)
+    check_integer("ransac: trials", trials, 1, _MOST_TRIALS)
     check_integer("ransac: sample_size", sample_size, 3)
     check_seed("ransac: seed", seed)
-    if not threshold > 0:
-        raise InputError(f"ransac: threshold is {threshold}, expected a positive number")
-    if not 0 <= scale_range[0] <= scale_range[1]:
+    if not isinstance(threshold, numbers.Real) or not threshold > 0:
+        raise InputError(f"ransac: threshold is {threshold!r}, expected a positive number")
+    if real_array("ransac: scale_range", scale_range).shape != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
         raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
@@ -259,13 +262,15 @@ def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> I
 
 def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np.ndarray, np.ndarray]:
     """Convert corresponding points to float64 arrays and check them."""
-    source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    source, target = real_array("source", source), real_array("target", target)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("source or target holds non-finite coordinates, expected finite ones")
+    check_magnitude("source", source)
+    check_magnitude("target", target)
     for name, points in (("source", source), ("target", target)):
         longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _COLLINEAR_CLOUD * longest:

@@ -2,6 +2,11 @@
 
 import math
 import numbers
+import reprlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # Largest coordinate, in any unit of length or in pixels.
 MAX_LENGTH = 1e9
@@ -58,6 +63,23 @@ def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None
 
     if not (np.abs(values) <= most).all():  # False for NaN too
         raise InputError(f"{name} holds {np.max(np.abs(values))}, expected finite numbers of at most {most:g}")
+
+
+def real_array(name: str, values: object) -> "np.ndarray":
+    """Convert real numbers to a float64 array. Texts and complex numbers, which NumPy would convert, are refused.
+
+    Raises:
+        InputError: The values are of another type or of irregular shape.
+    """
+    import numpy as np
+
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf":
+            raise TypeError(f"an array of type {array.dtype}")
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name} is {reprlib.repr(values)}, expected real numbers") from error
 
 
 def check_seed(name: str, value: object) -> None:

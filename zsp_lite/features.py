@@ -41,14 +41,19 @@ class FeatureMap:
     global_feature: Float[Tensor, " e"]
 
     def __post_init__(self):
+        for name in ("keys", "saliency", "global_feature"):
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) or not value.is_floating_point():
+                kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
+                raise InputError(f"FeatureMap: {name} is {kind}, expected a tensor of floats")
         if self.keys.ndim != 3 or 0 in self.keys.shape:
             raise InputError(f"FeatureMap: keys have shape {tuple(self.keys.shape)}, expected (H, W, D)")
         if self.saliency.shape != self.keys.shape[:2]:
             raise InputError(
                 f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
-        if not bool(self.keys.isfinite().all() & self.saliency.isfinite().all()):
-            raise InputError("FeatureMap: keys or saliency hold values that are not finite")
+        if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
+            raise InputError("FeatureMap: keys, saliency or global feature hold values that are not finite")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape

@@ -134,7 +134,8 @@ def object_weights(
         )
     weights = np.empty((resamples, len(objects)))
     for category in np.unique(categories):
-        rng = np.random.default_rng([seed, int.from_bytes(hashlib.sha256(category.encode()).digest()[:8], "big")])
+        digest = hashlib.sha256(category.encode(errors="surrogateescape")).digest()
+        rng = np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
         members = np.nonzero(categories == category)[0]
         names, sides = np.unique(objects[members], return_inverse=True)
         first, second = sides.reshape(-1, 2).T

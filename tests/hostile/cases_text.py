@@ -1,1 +1,73 @@
-"""To come."""
+"""Names that mean something to a terminal, to TeX, to HTML or to Markdown, and names that are not UTF-8."""
+
+import gzip
+import json
+import shutil
+
+from tests.hostile.cases_runs import _results, _write
+from tests.hostile.harness import Wrong, case, command
+from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown
+from zsp_lite.benchmark.reports import write_reports
+from zsp_lite.benchmark.tables import every_table
+from zsp_lite.cli.terminal import print_tables
+from zsp_lite.viz.plots import show_images
+
+NAMES = ("[/1]", "[red]x[/blue]", "$x_$", "$\\frac{$", "a_b^c", "%d {0} {x}", "<script>alert(1)</script>", "| a | b |",
+         "\\textbf{", "&amp;", "\udcff\udcfe", "a\nb", "\x1b[31mred", "\u202eabc", "x" * 300, "#~{}")  # fmt: skip
+
+
+def _named(name):
+    """Results whose row, category and backbone have a name."""
+
+    def change(content):
+        content["pairs"] = [f"{name.replace('/', '')}/a:{i}/b:0,1" for i in range(4)]
+        content["rows"][name] = content["rows"].pop("ours")
+        content["settings"]["methods"] = {name: "m"}
+        from zsp_lite.benchmark.summary import summarise_rows
+
+        rows = {name: {key: {"error": 5.0} for key in content["pairs"]}}
+        data = {"root": name, "categories": [name.replace("/", "")], "pairs": 4, "targets": 2, "seed": 0}
+        content["summary"] = {"data": data, "backbone": name, **summarise_rows(rows)}
+        for row in content["summary"]["methods"].values():
+            row |= {"failed": 0, "flagged": 0}
+
+    return _results(change)
+
+
+def _reports(folder, name):
+    _write(_named(name))(folder)
+    results = write_reports(folder / "r.json.gz", folder / "reports")
+    print_tables(every_table(results.summary))
+    for table in every_table(results.summary):
+        for render in (as_csv, as_html, as_latex, as_markdown):
+            text = render(table)
+            if render is as_html and "<script>" in text:
+                raise Wrong(f"script in {text[:200]}")
+    return "written"
+
+
+for name in NAMES:
+    case("text", f"reports of a run with {name[:20]!r}", lambda folder, name=name: _reports(folder, name), answers=True)
+    command("text", f"tables of a run with {name[:20]!r}", "tables", "ROOT/r.json.gz", codes=(0,),
+            change=lambda folder, name=name: _write(_named(name))(folder))  # fmt: skip
+
+    def titles(folder, name=name):
+        figure, _ = show_images([[[0.0]]], [name])
+        figure.savefig(folder / "x.png")
+        return figure
+
+    case("text", f"title {name[:20]!r}", titles, answers=True)
+
+    def renamed(folder, name=name):
+        new = name.replace("/", "")[:200]
+        for parent in ("data", "data/class_labels"):
+            (folder / parent / "cup").rename(folder / parent / new)
+        for file in ("frame_annotations.jgz", "sequence_annotations.jgz"):
+            path = folder / "data" / new / file
+            text = json.loads(gzip.decompress(path.read_bytes()))
+            path.write_bytes(gzip.compress(json.dumps(text).encode()))
+
+    command("text", f"data check of a category {name[:20]!r}", "data", "check", "ROOT/data", change=renamed, codes=(1,))
+    command("text", f"benchmark of a category {name[:20]!r}", "benchmark", "--data", "ROOT/data", "--pairs", "1", "--targets",
+            "1", "--methods", "icp", "--out", "ROOT/out", change=lambda folder, renamed=renamed: (
+                renamed(folder), shutil.rmtree(folder / "data/class_labels")))  # fmt: skip

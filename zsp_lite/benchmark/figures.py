@@ -160,12 +160,13 @@ def write_figures(results: Results, folder: str | Path) -> list[Path]:
     }
     written = []
     for name, make in makers.items():
-        try:
-            figure = make()
-        except InputError:  # the run has no rows for this figure
-            continue
         path = folder / f"{name}.png"
-        figure.savefig(path, dpi=_DPI)
+        with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
+            try:
+                figure = make()
+            except InputError:  # the run has no rows for this figure
+                continue
+            figure.savefig(path, dpi=_DPI)
         plt.close(figure)
         written.append(path)
     return written

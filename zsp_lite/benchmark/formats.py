@@ -60,10 +60,10 @@ def write_tables(tables: Iterable[Table], folder: str | Path) -> list[Path]:
     for table in tables:
         for suffix, render in ((".csv", as_csv), (".md", as_markdown), (".tex", as_latex), (".html", as_html)):
             written.append(folder / f"{table.name}{suffix}")
-            write_atomic(written[-1], render(table).encode())
+            write_atomic(written[-1], render(table).encode(errors="replace"))
         pages.append(as_html(table))
     page = f'<!doctype html>\n<meta charset="utf-8">\n<title>zsp-lite benchmark</title>\n<style>{_STYLE}</style>\n'
-    write_atomic(folder / "tables.html", (page + "\n".join(pages)).encode())
+    write_atomic(folder / "tables.html", (page + "\n".join(pages)).encode(errors="replace"))
     return [*written, folder / "tables.html"]
 
 

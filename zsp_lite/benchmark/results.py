@@ -100,9 +100,24 @@ def read_results(path: str | Path) -> Results:
             }
             for name, row in content["rows"].items()
         }
+        _check_rows(rows, path)
+        if not rows:
+            raise KeyError("no rows")
         return Results(content["summary"], content["settings"], content["invocations"], rows)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise InputError(f"results {path}: not a run's results ({error})") from error
+        raise InputError(f"results {path}: not a run's results ({error!r})") from error
+
+
+def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> None:
+    """Raise InputError if an error is not an angle from 0 to 180 degrees, or a confidence not from 0 to 1."""
+    for name, row in rows.items():
+        for key, found in row.items():
+            if not isinstance(key, str) or "/" not in key:
+                raise InputError(f"results {path}: {key!r} is no key of a pair, expected CATEGORY/...")
+            for part, most in (("error", 180.0), ("confidence", 1.0)):
+                value = found[part] if part == "error" else found.get(part, 0.0)
+                if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:
+                    raise InputError(f"results {path}: {part} of {name} on {key} is {value!r}, expected 0 to {most:g}")
 
 
 def read_runs(paths: Sequence[str | Path]) -> Results:

@@ -111,7 +111,7 @@ def benchmark(
     write_reports(out)
     if quiet:
         return None
-    console = Console()
+    console = Console(markup=False)  # names may hold brackets
     title = f"{root}, backbone {summary['backbone']}, {targets} target views"
     console.print(title, soft_wrap=True, highlight=False)
     shown = [all_rows(summary), *(paper_tables(summary) if len(summary["methods"]) > 3 else [])]

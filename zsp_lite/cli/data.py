@@ -141,7 +141,7 @@ def check(root: Path, deep: bool, show: int) -> int:
     for check in checks:
         counts = (check.sequences, check.complete, check.labelled, check.usable, check.pairs, check.frames)
         table.add_row(check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size))
-    Console(width=max(Console().width, 100)).print(table)
+    Console(width=max(Console().width, 100), markup=False).print(table)
     for check in checks:
         for problem in check.problems[:show]:
             print(f"{check.category}: {problem}")

@@ -29,8 +29,8 @@ def as_rich(table: Table) -> RichTable:
 
 def print_tables(tables: Iterable[Table]) -> None:
     """Print to the terminal; lines that are wider continue in the next one, and no figure is cut."""
-    console = Console()
+    console = Console(markup=False)  # names may hold brackets
     for table in tables:
         made = as_rich(table)
         needed = console.measure(made, options=console.options.update(max_width=1000)).maximum
-        Console(width=max(console.width, needed)).print(made)
+        Console(width=max(console.width, needed), markup=False).print(made)

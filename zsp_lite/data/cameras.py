@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import InputError, check_magnitude
+from zsp_lite.errors import InputError, check_magnitude, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 
@@ -216,10 +216,7 @@ def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.
 
 def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Convert to a float64 array of the given shape; InputError naming `what` if that fails or it is not finite."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what} is {value!r}, expected numbers of shape {shape}") from error
+    array = np.array(real_array(what, value))
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():

@@ -41,6 +41,7 @@ from zsp_lite.data.frames import (
 )
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside, plain_name, read_bytes, write_atomic
+from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
 if TYPE_CHECKING:
@@ -303,7 +304,7 @@ def write_co3d(
     """Write sequences into `root / category` in CO3D's layout; the same input gives the same bytes.
 
     Other sequences in the folder are kept; those of the same names are replaced. The annotations are updated
-    atomically after each sequence, so the folder stays readable if the run is interrupted. Only one process may write
+    atomically after each sequence, so the folder stays readable if the run is interrupted. Only one process can write
     to a category at a time.
 
     Args:
@@ -315,28 +316,30 @@ def write_co3d(
         depth_bits: Bits of the mantissa of stored depth to keep, 1 to 10. Less precise depth makes smaller files.
 
     Raises:
-        InputError: A name is not a plain folder name, or the parts of a sequence do not fit together.
+        InputError: A name is not a plain folder name, the parts of a sequence do not fit together, or another process
+            writes to the category.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
-    entries, keys = [], []
-    if frames_path.is_file():
-        index = read_frame_index(frames_path)
-        entries, keys = index.entries, index.keys
-    listed = []
-    if sequences_path.is_file():
-        raws = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path)
-        listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in raws]
+    with writing(folder):
+        entries, keys = [], []
+        if frames_path.is_file():
+            index = read_frame_index(frames_path)
+            entries, keys = index.entries, index.keys
+        listed = []
+        if sequences_path.is_file():
+            raws = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path)
+            listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in raws]
 
-    for sequence in sequences:
-        annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format, depth_bits)
-        kept = [position for position, key in enumerate(keys) if key.sequence_name != sequence.name]
-        entries = [entries[position] for position in kept] + annotations
-        keys = [keys[position] for position in kept]
-        keys += [FrameKey(frame.sequence_name, frame.frame_number) for frame in annotations]
-        listed = [item for item in listed if item[0] != sequence.name] + [(sequence.name, annotation)]
-        write_atomic(frames_path, compress(msgspec.json.encode(entries)))
-        write_atomic(sequences_path, compress(msgspec.json.encode([entry for _, entry in listed])))
+        for sequence in sequences:
+            annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format, depth_bits)
+            kept = [position for position, key in enumerate(keys) if key.sequence_name != sequence.name]
+            entries = [entries[position] for position in kept] + annotations
+            keys = [keys[position] for position in kept]
+            keys += [FrameKey(frame.sequence_name, frame.frame_number) for frame in annotations]
+            listed = [item for item in listed if item[0] != sequence.name] + [(sequence.name, annotation)]
+            write_atomic(frames_path, compress(msgspec.json.encode(entries)))
+            write_atomic(sequences_path, compress(msgspec.json.encode([entry for _, entry in listed])))
 
 
 def _write_sequence(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
-from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
 from zsp_lite.io.images import decode_image
@@ -51,7 +51,9 @@ class Frame:
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
             if getattr(self, name) is None:
                 continue
-            values = np.asarray(getattr(self, name), dtype=np.float32)
+            values = getattr(self, name)
+            if getattr(values, "dtype", None) != np.float32:
+                values = real_array(f"{self._label} {name}", values).astype(np.float32)
             if values.shape != rgb.shape[:2]:
                 raise InputError(f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}")
             if not np.isfinite(values).all() or values.min() < 0 or values.max() > top:

@@ -244,4 +244,4 @@ def _frame_number(dataset: Co3D, category: str, sequence: str, position, where: 
 
 def _stable_hash(text: str) -> int:
     """Hash text to 63 bits; unlike Python's `hash`, the result is the same in every process."""
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+    return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big") >> 1

@@ -8,6 +8,8 @@ import io
 import lzma
 import math
 import os
+import platform
+import re
 import secrets
 import stat
 import zipfile
@@ -22,6 +24,9 @@ MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decom
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
 _GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096  # bytes, on most file systems
+_MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"  # folders can be shared with other machines
+_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{8})-(\d+)\.[0-9a-f]{8}\.tmp")
+_cleaned: set[Path] = set()  # folders without leftovers
 # Exceptions of zipfile and of decompression for truncated, damaged or encrypted files and unknown methods.
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError, KeyError)
 
@@ -30,16 +35,28 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     """Write a file atomically: a reader sees the old content or the new one, never a part.
 
     The data is written to a temporary file in the same folder, which is then renamed. Missing folders are created.
+    Temporary files that killed processes of this machine left in the folder are removed at the first write to it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if (folder := path.parent.resolve()) not in _cleaned:
+        _cleaned.add(folder)
+        _remove_leftovers(folder)
     # The random part is for threads, which share the process id.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f".{path.name}.{_MACHINE}-{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:
         temporary.write_bytes(data)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    with os.scandir(folder) as entries:
+        found = [(entry.path, _TEMPORARY.fullmatch(entry.name)) for entry in entries]
+    for path, match in found:
+        if match and match[1] == _MACHINE and not os.path.exists(f"/proc/{match[2]}") and os.path.isdir("/proc/self"):
+            Path(path).unlink(missing_ok=True)
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:

@@ -25,6 +25,11 @@ _FONT = 10
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
+def plain_text(text: str) -> str:
+    """Escape a text for matplotlib, which reads what is between two dollar signs as TeX."""
+    return text.encode(errors="replace").decode().replace("$", r"\$")
+
+
 def show_images(
     images: Sequence[np.ndarray],
     titles: Sequence[str] | None = None,
@@ -61,7 +66,7 @@ def show_images(
     for axis, image in zip(axes, images):
         _draw_image(axis, image)
     for axis, title in zip(axes, titles or []):
-        axis.set_title(title, fontsize=_FONT)
+        axis.set_title(plain_text(title), fontsize=_FONT)
     return figure, axes[: len(images)]
 
 
