@@ -36,19 +36,17 @@ LICENCES = {
 }
 
 
-class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One model of the catalogue.
+class Source(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One work of a package.
 
     Attributes:
-        package: Debian package.
+        package: Package.
         file: File in the package.
-        sha256: Checksum of the model's own file (that of the archive member where `member` is given).
-        licence: Licence of the model.
-        author: Author of the model.
-        licence_file: Where the licence was read: in the package, or in the archive beside the model.
-        member: Path of the model in the archive `file`.
-        textures: Folder of the package with textures that are not beside the model.
-        front: Front in the axes of the file; the top is +y.
+        sha256: Checksum of the work's own file (that of the archive member where `member` is given).
+        licence: Licence of the work.
+        author: Author of the work.
+        licence_file: Where the licence was read: in the package, or in the archive beside the work.
+        member: Path of the work in the archive `file`.
         title: Title that the author gave to the work, where there is one.
     """
 
@@ -59,9 +57,43 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     author: str
     licence_file: str
     member: str = ""
+    title: str = ""
+
+    def path(self, packages: Path) -> Path:
+        """Return the path of `file`. Raises InputError if it is missing."""
+        path = packages / self.package / self.file
+        if not path.is_file():
+            raise InputError(f"{path} is missing, expected the unpacked package {self.package}")
+        return path
+
+    def check(self, data: bytes, where: Path) -> bytes:
+        """Return the content of the work. Raises InputError if its checksum is another one."""
+        found = hashlib.sha256(data).hexdigest()
+        if found != self.sha256:
+            raise InputError(f"{where} {self.member}: checksum {found}, expected {self.sha256} as in the catalogue")
+        return data
+
+    def read(self, packages: Path) -> bytes:
+        """Return the content of the work. Raises InputError if it is missing or another one."""
+        path = self.path(packages)
+        if not self.member:
+            return self.check(path.read_bytes(), path)
+        with zipfile.ZipFile(path) as files:
+            if self.member not in files.namelist():
+                raise InputError(f"{path} has no {self.member}")
+            return self.check(files.read(self.member), path)
+
+
+class Entry(Source, frozen=True, omit_defaults=True):
+    """One model of the catalogue.
+
+    Attributes:
+        textures: Folder of the package with textures that are not beside the model.
+        front: Front in the axes of the file; the top is +y.
+    """
+
     textures: str = ""
     front: str = "+z"
-    title: str = ""
 
 
 class Catalogue(msgspec.Struct, frozen=True):
@@ -93,17 +125,12 @@ def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
     for category, models in catalogue.models.items():
         for name, entry in models.items():
             target = out / plain_name(category, "category") / plain_name(name, "model")
-            source = packages / entry.package / entry.file
-            if not source.is_file():
-                raise InputError(
-                    f"{category}/{name}: {source} is missing, expected the unpacked package {entry.package}"
-                )
+            source, data = entry.path(packages), entry.read(packages)
             if target.is_dir():
                 shutil.rmtree(target)
             if entry.member:
-                _extract(source, entry, target, name)
+                _extract(source, entry, data, target, name)
             else:
-                _check(entry, source.read_bytes(), source)
                 folders = [packages / entry.package / entry.textures] if entry.textures else []
                 convert(source, target / f"{name}.obj", folders)
             origin = f"{entry.package} {catalogue.packages[entry.package]}: {entry.member or entry.file}"
@@ -150,25 +177,16 @@ def _changes(entry: Entry) -> str:
     return ", ".join(changes)
 
 
-def _extract(archive: Path, entry: Entry, target: Path, name: str) -> None:
-    """Extract an OBJ file of an archive, as NAME.obj, with the files beside it."""
+def _extract(archive: Path, entry: Entry, model: bytes, target: Path, name: str) -> None:
+    """Write an OBJ file of an archive, as NAME.obj, and the files beside it."""
     folder = entry.member.rpartition("/")[0] + "/"
     target.mkdir(parents=True)
     with zipfile.ZipFile(archive) as files:
-        if entry.member not in files.namelist():
-            raise InputError(f"{archive} has no {entry.member}")
-        _check(entry, files.read(entry.member), archive)
         for member in files.namelist():
             rest = member.removeprefix(folder)
-            if member.startswith(folder) and rest and "/" not in rest:
-                written = f"{name}.obj" if member == entry.member else rest
-                (target / written).write_bytes(files.read(member))
-
-
-def _check(entry: Entry, data: bytes, where: Path) -> None:
-    found = hashlib.sha256(data).hexdigest()
-    if found != entry.sha256:
-        raise InputError(f"{where} {entry.member}: checksum {found}, expected {entry.sha256} as in the catalogue")
+            if member.startswith(folder) and rest and "/" not in rest and member != entry.member:
+                (target / rest).write_bytes(files.read(member))
+    (target / f"{name}.obj").write_bytes(model)
 
 
 if __name__ == "__main__":
