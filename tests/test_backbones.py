@@ -202,8 +202,13 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="zsp-lite train"):
         load_backbone()
     save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "4"})
+    digest = hashlib.sha256((tmp_path / "zsp-tiny.safetensors").read_bytes()).hexdigest()
+    (tmp_path / "SHA256SUMS").write_text(f"{digest}  zsp-tiny.safetensors\n")
     assert load_backbone().name == "zsp-tiny"
     assert available_backbones()["zsp-tiny"] == tmp_path / "zsp-tiny.safetensors"
+    save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "2"})
+    with pytest.raises(InputError, match="zsp-tiny.safetensors is damaged: its SHA-256 is .*, expected .* as in SHA25"):
+        load_backbone()
 
 
 class Harmful:
@@ -275,6 +280,7 @@ class Server:
 
     def __init__(self, files: dict[str, bytes]):
         self.files, self.ranges, self.break_after, self.knows_ranges = files, [], None, True
+        self.chunked = False  # send no length
         outer = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -295,7 +301,8 @@ class Server:
                     self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
                 else:
                     self.send_response(200)
-                self.send_header("Content-Length", str(len(content) - start))
+                if not outer.chunked:
+                    self.send_header("Content-Length", str(len(content) - start))
                 self.end_headers()
                 end = len(content) if outer.break_after is None else start + outer.break_after
                 self.wfile.write(content[start:end])
@@ -382,13 +389,60 @@ def test_dino_models_come_from_the_server_into_the_cache(server, vit, pictures, 
     server.files["/dino/some/vit.pth"] = content
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
-    release = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+    release = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content), (32, 8, 64, 3))
     monkeypatch.setitem(pretrained.PRETRAINED, "dino_vits8", release)
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu", num_heads=4)
     assert loaded.name == "dino_vits8"
     assert available_backbones()["dino_vits8"] == tmp_path / "cache" / "vit.pth"
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+    # A file that was used once is never replaced by another one unnoticed.
+    pin = tmp_path / "cache" / "vit.pth.sha256"
+    assert pin.read_text() == f"{hashlib.sha256(content).hexdigest()}  vit.pth\n"
+    torch.save(small_vit(seed=5).state_dict(), tmp_path / "cache" / "vit.pth")
+    with pytest.raises(
+        InputError, match="vit.pth has changed since its first use: its SHA-256 is .*, expected .*remove"
+    ):
+        load_backbone("dino_vits8", "cpu", num_heads=4)
+
+
+def test_a_network_of_another_size_than_the_release_is_refused_and_not_pinned(vit, tmp_path, monkeypatch):
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
+    torch.save(vit.state_dict(), tmp_path / "dino_deitsmall8_pretrain.pth")
+    with pytest.raises(
+        InputError, match=r"dino_vits8: .*not the released network: .*\(32, 8, 64, 3\), expected \(224, 8"
+    ):
+        load_backbone("dino_vits8", "cpu")
+    assert [path.name for path in tmp_path.iterdir()] == ["dino_deitsmall8_pretrain.pth"]
+
+
+def test_a_download_is_stopped_when_it_exceeds_the_expected_size(server, tmp_path):
+    for options in ({"most": 9_000}, {"size": 9_000}):
+        with pytest.raises(InputError, match="has 10000 bytes, expected at most 9000"):
+            fetch(f"{server.url}/file", tmp_path / "file", **options)
+    server.chunked = True  # no size is announced
+    server.files["/file"] = bytes(2_000_000)
+    with pytest.raises(InputError, match="has more than 9000 bytes, expected no more; removed"):
+        fetch(f"{server.url}/file", tmp_path / "file", most=9_000)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_released_file_is_about_as_long_as_its_weights():
+    release = pretrained.PRETRAINED["dino_vits8"]
+    assert release.size < release.most_bytes < 1.15 * release.size
+
+
+def test_weights_that_overflow_do_not_verify(tmp_path):
+    vit = small_vit(num_heads=1)
+    verify(_saved(vit, tmp_path / "fine.safetensors"))
+    vit.blocks[1].mlp.fc2.weight.data.fill_(1e38)
+    with pytest.raises(InputError, match="huge.safetensors: .*not finite"):
+        verify(_saved(vit, tmp_path / "huge.safetensors"))
+
+
+def _saved(vit, path):
+    save_file(vit.state_dict(), path)
+    return path
 
 
 def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, monkeypatch):
@@ -398,7 +452,7 @@ def test_a_cached_file_that_is_not_the_released_one_does_not_verify(tmp_path, mo
     monkeypatch.setitem(
         pretrained.PRETRAINED,
         "dino_vits16",
-        PretrainedWeights("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content)),
+        PretrainedWeights("vit.pth", hashlib.md5(content).hexdigest()[:6], len(content), (32, 8, 64, 3)),
     )
     verify("dino_vits16")
     torch.save(small_vit(num_heads=1, seed=1).state_dict(), tmp_path / "vit.pth")  # as long, and loads as well

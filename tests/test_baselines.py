@@ -97,7 +97,7 @@ def test_a_block_is_two_convolutions_and_a_shortcut():
 
 
 @pytest.mark.slow
-def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path):
+def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path, monkeypatch):
     state = {f"module.{key}": x for key, x in random_state(torchvision_shapes()).items()}
     heads = {"projection_head.0.weight": (8, 2048), "projection_head.0.bias": (8,), "prototypes.weight": (5, 8)}
     path = tmp_path / "swav_800ep_pretrain.pth.tar"
@@ -110,6 +110,13 @@ def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_
         torch.save(state | change, path)
         with pytest.raises(InputError, match="conv1.weight|bn1.bias"):
             load_swav(path)
+    # Under its released name, the file of the first use is the only one.
+    torch.save(state, path)
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
+    load_swav()
+    torch.save(state | {"module.bn1.bias": torch.ones(64)}, path)
+    with pytest.raises(InputError, match="swav_800ep_pretrain.pth.tar has changed since its first use"):
+        load_swav()
 
 
 def test_a_failed_download_of_swav_names_the_alternative(tmp_path, monkeypatch):

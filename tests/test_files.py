@@ -186,6 +186,21 @@ def test_a_pair_that_cannot_be_evaluated_as_its_set_says_is_refused(tmp_path, ch
         read_upstream_pairs(path, Co3D(tmp_path))
 
 
+def test_a_link_to_itself_is_refused(tmp_path):
+    write_co3d(tmp_path, "cup", [sequence_data("a", 1)])
+    (tmp_path / "x.pt").symlink_to(tmp_path / "x.pt")
+    with pytest.raises(InputError, match="evaluation pairs .*x.pt cannot be read"):
+        read_upstream_pairs(tmp_path / "x.pt", Co3D(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["x.pth", "x.safetensors"])
+def test_a_file_of_weights_above_four_gigabytes_is_refused_before_it_is_read(tmp_path, name):
+    with open(tmp_path / name, "wb") as file:
+        file.truncate(5 << 30)
+    with pytest.raises(InputError, match=f"checkpoint .*{name} is {5 << 30} bytes long, expected at most {4 << 30}"):
+        read_checkpoint(tmp_path / name)
+
+
 def test_labels_with_two_references_are_refused(tmp_path):
     for name in "ab":
         write_label(tmp_path, "cup", PoseLabel(np.eye(4), name, name))

@@ -8,7 +8,7 @@ import pytest
 from safetensors import safe_open
 
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.backbones.pretrained import TINY
+from zsp_lite.backbones.pretrained import SUMS, TINY, check_shipped
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.extractors import random_backbone
 from zsp_lite.data.co3d import Co3D
@@ -26,6 +26,14 @@ def test_the_file_is_small_and_in_half_precision():
     assert TINY.stat().st_size <= 12e6
     with safe_open(TINY, "pt") as file:
         assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
+
+
+def test_the_digests_of_all_shipped_weights_are_those_of_the_files():
+    """After a change of the weights: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS."""
+    files = sorted(TINY.parent.glob("*.safetensors"))
+    assert [line.split()[1] for line in (TINY.parent / SUMS).read_text().splitlines()] == [path.name for path in files]
+    for path in files:
+        check_shipped(path)
 
 
 def test_it_loads_strictly_into_a_plain_dino_transformer():

@@ -1,6 +1,7 @@
 """Checkpoint files of vision transformers in the DINO layout."""
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,8 +11,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import file_size
-from zsp_lite.io.tensors import load_torch
+from zsp_lite.io.tensors import check_weights_size, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -25,14 +25,14 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        file_size(path, "checkpoint")
+        check_weights_size(path, "checkpoint")
         try:
             with safe_open(path, framework="pt") as file:
                 return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
         except Exception as error:  # a damaged file can raise almost any exception
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})") from error
-    content = load_torch(path, f"checkpoint {path}")
+    content = load_torch(path, "checkpoint")
     for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints contain teacher and student
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
@@ -106,6 +106,8 @@ def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ign
     Raises:
         InputError: A key is missing, unknown or of another shape, or a weight is not of finite floats.
     """
+    if strange := [key for key, x in weights.items() if not (isinstance(key, str) and torch.is_tensor(x))]:
+        raise InputError(f"{name}: entry {reprlib.repr(strange[0])} is no named tensor, expected weights")
     state = model.state_dict()
     weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
     expected, found = ({key: tuple(x.shape) for key, x in tensors.items()} for tensors in (state, weights))

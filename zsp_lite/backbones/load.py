@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
@@ -11,7 +12,7 @@ from zsp_lite.backbones.checkpoints import build_vit, metadata_integer, metadata
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
 from zsp_lite.backbones.precision import Precision
-from zsp_lite.backbones.pretrained import available_backbones, download, verify_download
+from zsp_lite.backbones.pretrained import available_backbones, check_geometry, download, using, verify_download
 from zsp_lite.errors import InputError
 
 
@@ -112,8 +113,10 @@ def load_backbone(
         raise InputError(
             f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}, nor {PREFIX}NAME"
         )
-    weights, metadata = read_checkpoint(path)
-    model = build_vit(weights, num_heads or metadata_integer(metadata, "num_heads", path), path.name)
+    with using(name, path):
+        weights, metadata = read_checkpoint(path)
+        model = build_vit(weights, num_heads or metadata_integer(metadata, "num_heads", path), path.name)
+        check_geometry(name, model)
     block = metadata_integer(metadata, "key_block", path) if layer is None else layer
     if saliency_heads is None:
         saliency_heads = metadata_integers(metadata, "saliency_heads", path)
@@ -121,6 +124,16 @@ def load_backbone(
 
 
 def verify(name_or_path: str | Path) -> None:
-    """Raise InputError if a backbone is not downloaded, differs from the released file, or cannot be loaded."""
+    """Check that a backbone is complete, loads, and has finite features of an image.
+
+    Raises:
+        InputError: It is not downloaded, differs from the released file, cannot be loaded, or overflows.
+    """
     verify_download(str(name_or_path))
-    load_backbone(name_or_path, "cpu")
+    backbone = load_backbone(name_or_path, "cpu")
+    side = backbone.image_size
+    ramp = np.broadcast_to(np.linspace(0, 255, side, dtype=np.uint8)[:, None, None], (side, side, 3))
+    try:
+        backbone([ramp])
+    except InputError as error:
+        raise InputError(f"{name_or_path}: {error}") from error

@@ -1,15 +1,27 @@
-"""Backbones that have a name: the embedded "zsp-tiny" and the DINO models released by Caron et al. (2021)."""
+"""Backbones that have a name: the embedded "zsp-tiny" and the DINO models released by Caron et al. (2021).
+
+The SHA-256 of the package's own weights are in weights/SHA256SUMS. Of the released models only the first digits of an
+MD5 digest were published, which can be forged: the sizes of the network are compared with the release's, and the
+SHA-256 of the file with that of its first use (see `download.pinned`).
+"""
 
 import os
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from zsp_lite.backbones.huggingface import PREFIX, model_folder
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
+from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash, pinned
+from zsp_lite.io.files import read_bytes, sha256
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
 TINY = Path(__file__).parents[1] / "weights" / "zsp-tiny.safetensors"
+SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS
+_GROWTH = 1.1  # of a file compared with its weights in float32: names, and the parts of training
 
 
 @dataclass(frozen=True)
@@ -20,11 +32,13 @@ class PretrainedWeights:
         file: Path below the DINO URL.
         md5_prefix: First digits of the file's MD5 hash.
         size: File size in bytes, if known.
+        geometry: Image size in pixels, patch size in pixels, channels and number of blocks.
     """
 
     file: str
     md5_prefix: str
     size: int | None = None
+    geometry: tuple[int, int, int, int] = (224, 8, 384, 12)
 
     @property
     def url(self) -> str:
@@ -36,12 +50,22 @@ class PretrainedWeights:
         """Path of the downloaded file."""
         return cache_folder() / Path(self.file).name
 
+    @property
+    def most_bytes(self) -> int:
+        """Largest plausible size of the file."""
+        with torch.device("meta"):
+            model = VisionTransformer(*self.geometry, num_heads=1)
+        return int(_GROWTH * sum(4 * weight.numel() for weight in model.parameters()))
 
+
+_BASE8, _BASE16 = (224, 8, 768, 12), (224, 16, 768, 12)
 PRETRAINED = {
     "dino_vits8": PretrainedWeights("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
-    "dino_vits16": PretrainedWeights("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
-    "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
-    "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
+    "dino_vits16": PretrainedWeights(
+        "dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22", geometry=(224, 16, 384, 12)
+    ),
+    "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550", geometry=_BASE8),
+    "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf", geometry=_BASE16),
 }
 
 
@@ -73,11 +97,42 @@ def download(name: str) -> Path:
         raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
     weights = PRETRAINED[name]
     try:
-        return fetch(weights.url, weights.path, weights.size, weights.md5_prefix)
+        return fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=weights.most_bytes)
     except InputError as error:
         raise InputError(
             f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use zsp-tiny"
         ) from error
+
+
+def using(name: str, path: Path) -> AbstractContextManager:
+    """Check the digest of a backbone's file. The block loads it; a released file is known from then on.
+
+    Raises:
+        InputError: The file of the package is not that of SHA256SUMS, or a released one is not that of its first use.
+    """
+    if path == TINY:
+        check_shipped(path)
+    return pinned(path) if name in PRETRAINED else nullcontext()
+
+
+def check_shipped(path: Path) -> None:
+    """Raise InputError if a file of weights in the package is not the one that SHA256SUMS beside it lists."""
+    lines = read_bytes(path.with_name(SUMS), "digests").decode().splitlines()
+    digests = {name: digest for digest, name in (line.split(maxsplit=1) for line in lines)}
+    expected, found = digests.get(path.name, "none"), sha256(path, "weights")
+    if found != expected:
+        raise InputError(f"{path} is damaged: its SHA-256 is {found}, expected {expected} as in {SUMS}; reinstall it")
+
+
+def check_geometry(name: str, model: VisionTransformer) -> None:
+    """Raise InputError if a network that was loaded under a released name has other sizes than the release."""
+    if name in PRETRAINED:
+        found = model.image_size, model.patch_size, model.embed_dim, model.depth
+        if found != PRETRAINED[name].geometry:
+            raise InputError(
+                f"{name}: {PRETRAINED[name].path} is not the released network: image size, patch size, channels and "
+                f"blocks are {found}, expected {PRETRAINED[name].geometry}"
+            )
 
 
 def verify_download(name: str) -> None:

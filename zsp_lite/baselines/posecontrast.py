@@ -7,6 +7,7 @@ labels of the training categories.
 
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +20,11 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.backbone import normalize, prepare_images
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
+from zsp_lite.backbones.pretrained import check_shipped
 from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder
+from zsp_lite.io.download import cache_folder, pinned
 from zsp_lite.io.tensors import load_torch
 
 FILE = "posecontrast.pth"  # in the cache folder; there is no permanent URL
@@ -101,22 +103,24 @@ def load_posecontrast(path: str | Path | None = None) -> PoseContrast:
             the cache folder.
 
     Raises:
-        InputError: The file is missing or damaged, or has other keys or shapes.
+        InputError: The file is missing or damaged, has other keys or shapes, or is another one than at its first use.
     """
-    path = Path(path) if path is not None else cache_folder() / FILE
+    released = path is None
+    path = cache_folder() / FILE if path is None else Path(path)
     if not path.is_file():
         raise InputError(
             f"posecontrast: no checkpoint at {path}; copy the authors' file there, or use posecontrast-tiny"
         )
-    content = load_torch(path, f"posecontrast {path}")
-    parts = [content.get(part) if isinstance(content, dict) else None for part in ("net_feat", "net_vp")]
-    if not all(isinstance(part, dict) for part in parts):
-        raise InputError(f"posecontrast {path}: expected a dict with net_feat and net_vp")
     config = ResNetConfig(outputs=128)
     network, head = ResNet(config), ViewpointHead(config.channels[-1])
-    for module, weights in zip((network, head), parts, strict=True):
-        weights = {key.removeprefix("module."): value for key, value in weights.items()}
-        load_weights(module, weights, f"posecontrast {path}")
+    with pinned(path) if released else nullcontext():
+        content = load_torch(path, "posecontrast")
+        parts = [content.get(part) if isinstance(content, dict) else None for part in ("net_feat", "net_vp")]
+        if not all(isinstance(part, dict) for part in parts):
+            raise InputError(f"posecontrast {path}: expected a dict with net_feat and net_vp")
+        for module, weights in zip((network, head), parts, strict=True):
+            weights = {str(key).removeprefix("module."): value for key, value in weights.items()}
+            load_weights(module, weights, f"posecontrast {path}")
     return PoseContrast(network, head, "posecontrast")
 
 
@@ -127,6 +131,8 @@ def load_posecontrast_tiny(path: str | Path = TINY_WEIGHTS) -> PoseContrast:
             f"posecontrast-tiny: {Path(path).name} does not exist; `zsp-lite train-baseline posecontrast-tiny` creates "
             "it"
         )
+    if path == TINY_WEIGHTS:
+        check_shipped(path)
     weights, _ = read_checkpoint(path)
     model = TinyPoseContrast()
     load_weights(model, weights, f"posecontrast-tiny {path}")

@@ -5,6 +5,7 @@ trained by the same method on renders of the training categories.
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
@@ -12,13 +13,15 @@ from torch import Tensor
 
 from zsp_lite.backbones.backbone import Image, normalize, prepare_images
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
+from zsp_lite.backbones.pretrained import check_shipped
 from zsp_lite.baselines.resnet import TINY, ResNet
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.io.download import cache_folder, fetch
+from zsp_lite.io.download import cache_folder, fetch, pinned
 
 URL = "https://dl.fbaipublicfiles.com/deepcluster/swav_800ep_pretrain.pth.tar"
 TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "swav-tiny.safetensors"
+_MOST_BYTES = 200_000_000  # of the file: 28 million float32 weights, and the state of the training
 _HEADS = ("projection_head.", "prototypes.")  # parts of the checkpoint that are used in training only
 
 
@@ -68,17 +71,21 @@ def load_swav(path: str | Path | None = None) -> Swav:
             at the first use.
 
     Raises:
-        InputError: The file cannot be downloaded or read, or has other keys or shapes.
+        InputError: The file cannot be downloaded or read, has other keys or shapes, or is not the released one that
+            was used before.
     """
+    released = nullcontext()
     if path is None:
         target = cache_folder() / Path(URL).name
         try:
-            path = fetch(URL, target)
+            path = fetch(URL, target, most=_MOST_BYTES)
         except InputError as error:
             raise InputError(f"swav: {error}; put the file at {target}, or use swav-tiny") from error
-    weights, _ = read_checkpoint(path)
+        released = pinned(target)
     model = ResNet()
-    load_weights(model, weights, f"swav {path}", _HEADS)
+    with released:
+        weights, _ = read_checkpoint(path)
+        load_weights(model, weights, f"swav {path}", _HEADS)
     return Swav(model, "swav", 448)
 
 
@@ -86,6 +93,8 @@ def load_swav_tiny(path: str | Path = TINY_WEIGHTS) -> Swav:
     """Load the small network of this project. Raises InputError if the file is missing or invalid."""
     if not Path(path).is_file():
         raise InputError(f"swav-tiny: {Path(path).name} does not exist; `zsp-lite train-baseline swav-tiny` creates it")
+    if path == TINY_WEIGHTS:
+        check_shipped(path)
     weights, _ = read_checkpoint(path)
     model = ResNet(TINY)
     load_weights(model, weights, f"swav-tiny {path}")

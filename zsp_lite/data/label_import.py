@@ -15,7 +15,7 @@ from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_lab
 from zsp_lite.data.pairs import check_upstream_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder, fetch
-from zsp_lite.io.files import ARCHIVE_ERRORS, decompress, growth_limit, plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import ARCHIVE_ERRORS, MAX_FILE, decompress, growth_limit, plain_name, read_bytes, write_atomic
 
 # Residual above which the camera centres of v1 and v2 are not related by a similarity.
 MAX_RESIDUAL = 0.05
@@ -167,7 +167,7 @@ def _read_url(url: str, sha256: str | None) -> Iterator[tuple[str, bytes]]:
     if not sha256:
         raise InputError(f"{url} needs its SHA-256, expected --sha256 with 64 hexadecimal digits")
     name = hashlib.sha256(url.encode()).hexdigest()[:16]
-    path = fetch(url, cache_folder() / f"labels-{name}-{PurePosixPath(url).name}")
+    path = fetch(url, cache_folder() / f"labels-{name}-{PurePosixPath(url).name}", most=MAX_FILE)
     try:
         yield from _read_archive(path, sha256)
     except InputError:

@@ -159,7 +159,7 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
             another number of targets than its folder says, or does not fit the data set.
     """
     where = f"evaluation pairs {path}"
-    named = re.fullmatch(r".*_(\d{1,6})tgt", Path(path).resolve().parent.name)
+    named = re.fullmatch(r".*_(\d{1,6})tgt", Path(path).absolute().parent.name)
     pairs = []
     for number, item in enumerate(check_upstream_pairs(read_bytes(path, "evaluation pairs"), where)):
         category, reference, reference_id, target, target_ids = (item[name] for name in _FIELDS)

@@ -1,15 +1,24 @@
-"""Download of a file over HTTP, with resume and checksum. Written here because pooch cannot resume a download."""
+"""Download of a file over HTTP, with resume, checksum and a limit on its size.
+
+Written here because pooch cannot resume a download.
+"""
 
 import hashlib
 import http.client
+import logging
 import os
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tqdm import tqdm
 
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import read_bytes, sha256, write_atomic
+
+logger = logging.getLogger(__name__)
 
 CHUNK = 1 << 18  # bytes
 
@@ -19,7 +28,14 @@ def cache_folder() -> Path:
     return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
 
 
-def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str = "", timeout: float = 30.0) -> Path:
+def fetch(
+    url: str,
+    path: str | Path,
+    size: int | None = None,
+    md5_prefix: str = "",
+    timeout: float = 30.0,
+    most: int | None = None,
+) -> Path:
     """Download a file unless it exists.
 
     Data is written to `path`.part, which is renamed after its size and checksum were verified. An interrupted download
@@ -31,13 +47,14 @@ def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str =
         size: Expected size, bytes; None if unknown.
         md5_prefix: Expected first digits of the MD5 digest.
         timeout: Timeout of the connection, seconds.
+        most: Largest size, bytes, where `size` is unknown. A longer download is stopped and removed.
 
     Returns:
         `path`.
 
     Raises:
-        InputError: The server cannot be reached, the download was interrupted three times, or the size or checksum
-            differs.
+        InputError: The server cannot be reached, the download was interrupted three times or is too long, or the size
+            or checksum differs.
     """
     path = Path(path)
     if path.exists():
@@ -46,7 +63,7 @@ def fetch(url: str, path: str | Path, size: int | None = None, md5_prefix: str =
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for _ in range(3):
-            if _fetch_rest(url, part, size, timeout):
+            if _fetch_rest(url, part, size, timeout, most if size is None else size):
                 break
         else:
             raise InputError(
@@ -79,7 +96,32 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
     return digest.startswith(md5_prefix)
 
 
-def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
+@contextmanager
+def pinned(path: Path) -> Iterator[None]:
+    """Use a file of which no digest was published: its SHA-256 is stored beside it at the first use without an error.
+
+    Every later use compares it. PATH.sha256 has the format of the program sha256sum.
+
+    Raises:
+        InputError: The file differs from that of the first use.
+    """
+    pin, found = path.with_name(path.name + ".sha256"), sha256(path, "weights")
+    if known := pin.is_file():
+        expected = read_bytes(pin, "digest")[:64].decode("ascii", "replace")
+        if found != expected:
+            raise InputError(
+                f"{path} has changed since its first use: its SHA-256 is {found}, expected {expected} as in "
+                f"{pin.name}; remove both files to download it again"
+            )
+    yield
+    if not known:
+        try:
+            write_atomic(pin, f"{found}  {path.name}\n".encode())
+        except OSError as error:
+            logger.warning("%s cannot be written (%s): later changes of %s will not be noticed", pin, error, path.name)
+
+
+def _fetch_rest(url: str, part: Path, size: int | None, timeout: float, most: int | None) -> bool:
     """Request the missing rest of `part`. Returns True if the file is complete, False if interrupted."""
     start = part.stat().st_size if part.exists() else 0
     if size is not None and start == size:
@@ -103,13 +145,20 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float) -> bool:
             start = 0  # the server ignored the Range header and sends the whole file
         length = response.headers.get("Content-Length")
         total = start + int(length) if length is not None else None
+        if most is not None and total is not None and total > most:
+            raise InputError(f"download of {url} has {total} bytes, expected at most {most}")
         bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)
         with bar, open(part, "ab" if start else "wb") as file:
             try:
                 while chunk := response.read(CHUNK):
                     file.write(chunk)
                     bar.update(len(chunk))
+                    if most is not None and file.tell() > most:
+                        break
             except (http.client.IncompleteRead, ConnectionError, TimeoutError):
                 return False
             received = file.tell()
+    if most is not None and received > most:
+        part.unlink()
+        raise InputError(f"download of {url} has more than {most} bytes, expected no more; removed")
     return total is None or received >= total

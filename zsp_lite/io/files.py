@@ -4,6 +4,7 @@ The standard library has no atomic write, and the package `atomicwrites` is no l
 """
 
 import gzip
+import hashlib
 import io
 import lzma
 import math
@@ -93,6 +94,16 @@ def file_size(path: str | Path, what: str) -> int:
         kind = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
         raise InputError(f"{what} {path} cannot be read: {kind}")
     return status.st_size
+
+
+def sha256(path: str | Path, what: str) -> str:
+    """Return the SHA-256 digest of a file in hexadecimal digits. Raises InputError if it cannot be read."""
+    file_size(path, what)
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{what} {path} cannot be read: {(error.strerror or str(error)).lower()}") from error
 
 
 def growth_limit(size: int) -> int:

@@ -10,23 +10,32 @@ import torch
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size
 
+MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
+
+
+def check_weights_size(path: str | Path, what: str) -> None:
+    """Raise InputError if there is no file at `path`, or one of more than `MAX_WEIGHTS` bytes."""
+    if (size := file_size(path, what)) > MAX_WEIGHTS:
+        raise InputError(f"{what} {path} is {size} bytes long, expected at most {MAX_WEIGHTS}")
+
 
 def load_torch(source: str | Path | bytes, what: str) -> Any:
     """Read a torch file into CPU memory. No code from the file is executed.
 
     Args:
         source: The file, or its content.
-        what: Its kind and name, for error messages.
+        what: Its kind for error messages; of content, its kind and name.
 
     Returns:
         Tensors in lists, tuples and dictionaries.
 
     Raises:
-        InputError: There is no file, it is damaged or compressed, contains more than tensors and plain data, or has a
-            tensor that is not dense or has more values than are stored (with a stride of 0).
+        InputError: There is no file, it is too large, damaged or compressed, contains more than tensors and plain
+            data, or has a tensor that is not dense or has more values than are stored (with a stride of 0).
     """
     if not isinstance(source, bytes):
-        file_size(source, what)
+        check_weights_size(source, what)
+        what = f"{what} {source}"
     try:
         file = io.BytesIO(source) if isinstance(source, bytes) else source
         if zipfile.is_zipfile(file):
