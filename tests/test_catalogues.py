@@ -11,7 +11,7 @@ from PIL import Image
 
 from tools import backgrounds
 from tools.ac3d import convert
-from tools.models import Catalogue, Entry, build, read_catalogue
+from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.models import list_models
@@ -19,7 +19,7 @@ from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
 
 TOOLS = Path(__file__).parents[1] / "tools"
-ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
+ARTISTS, SAMPLES, TRAINED = TOOLS / "artists.json", TOOLS / "samples.json", TOOLS / "training.json"
 
 # A world with one group, moved by 10 along x, of a square turned by a quarter about y; one polyline, one wrong count.
 AC3D = """AC3Db
@@ -90,12 +90,23 @@ def test_the_sample_catalogue_has_four_of_the_papers_categories_of_four_models_t
     assert all(entry.author and entry.licence_file for entry in entries)
 
 
-def test_no_sample_is_in_the_catalogue_of_artists():
+def test_the_training_catalogue_has_over_400_models_under_cc0_or_cc_by_with_author_and_licence_file():
+    models = [item for models in read_catalogue(TRAINED).models.values() for item in models.items()]
+    entries = [entry for _, entry in models]
+    assert len(models) > 400 and len({name for name, _ in models}) == len(models)
+    assert len({entry.sha256 for entry in entries}) == len(entries)  # no file twice
+    assert {entry.licence for entry in entries} <= LICENCES.keys() - {"Public Domain Mark 1.0"}
+    assert all(entry.author and entry.licence_file and entry.member for entry in entries)
+    page = attribution(read_catalogue(TRAINED))
+    assert page.count("https://creativecommons.org/") == len(models)  # every row links its licence
+
+
+def test_no_file_is_in_two_catalogues():
     files = [{(entry.sha256, entry.member or entry.file) for models in read_catalogue(path).models.values()
-              for entry in models.values()} for path in (ARTISTS, SAMPLES)]  # fmt: skip
+              for entry in models.values()} for path in (ARTISTS, SAMPLES, TRAINED)]  # fmt: skip
     for part in range(2):  # neither the content nor the name of a file
-        artists, samples = ({entry[part] for entry in entries} for entries in files)
-        assert len(samples) == 16 and not artists & samples
+        artists, samples, trained = ({entry[part] for entry in entries} for entries in files)
+        assert len(samples) == 16 and not artists & samples and not trained & (artists | samples)
 
 
 def test_no_category_of_the_catalogue_is_trained_on_or_used_for_model_selection():
