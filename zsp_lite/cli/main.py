@@ -279,6 +279,8 @@ def verify(name: str) -> None:
         "train --out outputs/first",
         "train --out outputs/second --start-from outputs/first/checkpoint.pt",
         "train --out outputs/further --start-from zsp-tiny --seed 1 --objects 2400",
+        "train --out outputs/photo --start-from zsp-tiny --photo --models outputs/training_models "
+        "--backgrounds outputs/backgrounds.npz",
         "train --out outputs/try --shorten 0.02 --objects 60",
         "train --self-distillation --out outputs/dino --renders outputs/first/renders",
     )
@@ -290,29 +292,45 @@ def verify(name: str) -> None:
     help="Continue with the second part of the recipe from a run's checkpoint.pt, exported .safetensors, or zsp-tiny.",
 )  # fmt: skip
 @click.option(
+    "--photo", is_flag=True,
+    help="Train the input of photo features too, with the third part of the recipe; needs --start-from.",
+)  # fmt: skip
+@click.option(
+    "--models", type=PATH, metavar="DIR",
+    help="Folder of textured models to train on beside procedural objects.  [default: procedural objects only]",
+)  # fmt: skip
+@click.option(
+    "--backgrounds", type=PATH, metavar="FILE",
+    help="Photographs to put objects in front of (tools/backgrounds.py).  [default: rendered rooms only]",
+)  # fmt: skip
+@click.option(
     "--self-distillation", is_flag=True,
     help="Train with DINO's objective instead, which uses no geometry: a comparison at the same number of steps.",
 )  # fmt: skip
 @click.option(
-    "--objects", type=COUNT, metavar="N", show_default="5600",
-    help="Training objects; each takes 1.1 MB on disk and in memory.",
+    "--objects", type=COUNT, metavar="N", show_default="5600; 2400 with --photo",
+    help="Training objects; each takes 1.4 MB on disk and in memory.",
 )  # fmt: skip
 @click.option("--shorten", type=positive, metavar="F", default=1.0, help="Multiply the steps of every stage by F.")
 @seed_option
 def train(
-    out: Path, renders: Path | None, start_from: str | None, self_distillation: bool, objects: int | None,
-    shorten: float, seed: int,
+    out: Path, renders: Path | None, start_from: str | None, photo: bool, models: Path | None,
+    backgrounds: Path | None, self_distillation: bool, objects: int | None, shorten: float, seed: int,
 ) -> None:  # fmt: skip
     """Train the embedded backbone or resume its training; takes hours on a CPU."""
-    if self_distillation and start_from is not None:
-        raise InputError("--self-distillation has no second part; expected it without --start-from")
+    if self_distillation and (start_from or photo or models or backgrounds):
+        raise InputError(
+            "--self-distillation has its own recipe; expected it without --start-from, --photo, --models, --backgrounds"
+        )
+    if photo and start_from is None:
+        raise InputError("--photo has no weights to start from; expected --start-from")
     from dataclasses import replace
 
     from zsp_lite.training.loop import keep_freed_memory
-    from zsp_lite.training.recipe import CONTINUATION, TrainingConfig
+    from zsp_lite.training.recipe import CONTINUATION, PHOTO_INFORMED, TrainingConfig
     from zsp_lite.training.train import train as train_backbone
 
-    recipe = TrainingConfig() if start_from is None else CONTINUATION
+    recipe = PHOTO_INFORMED if photo else TrainingConfig() if start_from is None else CONTINUATION
     config = replace(recipe, seed=seed).shortened(shorten)
     if objects:
         config = replace(config, objects=objects)
@@ -323,7 +341,7 @@ def train(
         run = replace(LONG_RUN, seed=seed, steps=max(1, round(LONG_RUN.steps * shorten)))
         written = distil(run, config, out, renders)
     else:
-        written = train_backbone(config, out, renders, start_from=start_from)
+        written = train_backbone(config, out, renders, start_from=start_from, models=models, backgrounds=backgrounds)
     print(f"Written: {written}")
 
 

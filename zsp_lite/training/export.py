@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, normalize
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.photo_informed import PHOTO_INPUT, PhotoInformedViT
 from zsp_lite.backbones.pretrained import TINY
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -34,8 +35,7 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     """
     backbone = VisionTransformer(224, 8, config.embed_dim, config.depth, config.num_heads)
     backbone.load_state_dict(model.backbone.state_dict())
-    rgb = torch.from_numpy(renders.rgb[:24, ::3].reshape(-1, *renders.rgb.shape[2:])).permute(0, 3, 1, 2)
-    images = normalize(F.interpolate(rgb.float() / 255, (224, 224), mode="bilinear"), *_TRAINING_SCALING)
+    images = normalize(_export_images(renders, 224), *_TRAINING_SCALING)
     dim = config.embed_dim
     x, _ = backbone.embed(images)
     for block, activations in zip(backbone.blocks, backbone.run_blocks(x), strict=True):
@@ -44,6 +44,30 @@ def export_checkpoint(model: Trainee, renders: RenderSet, config: TrainingConfig
     metadata = {"name": path.stem, "patch_size": "8", "image_size": "224", "num_heads": str(config.num_heads)}
     metadata |= {"key_block": str(config.layer), "saliency_heads": ",".join(map(str, range(config.num_heads)))}
     return _write({name: value.half() for name, value in backbone.state_dict().items()}, metadata, path)
+
+
+@torch.no_grad()
+def export_photo_input(model: Trainee, renders: RenderSet, backbone: Path, path: Path) -> Path:
+    """Write the photo input of an exported backbone: the projection, and the mean key of every block with that input.
+
+    Args:
+        model: Network that was trained with photo features.
+        renders: Objects from which the mean keys are computed, at 224 px.
+        backbone: File that `export_checkpoint` wrote.
+        path: File to write.
+
+    Returns:
+        The path.
+    """
+    network = PhotoInformedViT(load_backbone(backbone, "cpu").model)
+    network.projection.load_state_dict(model.photo_projection.state_dict())
+    parts = _export_images(renders, network.image_size).split(8)
+    for part in parts:
+        x, _ = network.vit.embed(*network.inputs(part))
+        for mean, activations in zip(network.key_mean, network.vit.run_blocks(x), strict=True):
+            mean += activations.key[:, 1:].mean((0, 1)) / len(parts)
+    weights = {name: network.state_dict()[name].half() for name in PHOTO_INPUT}
+    return _write(weights, {"name": path.stem}, path)
 
 
 def export_convolutional(network: nn.Module, path: Path) -> Path:
@@ -114,3 +138,9 @@ def _write(weights: dict[str, Tensor], metadata: dict[str, str], path: Path) -> 
     save_file({name: value.contiguous() for name, value in weights.items()}, path, metadata=metadata)
     path.chmod(0o644)  # safetensors makes files that only their owner can read
     return path
+
+
+def _export_images(renders: RenderSet, side: int) -> Tensor:
+    """Return views in [0, 1] from which mean keys are computed."""
+    rgb = torch.from_numpy(renders.rgb[:24, ::3].reshape(-1, *renders.rgb.shape[2:])).permute(0, 3, 1, 2)
+    return F.interpolate(rgb.float() / 255, (side, side), mode="bilinear")

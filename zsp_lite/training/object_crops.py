@@ -10,6 +10,7 @@ from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_arrays
 from zsp_lite.synthetic.assembly import make_shape
+from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.training.renders import SEED_STRIDE
@@ -64,7 +65,8 @@ def render_object(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         azimuth = 2 * np.pi * (view + rng.uniform()) / VIEWS
         R, t = orbit_pose(azimuth, rng.uniform(0.05, 0.8), rng.normal(0, 0.08), rng.uniform(5, 10), np.zeros(3))
         camera = framed_camera(shape.vertices, R, t, _RENDER_SIZE, 1.3)
-        image = render_view(seed, shape, camera, rng)
+        mesh = with_materials(shape, random_materials(rng))
+        image = render_view(seed, mesh, shape.vertices, camera, rng)
         crop = crop_to_object(Frame(image.rgb, None, image.mask.astype(np.float32), camera))
         height, width = crop.camera.size
         rows.append((resize_frame(crop, (SIZE, SIZE)).rgb, width / height, R))

@@ -67,9 +67,10 @@ def view_loss(
     keys: Float[Tensor, "crops h w dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float,
     queries: int, generator: torch.Generator, log_binned: bool = True,
 ) -> tuple[Tensor, float]:  # fmt: skip
-    """Compute the cross-entropy of selecting, among the object's other views, the one from the same side.
+    """Compute the cross-entropy of selecting, among the views of the other instance, the one from the same side.
 
-    Views 2k and 2k + 1 show the same side; views of the opposite side are among the negatives. The score of two views
+    Views 2k and 2k + 1 show the same side, of two instances of the object: the even views are compared with the odd
+    ones. Views of the opposite side are among the negatives. The score of two views
     is a differentiable form of the best-view score: the mean over patches of one view of their highest similarity in
     the other view, made symmetric.
 
@@ -104,7 +105,8 @@ def view_loss(
         score = torch.stack([rows.mean(0) if len(rows) else rows.new_full((views,), -1.0) for rows in taken])
         scores.append((score + score.T) / 2)
     seen = on_object.view(objects, views, -1).sum(2) > 3
-    excluded = torch.eye(views, dtype=torch.bool, device=keys.device) | ~seen[:, None]
+    parity = torch.arange(views, device=keys.device) % 2
+    excluded = (parity[:, None] == parity) | ~seen[:, None]
     valid = seen & seen[:, partner]
     if not valid.any():
         return keys.sum() * 0, 0.0

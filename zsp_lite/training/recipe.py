@@ -57,6 +57,8 @@ class TrainingConfig:
         view_queries: Patches per view in the view loss.
         log_binned: Compute the view loss on log-binned keys, as the method does, instead of on the keys.
         average: Decay per step of the exponential average of the weights.
+        photo_share: Fraction of the steps in which the tokens receive the features of the photo network
+            (`zsp_lite.backbones.photo_informed`). The other steps train the transformer alone.
         stages: Stages in order.
 
     Raises:
@@ -79,6 +81,7 @@ class TrainingConfig:
     view_queries: int = 64
     log_binned: bool = True
     average: float = 0.998
+    photo_share: float = 0.0
     stages: tuple[Stage, ...] = (
         Stage(1200, 96, 8, 2, (0.4, 1.0), correspondence=(0.1, 0.1), helpers=1.0),
         Stage(700, 96, 3, 8, (0.4, 1.0), correspondence=(0.1, 1.0), helpers=1.0),
@@ -94,6 +97,8 @@ class TrainingConfig:
         for name in ("proportions", "deformation"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
+        if not 0 <= self.photo_share <= 1:
+            raise InputError(f"photo_share: expected 0 to 1, got {self.photo_share}")
 
     @property
     def steps(self) -> int:
@@ -133,5 +138,18 @@ CONTINUATION = TrainingConfig(
         Stage(500, 160, 3, 8, (0.7, 1.0), view=2.0),
         Stage(500, 184, 2, 8, (0.8, 1.0), radius=0.12, view=2.0),
         Stage(900, 224, 2, 8, (0.9, 1.0), radius=0.12, view=2.0),
+    ),
+)
+
+# From the weights of `CONTINUATION`, with models from files and photographs as backgrounds.
+PHOTO_INFORMED = TrainingConfig(
+    objects=2400,
+    learning_rate=3e-4,
+    average=0.995,
+    photo_share=0.65,
+    stages=(
+        Stage(900, 128, 3, 8, (0.6, 1.0), helpers=0.6, view=2.0),
+        Stage(170, 192, 2, 8, (0.75, 1.0), helpers=0.6, radius=0.12, view=2.0),
+        Stage(80, 224, 2, 8, (0.85, 1.0), helpers=0.6, radius=0.12, view=2.0),
     ),
 )

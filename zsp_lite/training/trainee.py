@@ -8,9 +8,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.efficientnet import EfficientNetLite0
+from zsp_lite.backbones.photo_informed import DETAIL, PhotoProjection
 from zsp_lite.backbones.precision import Precision, autocast, choose_precision
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
-from zsp_lite.training.batches import PATCH_SIZE, sample_batch
+from zsp_lite.training.batches import MEAN, PATCH_SIZE, STD, sample_batch
 from zsp_lite.training.recipe import TrainingConfig
 from zsp_lite.training.renders import VIEWS, RenderSet
 
@@ -19,6 +21,8 @@ class Trainee(nn.Module):
     """Backbone with two linear heads, which only training uses, and the running mean of its keys.
 
     The heads predict geometry (see `geometry_loss`) from the output tokens and from the input of the keys' projection.
+
+    With `config.photo_share` > 0 the tokens can also receive the features of a photo network, which is not trained.
 
     Attributes:
         layer: Block whose keys are trained, counted from 0.
@@ -34,20 +38,38 @@ class Trainee(nn.Module):
         self.geometry_of_tokens = nn.Linear(config.embed_dim, 5)
         self.geometry_of_keys = nn.Linear(config.embed_dim, 5)
         self.register_buffer("key_mean", torch.zeros(config.embed_dim))
+        if config.photo_share:
+            self.photo_projection = PhotoProjection(config.embed_dim)
+            self.register_buffer("photo_key_mean", torch.zeros(config.embed_dim))
+            self._photo_network = [EfficientNetLite0().requires_grad_(False)]  # in a list: not part of the state dict
 
-    def forward(self, images: Float[Tensor, "batch 3 side side"]) -> TrainingTokens:
-        """Run the backbone on images that are normalised by `batches.MEAN` and `batches.STD`."""
-        device = images.device.type
+    def forward(self, images: Float[Tensor, "batch 3 side side"], photo: bool = False) -> TrainingTokens:
+        """Run the backbone on images that are normalised by `batches.MEAN` and `batches.STD`.
+
+        Args:
+            images: Images; with `photo`, of `photo_informed.DETAIL` times the side of the crops.
+            photo: Whether the tokens receive the features of the photo network.
+        """
+        device, added = images.device.type, None
+        if photo:
+            with torch.no_grad():
+                features = self._photo_network[0].features((images * STD + MEAN).clamp(0, 1))
+            images, added = F.avg_pool2d(images, DETAIL), self.photo_projection(features)
         with autocast(device, self.precision or choose_precision(device)):
-            return self.backbone.forward_training(images, self.layer)
+            return self.backbone.forward_training(images, self.layer, added)
 
-    def centred(self, keys: Float[Tensor, "batch n dim"], update_mean: bool = False) -> Float[Tensor, "batch n dim"]:
-        """Subtract the running mean from keys. `export_checkpoint` folds the mean at 224 px into the key bias."""
-        keys = keys.float()
+    def centred(
+        self, keys: Float[Tensor, "batch n dim"], update_mean: bool = False, photo: bool = False
+    ) -> Float[Tensor, "batch n dim"]:
+        """Subtract the running mean of keys with or without photo features.
+
+        `export_checkpoint` folds the mean at 224 px into the key bias.
+        """
+        keys, running = keys.float(), self.photo_key_mean if photo else self.key_mean
         if update_mean:
             mean = keys.detach().mean((0, 1))
-            self.key_mean.copy_(mean if not self.key_mean.any() else 0.95 * self.key_mean + 0.05 * mean)
-        return keys - self.key_mean
+            running.copy_(mean if not running.any() else 0.95 * running + 0.05 * mean)
+        return keys - running
 
 
 def as_trainee(backbone: VisionTransformer, config: TrainingConfig, renders: RenderSet, side: int = 96) -> Trainee:

@@ -1,4 +1,4 @@
-"""Single views of procedural objects for training, rendered with few rays."""
+"""Single views of objects for training, rendered with few rays."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.assembly import Shape
 from zsp_lite.synthetic.lighting import RoomLight
-from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.raytracing import FASTEST, MeshScene
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.room import random_room
@@ -20,28 +19,25 @@ ROOMS, SHARING = 8, 100  # so many rooms for so many consecutive objects: a room
 
 def render_view(
     number: int,
-    shape: Shape,
+    mesh: TexturedMesh,
+    coordinates: Float[np.ndarray, "v 3"],
     camera: Camera,
     rng: np.random.Generator,
-    vertices: Float[np.ndarray, "v 3"] | None = None,
 ) -> Rendering:
-    """Render one view of an object with random materials in a random room, which is turned at random.
+    """Render one view of an object in a random room, which is turned at random.
 
     Args:
         number: Number of the object. Objects with neighbouring numbers share their rooms.
-        shape: Object.
-        camera: Camera; maps from the coordinates of the vertices.
+        mesh: Object.
+        coordinates: Object coordinates of its vertices.
+        camera: Camera; maps from the coordinates of the mesh.
         rng: Source of the draws.
-        vertices: Vertices of a deformed copy, which is rendered instead. The object coordinates of the view remain
-            those of `shape`.
     """
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    vertices = shape.vertices if vertices is None else vertices
-    mesh = with_materials(shape, random_materials(rng), vertices @ turn.T)
-    scene = MeshScene(
-        mesh, _room(number // SHARING * ROOMS + int(rng.integers(ROOMS))), FASTEST, coordinates=shape.vertices
-    )
+    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=(mesh.normals @ turn.T).astype(np.float32))
+    room = _room(number // SHARING * ROOMS + int(rng.integers(ROOMS)))
+    scene = MeshScene(turned, room, FASTEST, coordinates=coordinates)
     view = scene.render(replace(camera, R=camera.R @ turn.T), rng)
     return replace(view, camera=camera)
 

@@ -1,0 +1,75 @@
+"""A vision transformer whose patch tokens receive the features of a network that was trained on photographs.
+
+The photo network is EfficientNet-Lite0 (see `zsp_lite.backbones.efficientnet`), supervised by ImageNet's class labels,
+never by poses. It sees the image at twice the resolution of the transformer, so that its map of stride 16 has one
+position per patch of 8 pixels. A linear layer maps its features to the width of the tokens, to which they are added
+before the first block. Without that addition the transformer is one of its own.
+"""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from zsp_lite.backbones.backbone import normalize
+from zsp_lite.backbones.efficientnet import EfficientNetLite0
+from zsp_lite.backbones.facets import Facet
+from zsp_lite.backbones.vit import Tokens, VisionTransformer
+
+BLOCK, CHANNELS = 10, 112  # of EfficientNet-Lite0: the last map of stride 16
+PHOTO_INPUT = ("key_mean", "projection.linear.weight", "projection.linear.bias")  # weights beside those of the parts
+DETAIL = 2  # sides of the photo network's images, as a multiple of the transformer's
+
+
+class PhotoProjection(nn.Module):
+    """Linear map of the photo network's features, each position normalised, to tokens; 0 before training."""
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.linear = nn.Linear(CHANNELS, dim)
+        nn.init.zeros_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, features: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch n dim"]:
+        return self.linear(F.layer_norm(features.flatten(2).transpose(1, 2), (CHANNELS,)))
+
+
+class PhotoInformedViT(nn.Module):
+    """Vision transformer with the features of EfficientNet-Lite0 added to its patch tokens.
+
+    Args:
+        vit: Transformer with patches of 8 pixels, for images with ImageNet's normalisation.
+
+    Attributes:
+        image_size, patch_size, embed_dim, depth, num_heads: As those of `VisionTransformer`; image_size and patch_size
+            are in pixels of the larger image.
+        projection: Maps the photo network's features to tokens.
+        key_mean: Mean key of each block, which is subtracted from the keys.
+    """
+
+    def __init__(self, vit: VisionTransformer):
+        super().__init__()
+        self.vit, self.photo_network, self.projection = vit, EfficientNetLite0(), PhotoProjection(vit.embed_dim)
+        self.image_size, self.patch_size = DETAIL * vit.image_size, DETAIL * vit.patch_size
+        self.embed_dim, self.depth, self.num_heads = vit.embed_dim, vit.depth, vit.num_heads
+        self.register_buffer("key_mean", torch.zeros(vit.depth, vit.embed_dim))
+
+    def inputs(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"]]:
+        """Return the transformer's images, and the features to add to its patch tokens."""
+        added = self.projection(self.photo_network.features(images, BLOCK))
+        return normalize(F.avg_pool2d(images, DETAIL)), added
+
+    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
+        """Compute what `VisionTransformer.extract` does.
+
+        Args:
+            images: RGB images with values in [0, 1]; height and width are multiples of 32.
+            layer, facet: Block and activation that describe the patches.
+        """
+        small, added = self.inputs(images)
+        tokens = self.vit.extract(small, layer, facet, added)
+        return replace(tokens, keys=tokens.keys - self.key_mean[layer]) if facet == "key" else tokens
