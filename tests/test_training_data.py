@@ -5,14 +5,17 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from model_files import write_wedge
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_variant
+from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
-from zsp_lite.training.batches import crop_grids, sample_batch
+from zsp_lite.training.batches import crop_grids, on_photographs, sample_batch
+from zsp_lite.training.instances import ModelInstances
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
-from zsp_lite.training.renders import GRID, SIZE, VIEWS, load_render_set, render_object, render_set
+from zsp_lite.training.renders import ARRAYS, GRID, SIZE, VIEWS, load_render_set, render_object, render_set
 from zsp_lite.training.views import render_view
 
 
@@ -28,7 +31,7 @@ def fourier(surface, seed=0):
 
 @pytest.mark.slow
 def test_an_object_is_rendered_the_same_in_every_process_and_differs_from_the_next(renders):
-    for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
+    for array, rows in zip(render_object(1), (getattr(renders, name) for name in ARRAYS), strict=True):
         np.testing.assert_array_equal(array, rows[1])
     assert not np.array_equal(renders.rgb[1], renders.rgb[2])
 
@@ -151,8 +154,9 @@ def test_the_view_loss_scores_by_the_methods_similarity_on_the_object():
         for b, product in enumerate(similarities(keys[a], list(keys))):
             if b != 5 and a != 5:
                 score[a, b] = product[on_object[a]][:, on_object[b]].amax(1).mean()
-    logits = ((score + score.T) / 2 / 0.1).fill_diagonal_(-1e4)
+    logits = (score + score.T) / 2 / 0.1
     logits[:, 5] = -1e4
+    logits[::2, ::2] = logits[1::2, 1::2] = -1e4  # views of the same instance
     partner = torch.arange(8) ^ 1
     rest = (torch.arange(8) != 5) & (partner != 5)  # view 4 is not asked for a partner that shows nothing
     loss, hits = view_loss_of(keys, on_object, 1, 0.1)
@@ -187,7 +191,10 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
     shape, factors, offset = make_shape(TRAINING["teapot"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
     camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
-    one, two = (render_view(0, shape, camera, np.random.default_rng(seed), copy) for seed in (0, 1))
+    meshes = (with_materials(shape, random_materials(seed), copy) for seed in (0, 1))
+    one, two = (
+        render_view(0, mesh, shape.vertices, camera, np.random.default_rng(seed)) for seed, mesh in enumerate(meshes)
+    )
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
     for drawn in (one, two):
         row, col = np.nonzero(drawn.mask)
@@ -233,6 +240,55 @@ def test_shards_that_are_damaged_or_of_another_renderer_are_refused(tmp_path):
     path.write_bytes(b"cut off")
     with pytest.raises(InputError, match="shard.npz cannot be read"):
         load_render_set([path])
-    np.savez(path, rgb=np.zeros((1, 6, 9, 9, 3)), surface=np.zeros((1, 6, 3, 3, 3)), geometry=np.zeros((1, 6, 3, 3, 4)))
+    sizes = (9, 9, 3), (9, 9), (3, 3, 3), (3, 3, 4)
+    np.savez(path, **{name: np.zeros((1, 6, *size)) for name, size in zip(ARRAYS, sizes, strict=True)})
     with pytest.raises(InputError, match="rgb has shape .1, 6, 9, 9, 3., expected .1, 8, 192, 192, 3.; remove it"):
         load_render_set([path])
+
+
+@pytest.fixture(scope="module")
+def model_folder(tmp_path_factory):
+    """Two models of one category, of slightly different heights, and one of a mixed category."""
+    folder = tmp_path_factory.mktemp("models")
+    for name, seat in (("cabinet/one", 0.5), ("cabinet/two", 0.7), ("plant/one", 0.5)):
+        write_wedge(folder / f"{name}.obj", seat)
+    return folder
+
+
+def test_even_and_odd_views_show_two_models_whose_coordinates_agree(model_folder):
+    found = set()
+    for seed in range(12):
+        instances = ModelInstances(model_folder, np.random.default_rng(seed), 0.0)
+        even, odd = instances.instance(0), instances.instance(1)
+        assert instances.instance(2) is even and instances.instance(3) is odd
+        np.testing.assert_allclose(np.ptp(even.coordinates, axis=0), np.ptp(odd.coordinates, axis=0), rtol=1e-5)
+        found.add((np.ptp(even.mesh.vertices, axis=0) / np.ptp(odd.mesh.vertices, axis=0)).round(2).max())
+    assert len(found) > 1  # in some draws the two are one model, in some they are two
+
+
+def test_instances_of_a_model_differ_in_colour_and_shape(model_folder):
+    instances = ModelInstances(model_folder, np.random.default_rng(1), 1.0)
+    one, other = (instances.instance(view).mesh for view in (0, 1))
+    assert np.abs(one.vertices - other.vertices).max() > 0.05
+    assert not np.allclose(one.materials[0].colour, other.materials[0].colour)
+
+
+@pytest.mark.slow
+def test_a_share_of_the_objects_are_models_and_their_shards_are_named_apart(model_folder, tmp_path):
+    paths = render_set(tmp_path, 1, models=model_folder, share=1.0), render_set(tmp_path, 1, workers=1)
+    models, procedural = map(load_render_set, paths)
+    assert paths[0] != paths[1] and not np.array_equal(models.rgb, procedural.rgb)
+    assert models.mask.any((2, 3)).all()
+    np.testing.assert_array_equal(models.mask[:, :, 2::4, 2::4], ~np.isnan(models.surface[..., 0]))
+
+
+def test_photographs_replace_what_is_behind_the_object_in_half_of_the_views():
+    rng, n = np.random.default_rng(0), 64
+    rgb, mask = torch.rand(n, 3, 32, 32), torch.zeros(n, 1, 32, 32)
+    mask[:, :, 8:24, 8:24] = 1
+    white = np.full((2, 24, 36, 3), 255, np.uint8)
+    shown = on_photographs(rng, rgb.clone(), mask, white, 2)
+    changed = (shown != rgb).flatten(1).any(1)
+    assert 0.3 < changed.float().mean() < 0.7
+    assert torch.equal(shown[:, :, 9:23, 9:23], rgb[:, :, 9:23, 9:23])
+    assert (shown[changed][:, :, :7] == 1).float().mean() > 0.5  # the rest shows other objects
