@@ -59,16 +59,17 @@ def test_every_category_of_a_preset_and_of_the_sample_data_is_listed_for_evaluat
 
 
 def test_every_category_of_a_catalogue_of_models_is_listed_on_its_side():
-    assert CATALOGUES.keys() == {"artists", "samples", "training"}
+    sides = {"artists": "evaluation", "samples": "evaluation", "training": "training", "validation": "validation"}
+    assert CATALOGUES.keys() == sides.keys()
     for catalogue, models in CATALOGUES.items():
-        expected = {"training", "validation"} if catalogue == "training" else {"evaluation"}
-        assert {SIDE_OF.get(category) for category in models} == expected, catalogue
+        assert {SIDE_OF.get(category) for category in models} == {sides[catalogue]}, catalogue
 
 
 def test_no_model_for_training_has_the_name_of_an_evaluation_category():
     reserved = {name for name, side in SIDE_OF.items() if side == "evaluation"}
     fittings = {"toilet_brush", "toilet_paper_dispenser"}  # of a bathroom; no toilet
-    found = {model for models in CATALOGUES["training"].values() for model in models if reserved & {*model.split("_")}}
+    models = [model for side in ("training", "validation") for names in CATALOGUES[side].values() for model in names]
+    found = {model for model in models if reserved & {*model.split("_")}}
     assert found == fittings
 
 

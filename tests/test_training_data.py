@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-
 from model_files import write_wedge
+
 from zsp_lite.errors import InputError
 from zsp_lite.matching import similarities
 from zsp_lite.synthetic.assembly import make_shape, make_variant

@@ -1,6 +1,6 @@
 """Cut the backgrounds that rendered objects are put in front of from photographs and environment maps of packages.
 
-    apt-get download endless-sky-data lomiri-wallpapers-16.04 sddm-theme-maldives supertuxkart-data ufoai-textures
+    apt-get download lomiri-wallpapers-16.04 sddm-theme-maldives supertuxkart-data
     pip download --no-deps bpy==5.0.1 scikit-image==0.26.0 scikit-learn==1.6.1
     mkdir packages
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
@@ -8,8 +8,8 @@
     pip install OpenEXR
     python tools/backgrounds.py packages outputs/backgrounds.npz
 
-`backgrounds.json` names every picture: package, file, licence and author. All are under CC0, CC BY or in the public
-domain. The pictures themselves are not part of this repository.
+`backgrounds.json` names every picture: package, file, licence and author. All are under CC0 or CC BY. The
+pictures themselves are not part of this repository.
 """
 
 import io
