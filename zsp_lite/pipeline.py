@@ -19,7 +19,7 @@ from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match, similarities
 from zsp_lite.points import standard_deviation
-from zsp_lite.views import View, crop_size, extract_views, frame_defect, object_crop, usable_targets
+from zsp_lite.views import View, crop_size, extract_views, frame_defect, has_saliency, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
@@ -42,7 +42,8 @@ class ZeroShotPose:
             for scenes in other units (supplement, "RANSAC parameters").
         sample_size: Points per RANSAC trial.
         saliency_threshold: A patch is foreground if its saliency is above this. The default is the published code's.
-        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
+        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency,
+            such as convolutional networks, need "mask".
         cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the cycle step of the
             published code (see `matching.match`; docs/published_code.md lists all its differences).
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
@@ -89,6 +90,12 @@ class ZeroShotPose:
                 raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
         for name, minimum in (("k", 1), ("trials", 1), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), minimum)
+        if self.foreground == "saliency" and not has_saliency(self.backbone):
+            name = getattr(self.backbone, "name", type(self.backbone).__name__)
+            raise InputError(
+                f"foreground is 'saliency', which {name} does not have; expected 'mask' (rows such as ours-mask), or a "
+                "combination such as zsp-tiny+effnet-lite0"
+            )
         check_number("threshold", self.threshold, above=0)
         check_number("saliency_threshold", self.saliency_threshold)
 

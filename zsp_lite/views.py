@@ -78,6 +78,11 @@ def crop_size(backbone: FeatureExtractor | None) -> int:
     return getattr(backbone, "image_size", IMAGE_SIZE)
 
 
+def has_saliency(backbone: FeatureExtractor | None) -> bool:
+    """Tell whether a backbone separates the object from the background: its `has_saliency`, or True without one."""
+    return getattr(backbone, "has_saliency", True)
+
+
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
 

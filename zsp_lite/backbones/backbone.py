@@ -1,6 +1,6 @@
 """A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -65,8 +65,6 @@ class Backbone:
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
     ):
-        if precision not in ("float32", "bfloat16"):
-            raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
         check_integer("batch_size", batch_size, 1)
         if saliency_heads is None:
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
@@ -82,7 +80,7 @@ class Backbone:
         self.batch_size = batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
         self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
-        self.device = _device(device)
+        self.device = choose_device(device)
         self.precision = supported_precision(precision, self.device.type)
         self.model = model.to(self.device).eval().requires_grad_(False)
 
@@ -101,11 +99,8 @@ class Backbone:
         Raises:
             InputError: For other image types, shapes or values.
         """
-        features = []
-        for first in range(0, len(images), self.batch_size):
-            batch = prepare_images(images[first : first + self.batch_size], self.image_size, first)
-            features += self._extract(batch.to(self.device))
-        return features
+        batches = image_batches(images, self.image_size, self.batch_size, self.device)
+        return [features for batch in batches for features in self._extract(batch)]
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         with torch.inference_mode(), autocast(self.device.type, self.precision):
@@ -117,6 +112,14 @@ class Backbone:
         # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
         # batch in memory.
         return [FeatureMap(*(x.to(torch.float32, copy=True) for x in one)) for one in zip(*grids)]
+
+
+def image_batches(
+    images: Sequence[Image], size: int, batch_size: int, device: torch.device
+) -> Iterator[Float[Tensor, "b 3 s s"]]:
+    """Yield images in batches on a device (see `prepare_images`)."""
+    for first in range(0, len(images), batch_size):
+        yield prepare_images(images[first : first + batch_size], size, first).to(device)
 
 
 def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:
@@ -163,7 +166,8 @@ def normalize(
     return (images - mean) / std
 
 
-def _device(device: str | torch.device | None) -> torch.device:
+def choose_device(device: str | torch.device | None) -> torch.device:
+    """Return a device: by default the GPU if there is one, else the CPU. Raises InputError if it is not available."""
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:

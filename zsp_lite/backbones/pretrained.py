@@ -1,4 +1,5 @@
-"""Backbones that have a name: the embedded "zsp-tiny" and the DINO models released by Caron et al. (2021).
+"""Backbones that have a name: the embedded "zsp-tiny", the DINO models released by Caron et al. (2021), and networks
+whose weights are files of other packages.
 
 The SHA-256 of the package's own weights are in weights/SHA256SUMS. Of the released models only the first digits of an
 MD5 digest were published, which can be forged: the sizes of the network are compared with the release's, and the
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from zsp_lite.backbones import efficientnet
 from zsp_lite.backbones.huggingface import PREFIX, model_folder
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -67,12 +69,20 @@ PRETRAINED = {
     "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550", geometry=_BASE8),
     "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf", geometry=_BASE16),
 }
+# Functions that return the file of weights in another package. They raise InputError if it is not installed.
+PACKAGED = {"effnet-lite0": efficientnet.weights_file}
 
 
 def available_backbones() -> dict[str, Path | None]:
-    """Return the names of all backbones with their file, or None if it is not downloaded."""
+    """Return the names of all backbones with their file, or None if it is not downloaded or installed."""
     paths = {"zsp-tiny": TINY} | {name: weights.path for name, weights in PRETRAINED.items()}
-    return {name: path if path.is_file() else None for name, path in paths.items()}
+    found = {name: path if path.is_file() else None for name, path in paths.items()}
+    for name, weights_file in PACKAGED.items():
+        try:
+            found[name] = weights_file()
+        except InputError:
+            found[name] = None
+    return found
 
 
 def download(name: str) -> Path:
@@ -93,6 +103,8 @@ def download(name: str) -> Path:
         if not TINY.is_file():
             raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")
         return TINY
+    if name in PACKAGED:
+        return PACKAGED[name]()
     if name not in PRETRAINED:
         raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
     weights = PRETRAINED[name]
@@ -136,11 +148,10 @@ def check_geometry(name: str, model: VisionTransformer) -> None:
 
 
 def verify_download(name: str) -> None:
-    """Raise InputError if a named backbone is not downloaded or differs from the released file."""
-    available = available_backbones()
-    if name in available and available[name] is None:
-        raise InputError(f"{name} is not downloaded; run zsp-lite weights fetch {name}")
+    """Raise InputError if a backbone that is downloaded by name is not there or differs from the released file."""
     weights = PRETRAINED.get(name)
+    if weights is not None and not weights.path.is_file():
+        raise InputError(f"{name} is not downloaded; run zsp-lite weights fetch {name}")
     if weights is not None and not has_size_and_hash(weights.path, weights.size, weights.md5_prefix):
         raise InputError(
             f"{name}: {weights.path} is not the released file, expected {weights.size or 'any number of'} bytes with "

@@ -31,6 +31,7 @@ class RootSift:
     """
 
     name = "rootsift"
+    has_saliency = False
     image_size = 224
     patch_size = 8
     embed_dim = 128

@@ -32,6 +32,8 @@ class Swav:
     1 everywhere.
     """
 
+    has_saliency = False
+
     def __init__(self, model: ResNet, name: str, image_size: int, layer: int = 3):
         """Create the extractor.
 

@@ -17,7 +17,7 @@ from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error, translation_error
 from zsp_lite.pipeline import view_alignment
-from zsp_lite.views import patch_mask
+from zsp_lite.views import has_saliency, patch_mask
 
 # Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
 FAILED = 180.0
@@ -123,7 +123,9 @@ def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]
 
 def _saliency_iou(problem: Problem, store: FrameStore) -> dict[str, float]:
     """IoU of the backbone's foreground (the paper's threshold) with the mask's patches, by SEQUENCE/FRAME."""
-    found = {}
+    found: dict[str, float] = {}
+    if not has_saliency(store.extractors.get("backbone")):
+        return found
     for key in problem.keys:
         features = store.description("backbone", key)
         if features is not None and (frame := store.frame(key)).mask is not None:

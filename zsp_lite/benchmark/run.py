@@ -25,11 +25,13 @@ from zsp_lite.benchmark.methods import fingerprint as method_fingerprint
 from zsp_lite.benchmark.plan import Plan, make_plan
 from zsp_lite.benchmark.provenance import environment, library_version
 from zsp_lite.benchmark.results import results_of
+from zsp_lite.benchmark.robustness import Damaged
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
+from zsp_lite.pipeline import ZeroShotPose
 
 
 def evaluate(
@@ -87,6 +89,7 @@ def evaluate(
     loaded = load_backbone(backbone) if named else backbone
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
     settings = _settings(root, loaded, extractors, rows, row_pairs, pairs, targets, seed)
+    _check_rows(rows, extractors)
     with RunFolder(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
         threads = threads or max(1, available_cores() // opened.number)
         setup = Setup(
@@ -134,6 +137,7 @@ def plan_run(
     backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     extractors = make_extractors(backbone, [row.features for row in rows.values()])
     settings = _settings(root, backbone, extractors, rows, row_pairs, pairs, targets, seed)
+    _check_rows(rows, extractors)
     check_settings(out, settings, allow_other_version)
     todo = _unfinished(rows_of_pairs(row_pairs), finished_results(out))
     return make_plan(root, todo, rows, extractors)
@@ -186,6 +190,17 @@ def rows_of_pairs(row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, dict[Pai
         for pair in dict.fromkeys(pairs):
             work.setdefault(pair.category, {}).setdefault(pair, []).append(name)
     return work
+
+
+def _check_rows(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> None:
+    """Raise InputError for settings with which `ZeroShotPose` would refuse every pair of a row."""
+    for name, row in rows.items():
+        if row.solve is None or isinstance(row.solve, Damaged):
+            settings = row.settings if row.solve is None else row.solve.settings
+            try:
+                ZeroShotPose(extractors[row.features], **settings)
+            except InputError as error:
+                raise InputError(f"method {name}: {error}") from error
 
 
 def _unfinished(

@@ -112,7 +112,6 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     dataset, model = Co3D(folder), load_backbone(backbone_config(**backbone))
-    out.mkdir(parents=True, exist_ok=True)
     name = getattr(model, "name", backbone["backbone"])
     with console.status("estimating the pose of the photographed motorcycle"):
         photograph = list(run_photograph(dataset, model))
@@ -134,6 +133,7 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
             results.append(result)
             table.add_row(*table_row(result))
     console.print(table)
+    out.mkdir(parents=True, exist_ok=True)
     with console.status("writing the report"):
         path = write_report(out / "report.html", results, str(folder), note, name, photograph)
         write_overview(out / "overview.jpg", results)
