@@ -1,13 +1,12 @@
 """Checkpoints in all their wrappings, downloads over loopback with every mishap, images good and bad."""
 
 import hashlib
-import http.server
-import threading
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from loopback import Server
 from safetensors.torch import save_file
 from torch import nn
 
@@ -275,47 +274,6 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 # downloads
 
 
-class Server:
-    """An HTTP server on loopback that counts requests and can misbehave."""
-
-    def __init__(self, files: dict[str, bytes]):
-        self.files, self.ranges, self.break_after, self.knows_ranges = files, [], None, True
-        self.chunked = False  # send no length
-        outer = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self):
-                outer.ranges.append(self.headers.get("Range"))
-                content = outer.files.get(self.path)
-                if content is None:
-                    return self.send_error(404)
-                start = 0
-                if outer.knows_ranges and outer.ranges[-1]:
-                    start = int(outer.ranges[-1].removeprefix("bytes=").removesuffix("-"))
-                    if start >= len(content):
-                        self.send_response(416)
-                        self.send_header("Content-Range", f"bytes */{len(content)}")
-                        self.send_header("Content-Length", "0")
-                        return self.end_headers()
-                    self.send_response(206)
-                    self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
-                else:
-                    self.send_response(200)
-                if not outer.chunked:
-                    self.send_header("Content-Length", str(len(content) - start))
-                self.end_headers()
-                end = len(content) if outer.break_after is None else start + outer.break_after
-                self.wfile.write(content[start:end])
-                self.close_connection = True
-
-            def log_message(self, *_):
-                return
-
-        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.http.server_port}"
-        threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
-
-
 @pytest.fixture()
 def server(monkeypatch):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
@@ -324,8 +282,7 @@ def server(monkeypatch):
     server = Server({"/file": content})
     server.content, server.md5 = content, hashlib.md5(content).hexdigest()[:6]
     yield server
-    server.http.shutdown()
-    server.http.server_close()
+    server.close()
 
 
 def test_a_file_is_fetched_checked_and_not_fetched_twice(server, tmp_path):

@@ -1,6 +1,11 @@
-"""The commands for data: `label` and `data check`, `data labels`, `data transfer`, `data import`."""
+"""The commands for data: `label` and `data check`, `data labels`, `data transfer`, `data import`.
 
+`data download` is in `zsp_lite.cli.download`.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,6 +20,9 @@ from zsp_lite.cli.common import (
     replace_option,
 )
 from zsp_lite.errors import InputError
+
+if TYPE_CHECKING:
+    from zsp_lite.data.check import CategoryCheck
 
 
 @click.command(
@@ -71,7 +79,7 @@ def label(
             print(f"{sequence}: proposed with {100 * found[1]:.0f} % confidence")
             labelling.guess(sequence, found[0])
 
-    label_category(labelling, _ask, print, propose)
+    label_category(labelling, ask, print, propose)
 
 
 def _draw_contact_sheet(labelling, path: Path) -> None:
@@ -97,7 +105,8 @@ def _print_progress(labelling) -> None:
         print(f"{row.sequence:24} {row.state:10} {picks}{residual}")
 
 
-def _ask(question: str) -> str:
+def ask(question: str) -> str:
+    """Ask on the terminal. InputError if standard input is closed."""
     try:
         return input(question)
     except EOFError as error:
@@ -108,6 +117,7 @@ def _ask(question: str) -> str:
     no_args_is_help=False,
     subcommand_metavar="ACTION ...",
     epilog=examples(
+        "data download co3d --category toaster --single-sequence",
         "data check path/to/co3d",
         "data labels path/to/clone --root path/to/co3d",
         "data transfer path/to/v1 path/to/v2 chair",
@@ -115,26 +125,43 @@ def _ask(question: str) -> str:
     ),
 )
 def data() -> None:
-    """Check a CO3D folder, import labels or captures, transfer labels from CO3D v1 to v2."""
+    """Download or check CO3D, import labels or captures, transfer labels from CO3D v1 to v2."""
 
 
 @data.command(epilog=examples("data check path/to/co3d", "data check path/to/co3d --deep"))
 @click.argument("root", type=PATH)
 @click.option("--deep", is_flag=True, help="Also decode every file; slow on large folders.")
 @click.option("--show", type=COUNT, metavar="N", default=5, help="Problems printed per category.")
-def check(root: Path, deep: bool, show: int) -> int:
+@click.option("--partial", is_flag=True, help="A sequence without any file is not a problem: it was not downloaded.")
+def check(root: Path, deep: bool, show: int, partial: bool) -> int:
     """Report missing or broken files, the number of pairs that can be evaluated, and the size on disk.
 
     The exit code is 1 if there is any problem.
     """
-    from rich.console import Console
-    from rich.filesize import decimal
-    from rich.table import Table
     from tqdm import tqdm
 
     from zsp_lite.data.check import check_folder
 
-    checks = check_folder(root, deep, lambda names: tqdm(names, "checking", disable=None))
+    checks = check_folder(root, deep, lambda names: tqdm(names, "checking", disable=None), partial=partial)
+    return print_checks(root, checks, deep, show)
+
+
+def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool, show: int) -> int:
+    """Print the results of `check_folder`.
+
+    Args:
+        root: The data folder.
+        checks: The results.
+        deep: Whether files were decoded.
+        show: Problems printed per category.
+
+    Returns:
+        Exit code: 1 if there is any problem, else 0.
+    """
+    from rich.console import Console
+    from rich.filesize import decimal
+    from rich.table import Table
+
     table = Table(title=f"{root}: {len(checks)} categories, {decimal(sum(check.size for check in checks))}")
     for column in ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk"):
         table.add_column(column, justify="left" if column in ("category", "layout") else "right", no_wrap=True)
@@ -143,6 +170,10 @@ def check(root: Path, deep: bool, show: int) -> int:
         table.add_row(check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size))
     Console(width=max(Console().width, 100), markup=False).print(table)
     for check in checks:
+        if check.absent:
+            print(f"{check.category}: {check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
+        if check.labelled > check.usable:
+            print(f"{check.category}: {check.usable} of {check.labelled} labelled sequences can be evaluated")
         for problem in check.problems[:show]:
             print(f"{check.category}: {problem}")
         if (more := len(check.problems) - show) > 0:
@@ -168,10 +199,15 @@ def labels(source: str, root: Path, sha256: str | None, replace: bool) -> None:
 
     SOURCE is a local clone of the published repository, an archive of it, or the URL of an archive.
     """
-    from zsp_lite.data.label_import import import_labels
+    from zsp_lite.data.label_import import import_labels, labelled_v2_categories
 
     counts = import_labels(source, root, sha256, replace)
     print(f"Written to {root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
+    if v2 := labelled_v2_categories(root):
+        print(
+            f"Note: {', '.join(v2)} in {root} is CO3D v2. The published labels and pairs are of v1, whose coordinates "
+            "and frames differ: import them into a v1 folder, then use `zsp-lite data transfer`."
+        )
 
 
 @data.command(epilog=examples("data transfer path/to/v1 path/to/v2 chair"))

@@ -22,6 +22,7 @@ from zsp_lite.cli.common import (
     seed_option,
 )
 from zsp_lite.cli.data import data, label
+from zsp_lite.cli.download import download as data_download
 from zsp_lite.cli.models import models, print_left_out
 from zsp_lite.errors import InputError
 
@@ -45,6 +46,7 @@ def cli() -> None:
 
 for command in (benchmark, tables, compare, profile, data, label, models):
     cli.add_command(command)
+data.add_command(data_download)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 """Check of a data folder: missing and broken files, sequences that can be evaluated, size on disk."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +25,7 @@ class CategoryCheck:
         sequences: Number of annotated sequences.
         frames: Number of annotated frames.
         complete: Number of sequences without problems.
+        absent: Number of annotated sequences without any file, in a folder that was downloaded in part.
         labelled: Number of sequences with a label.
         usable: Number of labelled sequences that can be evaluated: at least two frames have image, mask, depth and
             camera.
@@ -38,6 +39,7 @@ class CategoryCheck:
     sequences: int = 0
     frames: int = 0
     complete: int = 0
+    absent: int = 0
     labelled: int = 0
     usable: int = 0
     pairs: int = 0
@@ -46,30 +48,39 @@ class CategoryCheck:
 
 
 def check_folder(
-    root: str | Path, deep: bool = False, progress: Callable[[Iterable], Iterable] | None = None
+    root: str | Path,
+    deep: bool = False,
+    progress: Callable[[Iterable], Iterable] | None = None,
+    categories: Sequence[str] | None = None,
+    partial: bool = False,
 ) -> list[CategoryCheck]:
-    """Check every category of a data folder.
+    """Check the categories of a data folder.
 
     Args:
         root: The data folder.
         deep: Also decode every image, mask, depth map and point cloud, which is slow on large folders. Otherwise only
             check that the files exist and are not empty.
         progress: Wraps the list of categories to show a progress bar, such as `tqdm`.
+        categories: Names of the categories to check; all by default.
+        partial: An annotated sequence without any file is counted, and is not a problem.
 
     Returns:
         One result per category, sorted by name.
 
     Raises:
-        InputError: `root` is not a folder or has no category. All other problems are in the results.
+        InputError: `root` is not a folder or has no such category. All other problems are in the results.
     """
     dataset = Co3D(root)
-    categories = dataset.categories()
-    if not categories:
+    found = dataset.categories()
+    if not found:
         raise InputError(f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz")
-    return [_check_category(dataset, category, deep) for category in (progress or iter)(categories)]
+    if unknown := sorted(set(categories or ()) - set(found)):
+        raise InputError(f"category {unknown[0]!r} is not in {root}, which has {', '.join(found)}")
+    chosen = found if categories is None else sorted(set(categories))
+    return [_check_category(dataset, category, deep, partial) for category in (progress or iter)(chosen)]
 
 
-def _check_category(dataset: Co3D, category: str, deep: bool) -> CategoryCheck:
+def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
     check = CategoryCheck(category)
     try:
         sequences = {one.sequence_name: one for one in dataset.sequences(category)}
@@ -83,6 +94,9 @@ def _check_category(dataset: Co3D, category: str, deep: bool) -> CategoryCheck:
         check.problems.append(f"sequence {name} has no frames in the annotations")
     layouts, usable = set(), set()
     for name in names:
+        if partial and not (dataset.root / category / name).exists():
+            check.absent += 1
+            continue
         problems, complete_frames = [], 0
         try:
             annotations = dataset.frames(category, name)

@@ -4,12 +4,13 @@ import hashlib
 import io
 import tarfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from zsp_lite.alignment import Sim3, umeyama
+from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, parse_label, read_labels, rigid_label
 from zsp_lite.data.pairs import check_upstream_pairs
@@ -24,7 +25,11 @@ _EXTENSIONS = {"class_labels": ".json", "determ_eval": ".pt"}  # by folder
 
 
 def import_labels(
-    source: str | Path, root: str | Path, sha256: str | None = None, replace: bool = False
+    source: str | Path,
+    root: str | Path,
+    sha256: str | None = None,
+    replace: bool = False,
+    categories: Sequence[str] | None = None,
 ) -> dict[str, int]:
     """Import pose labels and evaluation pairs of the published code into a data folder.
 
@@ -37,6 +42,7 @@ def import_labels(
         root: The data folder.
         sha256: SHA-256 digest of the archive; required for a URL.
         replace: Overwrite existing files of other content.
+        categories: Names of the categories to import; all by default.
 
     Returns:
         Number of imported files by kind, "class_labels" and "determ_eval".
@@ -47,26 +53,68 @@ def import_labels(
     """
     if not Path(root).is_dir():
         raise InputError(f"data folder {root} does not exist, expected a folder with categories in CO3D's layout")
+    files, labels = _read_published(source, sha256, categories)
+    for category, imported in labels.items():
+        _check_one_reference(root, category, imported)
+    targets = {
+        (label_folder(root, group) if kind == "class_labels" else Path(root, kind, group)) / name: data
+        for (kind, group, name), data in files.items()
+    }
+    _write_all(targets, replace)
+    kinds = [kind for kind, *_ in files]
+    return {kind: kinds.count(kind) for kind in _EXTENSIONS}
+
+
+def published_sequences(
+    source: str | Path, sha256: str | None = None, categories: Sequence[str] | None = None
+) -> dict[str, list[str]]:
+    """List the labelled sequences of each category in a source of `import_labels`, which has the same arguments."""
+    labels = _read_published(source, sha256, categories)[1]
+    return {
+        category: sorted({*found, *(label.reference_seq for label in found.values())})
+        for category, found in labels.items()
+    }
+
+
+def _read_published(
+    source: str | Path, sha256: str | None, categories: Sequence[str] | None
+) -> tuple[dict[tuple[str, str, str], bytes], dict[str, dict[str, PoseLabel]]]:
+    """Read and check the labels and pairs of a source.
+
+    Returns:
+        The content of each file by kind, folder and name; the labels by category and sequence.
+    """
     files, labels = {}, {}
     for path, data in _read_files(source, sha256):
         kind, group, name = PurePosixPath(path).parts[-3:]
         group, name = plain_name(group, "folder"), plain_name(name, "file")
+        category = group if kind == "class_labels" else name.removesuffix(".pt")
+        if categories is not None and category not in categories:
+            continue
         if kind == "class_labels":
             label = parse_label(data, f"{source}: {path}")
             if f"{label.seq}.json" != name:
                 raise InputError(f"{source}: label {path} is of sequence {label.seq!r}, expected that of its name")
             labels.setdefault(group, {})[label.seq] = label
-            files[kind, label_folder(root, group) / name] = data
         else:
             check_upstream_pairs(data, f"{source}: {path}")
-            files[kind, Path(root) / kind / group / name] = data
+        files[kind, group, name] = data
     if not files:
-        raise InputError(f"{source} holds no class_labels/CATEGORY/SEQ.json, expected a clone of the published code")
-    for category, imported in labels.items():
-        _check_one_reference(root, category, imported)
-    _write_all({path: data for (_, path), data in files.items()}, replace)
-    kinds = [kind for kind, _ in files]
-    return {kind: kinds.count(kind) for kind in _EXTENSIONS}
+        wanted = "CATEGORY" if categories is None else " or ".join(categories)
+        raise InputError(f"{source} holds no class_labels/{wanted}/SEQ.json, expected a clone of the published code")
+    return files, labels
+
+
+def labelled_v2_categories(root: str | Path) -> list[str]:
+    """List the labelled categories of a data folder whose cameras are in the format of CO3D v2."""
+    dataset, found = Co3D(root), []
+    for category in dataset.categories():
+        labels = read_labels(root, category)
+        names = {key.sequence_name for key in dataset.frame_list(category)} & set(labels) if labels else set()
+        views = (one.viewpoint for name in sorted(names)[:1] for one in dataset.frames(category, name))
+        if any(view is not None and view.intrinsics_format == NDC_ISOTROPIC for view in views):
+            found.append(category)
+    return found
 
 
 def transfer_labels(

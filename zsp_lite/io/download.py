@@ -33,6 +33,7 @@ def fetch(
     path: str | Path,
     size: int | None = None,
     md5_prefix: str = "",
+    digest: str = "",
     timeout: float = 30.0,
     most: int | None = None,
 ) -> Path:
@@ -46,6 +47,7 @@ def fetch(
         path: Where to store it.
         size: Expected size, bytes; None if unknown.
         md5_prefix: Expected first digits of the MD5 digest.
+        digest: Expected SHA-256 digest; empty if unknown.
         timeout: Timeout of the connection, seconds.
         most: Largest size, bytes, where `size` is unknown. A longer download is stopped and removed.
 
@@ -69,12 +71,13 @@ def fetch(
             raise InputError(
                 f"download of {url} was interrupted three times, at {part.stat().st_size} bytes; call again to resume"
             )
-        if not has_size_and_hash(part, size, md5_prefix):
+        if not has_size_and_hash(part, size, md5_prefix) or (digest and sha256(part, "download") != digest):
             received = part.stat().st_size
             part.unlink()  # resuming from wrong data would never succeed
+            checksum = f"SHA-256 {digest}" if digest else f"MD5 {md5_prefix or '(any)'}..."
             raise InputError(
                 f"download of {url} gave another file of {received} bytes, expected "
-                f"{size if size is not None else 'any number of'} bytes with MD5 {md5_prefix or '(any)'}...; removed"
+                f"{size if size is not None else 'any number of'} bytes with {checksum}; removed"
             )
         os.replace(part, path)
     except urllib.error.HTTPError as error:
@@ -91,6 +94,8 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
     """Check the size of a file (bytes, if given) and the first digits of its MD5 digest."""
     if size is not None and path.stat().st_size != size:
         return False
+    if not md5_prefix:
+        return True
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
     return digest.startswith(md5_prefix)

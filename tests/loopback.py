@@ -1,0 +1,81 @@
+"""An HTTP server on loopback for the tests of downloads."""
+
+import http.server
+import re
+import threading
+
+
+class Server:
+    """An HTTP server on loopback that counts requests and can misbehave.
+
+    Attributes:
+        files: Content by path.
+        ranges: Range header of each GET request so far, or None.
+        break_after: The connection is closed after so many bytes of a response.
+        stall_after: Nothing is sent after so many bytes of a response, but the connection stays open.
+        knows_ranges: Whether Range headers are honoured.
+        knows_head: Whether HEAD requests are answered.
+        chunked: Whether the length is not sent.
+    """
+
+    def __init__(self, files: dict[str, bytes]):
+        self.files, self.ranges, self.break_after, self.stall_after = files, [], None, None
+        self.knows_ranges = self.knows_head = True
+        self.chunked = False
+        self.closed = threading.Event()
+        outer = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_HEAD(self):
+                if not outer.knows_head:
+                    return self.send_error(405)
+                content = outer.files.get(self.path)
+                if content is None:
+                    return self.send_error(404)
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(content)))
+                self.end_headers()
+
+            def do_GET(self):
+                outer.ranges.append(self.headers.get("Range"))
+                content = outer.files.get(self.path)
+                if content is None:
+                    return self.send_error(404)
+                start, end = 0, len(content)
+                if outer.knows_ranges and outer.ranges[-1]:
+                    first, last = re.fullmatch(r"bytes=(\d+)-(\d*)", outer.ranges[-1]).groups()
+                    start, end = int(first), min(end, int(last) + 1) if last else end
+                    if start >= len(content):
+                        self.send_response(416)
+                        self.send_header("Content-Range", f"bytes */{len(content)}")
+                        self.send_header("Content-Length", "0")
+                        return self.end_headers()
+                    self.send_response(206)
+                    self.send_header("Content-Range", f"bytes {start}-{end - 1}/{len(content)}")
+                else:
+                    self.send_response(200)
+                if not outer.chunked:
+                    self.send_header("Content-Length", str(end - start))
+                self.end_headers()
+                limits = [one for one in (outer.break_after, outer.stall_after) if one is not None]
+                self.close_connection = True
+                try:
+                    self.wfile.write(content[start : min([end, *(start + one for one in limits)])])
+                    if outer.stall_after is not None:
+                        outer.closed.wait()
+                except ConnectionError:  # the client closed the connection before the end
+                    return
+
+            def log_message(self, *_):
+                return
+
+        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.http.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self.http.server_port}"
+        threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
+
+    def close(self) -> None:
+        """End the server and its stalled responses."""
+        self.closed.set()
+        self.http.shutdown()
+        self.http.server_close()

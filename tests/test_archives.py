@@ -1,0 +1,423 @@
+"""`data download`: small archives in CO3D's layout from a server on loopback, and everything that can go wrong."""
+
+import hashlib
+import io
+import json
+import shutil
+import stat
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from co3d_folders import sequence_data
+from loopback import Server
+
+from zsp_lite.cli.main import main
+from zsp_lite.data import archives
+from zsp_lite.data.archives import list_archives, missing_archives
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.pairs import Pair, write_upstream_pairs
+from zsp_lite.errors import InputError
+from zsp_lite.io.remote import remote_size
+
+SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"
+LONG = 1 << 20  # bytes
+CHUNKS = ["/toaster_000.zip", "/toaster_001.zip"]
+
+
+def zipped(folder: Path, names) -> bytes:
+    """A zip archive of files and folders, named by their paths in `folder`."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name in names:
+            found = [folder / name] if (folder / name).is_file() else sorted((folder / name).rglob("*"))
+            for path in found:
+                archive.write(path, path.relative_to(folder).as_posix())
+    return data.getvalue()
+
+
+def evil(name: str, mode: int = stat.S_IFREG | 0o644) -> bytes:
+    """A zip archive of a toaster with one more member."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        archive.writestr("toaster/good.txt", b"good")
+        member = zipfile.ZipInfo(name)
+        member.external_attr = mode << 16
+        archive.writestr(member, b"/etc/passwd")
+    return data.getvalue()
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A labelled data folder of toasters with one evaluation pair, and a file that makes a long archive."""
+    folder = tmp_path_factory.mktemp("source")
+    write_co3d(folder, "toaster", [sequence_data(name) for name in (*SEQUENCES, UNLABELLED)])
+    (folder / "toaster" / UNLABELLED / "long").write_bytes(np.random.default_rng(0).bytes(LONG))
+    for name in SEQUENCES:
+        write_label(folder, "toaster", PoseLabel(np.eye(4), name, SEQUENCES[0]))
+    pair = Pair("toaster", SEQUENCES[0], 1, SEQUENCES[1], (2,))
+    write_upstream_pairs(folder / "determ_eval/1samples_1tgt/toaster.pt", [pair], Co3D(folder))
+    return folder
+
+
+@pytest.fixture
+def server(source, tmp_path, monkeypatch):
+    """A mirror: two chunks of toasters, a single-sequence subset, and an archive of v1."""
+    annotations = [f"toaster/{name}_annotations.jgz" for name in ("frame", "sequence")]
+    first, second, third = (f"toaster/{name}" for name in (*SEQUENCES, UNLABELLED))
+    files = {
+        CHUNKS[0]: zipped(source, [*annotations, first]),
+        CHUNKS[1]: zipped(source, [second, third]),
+        "/toaster_000_singlesequence.zip": zipped(source, annotations),
+        "/toaster_001_singlesequence.zip": zipped(source, [first, second, third]),
+        "/toaster.zip": zipped(source, ["toaster"]),
+    }
+    server = Server(files)
+    server.catalogue = tmp_path / "catalogue.json"
+    monkeypatch.setattr(archives, "CATALOGUE", server.catalogue)
+    monkeypatch.setenv("ZSP_LITE_CO3D_URL", server.url + "/")
+    monkeypatch.setenv("ZSP_LITE_CO3D_V1_URL", server.url)
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    write_catalogue(server)
+    yield server
+    server.close()
+
+
+def write_catalogue(server) -> None:
+    digest = {name: hashlib.sha256(content).hexdigest() for name, content in server.files.items()}
+    single = [digest[f"/toaster_00{number}_singlesequence.zip"] for number in (0, 1)]
+    full = {"toaster": [digest[name] for name in CHUNKS]}
+    lists = {
+        "co3d": {"url": "http://nowhere.invalid", "full": full, "single-sequence": {"toaster": single}},
+        "co3d-v1": {"url": "http://nowhere.invalid", "full": {"toaster": [digest["/toaster.zip"]]}},
+    }
+    server.catalogue.write_text(json.dumps(lists))
+    archives._catalogue.cache_clear()
+
+
+def download(root, *options, dataset="co3d", yes=True) -> int:
+    words = ["data", "download", dataset, "--category", "toaster", "--root", str(root), *options]
+    return main([*words, "--yes"] if yes else words)
+
+
+def same_files(first: Path, second: Path) -> bool:
+    contents = [
+        {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        for folder in (first, second)
+    ]
+    return contents[0] == contents[1]
+
+
+def files_of(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, tmp_path, capsys):
+    root = tmp_path / "co3d"
+    assert download(root) == 0
+    text = capsys.readouterr().out
+    for part in ("toaster_000.zip", "toaster_001.zip", "0.00 GB", "CC BY-NC 4.0", "No problems"):
+        assert part in text
+    assert same_files(root / "toaster", source / "toaster")
+    assert files_of(root / ".download") == ["unpacked.json"]  # the archives are removed
+    requests = len(server.ranges)
+    assert download(root) == 0
+    assert len(server.ranges) == requests and "everything is unpacked already" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [(), ("--single-sequence",)])
+def test_the_official_list_has_the_archives_of_every_category(options):
+    """The numbers of archives as published; a category of the paper has them in every list."""
+    counts = {"toyplane": 4, "car": 6, "toaster": 6, "bicycle": 6, "chair": 14}
+    for category, count in counts.items():
+        found = list_archives("co3d", category, bool(options))
+        assert len(found) == (2 if options else count)
+        ending = "_singlesequence.zip" if options else ".zip"
+        assert [one.name for one in found[:2]] == [f"{category}_000{ending}", f"{category}_001{ending}"]
+        assert found[0].url.startswith("https://dl.fbaipublicfiles.com/co3dv2_231130/")
+        (old,) = list_archives("co3d-v1", category)
+        assert old.url == f"https://dl.fbaipublicfiles.com/co3d/{category}.zip"
+        assert all(len(bytes.fromhex(one.sha256)) == 32 for one in (*found, old))
+
+
+def test_digests_of_the_official_list_occur_once():
+    content = json.loads(archives.CATALOGUE.read_text())
+    subsets = [content["co3d"]["full"], content["co3d"]["single-sequence"], content["co3d-v1"]["full"]]
+    digests = [digest for subset in subsets for category in subset.values() for digest in category]
+    assert [len(subset) for subset in subsets] == [51, 48, 51]
+    assert len(set(digests)) == len(digests) == 345 + 96 + 51
+
+
+def test_the_first_chunk_can_be_used_alone_and_completed_later(server, source, tmp_path, capsys):
+    root = tmp_path / "co3d"
+    assert download(root, "--chunks", "1") == 0
+    assert "2 of 3 annotated sequences are not downloaded" in capsys.readouterr().out
+    dataset = Co3D(root)
+    assert dataset.load(dataset.frame("toaster", SEQUENCES[0], 0)).rgb.shape == (24, 32, 3)
+    assert main(["data", "check", str(root)]) == 1  # without --partial, missing files are problems
+    assert main(["data", "check", str(root), "--partial"]) == 0
+    assert download(root) == 0
+    assert same_files(root / "toaster", source / "toaster")
+
+
+def test_the_single_sequence_subset_has_its_own_archives_and_folder(server, tmp_path, capsys):
+    assert download(tmp_path / "single", "--single-sequence") == 0
+    assert len(Co3D(tmp_path / "single").sequences("toaster")) == 3
+    assert download(tmp_path / "single") == 2
+    assert "is from co3d (single-sequence), expected another folder" in capsys.readouterr().err
+
+
+def test_a_category_from_elsewhere_is_not_touched(server, source, tmp_path, capsys):
+    shutil.copytree(source, tmp_path / "mine")
+    assert download(tmp_path / "mine") == 2
+    assert "is not from this command" in capsys.readouterr().err
+    assert same_files(tmp_path / "mine", source)
+
+
+def test_the_labels_and_pairs_of_the_paper_come_with_version_1(server, source, tmp_path, capsys):
+    assert download(tmp_path / "v1", "--labels", str(source), dataset="co3d-v1") == 0
+    text = capsys.readouterr().out
+    assert "2 labels, 1 files of pairs" in text and "No problems" in text
+    assert list(read_labels(tmp_path / "v1", "toaster")) == list(SEQUENCES)
+    assert download(tmp_path / "v2", "--labels", str(source)) == 2
+    assert "--labels goes with co3d-v1" in capsys.readouterr().err
+    assert not (tmp_path / "v2").exists()
+
+
+def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(server, source, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(archives, "_PART", 4_096)
+    root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")
+    assert download(root, *options, dataset="co3d-v1") == 0
+    text = capsys.readouterr().out
+    for part in ("2 sequences of toaster.zip", "1 of 3 annotated sequences are not downloaded", "No problems"):
+        assert part in text
+    for name in SEQUENCES:
+        assert same_files(root / "toaster" / name, source / "toaster" / name)
+    assert not (root / "toaster" / UNLABELLED).exists()
+    parts = [one.removeprefix("bytes=").split("-") for one in server.ranges]
+    assert sum(int(last) - int(first) for first, last in parts) < len(server.files["/toaster.zip"]) / 2
+    requests = len(server.ranges)
+    assert download(root, *options, dataset="co3d-v1") == 0
+    assert len(server.ranges) == requests and "everything is unpacked already" in capsys.readouterr().out
+    assert download(root, dataset="co3d-v1") == 0  # the rest
+    assert same_files(root / "toaster", source / "toaster")
+
+
+def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, tmp_path, capsys):
+    options = ("--labels", str(source), "--labelled-only")
+    server.knows_ranges = False
+    assert download(tmp_path / "v1", *options, dataset="co3d-v1") == 2
+    assert "expected range requests" in capsys.readouterr().err
+    server.knows_ranges, server.break_after = True, 1_000  # every response is cut off, and read on
+    assert download(tmp_path / "v1", *options, dataset="co3d-v1") == 0
+    capsys.readouterr()
+    server.break_after = 0
+    assert download(tmp_path / "other", *options, dataset="co3d-v1") == 2
+    assert "cannot be read: the connection was closed" in capsys.readouterr().err
+    assert download(tmp_path / "v1", "--labelled-only", dataset="co3d-v1") == 2
+    assert "--labelled-only goes with --labels" in capsys.readouterr().err
+
+
+def test_a_labelled_sequence_that_the_archive_lacks_is_named(server, source, tmp_path, capsys):
+    write_label(tmp_path / "clone", "toaster", PoseLabel(np.eye(4), "400_4_4", SEQUENCES[0]))
+    options = ("--labels", str(tmp_path / "clone"), "--labelled-only")
+    assert download(tmp_path / "v1", *options, dataset="co3d-v1") == 2
+    assert "has no sequence '400_4_4'" in capsys.readouterr().err and not (tmp_path / "v1").exists()
+
+
+def test_published_labels_in_a_version_2_folder_give_a_note(source, tmp_path, capsys):
+    write_co3d(tmp_path, "toaster", [sequence_data(name) for name in SEQUENCES], intrinsics_format="ndc_isotropic")
+    assert main(["data", "labels", str(source), "--root", str(tmp_path)]) == 0
+    assert f"Note: toaster in {tmp_path} is CO3D v2" in capsys.readouterr().out
+
+
+def test_without_a_terminal_nothing_is_downloaded_unless_told(server, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    assert download(tmp_path / "co3d", yes=False) == 2
+    out, error = capsys.readouterr()
+    assert "toaster_001.zip" in out and "expected --yes" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "co3d").exists() and server.ranges == []
+
+
+@pytest.mark.parametrize(("answer", "code"), [("n", 1), ("", 1), ("Y", 0)])
+def test_the_user_is_asked_on_a_terminal(server, tmp_path, capsys, monkeypatch, answer, code):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: answer)
+    assert download(tmp_path / "co3d", yes=False) == code
+    assert (tmp_path / "co3d").exists() == (code == 0)
+
+
+@pytest.mark.parametrize("knows_ranges", [True, False])
+def test_a_killed_download_is_resumed(server, source, tmp_path, knows_ranges):
+    """The process is killed while an archive arrives; a server without ranges sends all of it again."""
+    root, server.stall_after, server.knows_ranges = tmp_path / "co3d", LONG // 2, knows_ranges
+    code = (
+        f"import sys; from pathlib import Path; from zsp_lite.data import archives; "
+        f"archives.CATALOGUE = Path({str(server.catalogue)!r}); from zsp_lite.cli.main import main; "
+        f"main(['data', 'download', 'co3d', '--category', 'toaster', '--root', {str(root)!r}, '--yes'])"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    part = root / ".download/toaster_001.zip.part"
+    while not (part.is_file() and part.stat().st_size):
+        assert process.poll() is None
+        time.sleep(0.02)
+    assert download(root) == 2  # one writer at a time
+    process.kill()
+    process.wait()
+    received = part.stat().st_size
+    assert 0 < received <= LONG // 2 and Co3D(root).categories() == []
+    server.stall_after = None
+    assert download(root) == 0
+    assert f"bytes={received}-" in server.ranges and same_files(root / "toaster", source / "toaster")
+
+
+def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkeypatch):
+    root, write = tmp_path / "co3d", archives._write_member
+    written = []
+
+    def stop_at_third(archive, member, target):
+        if len(written) == 3:
+            raise KeyboardInterrupt
+        written.append(member.filename)
+        write(archive, member, target)
+
+    monkeypatch.setattr(archives, "_write_member", stop_at_third)
+    assert download(root) == 130
+    assert len(files_of(root / "toaster")) == 3 and Co3D(root).categories() == []
+    written.clear()
+    monkeypatch.setattr(archives, "_write_member", lambda *given: (written.append(given[1].filename), write(*given)))
+    requests = len(server.ranges)
+    assert download(root) == 0
+    assert same_files(root / "toaster", source / "toaster")
+    assert len(server.ranges) == requests + 1  # the archive that was there is not downloaded again
+    assert len(set(written)) == len(files_of(root / "toaster")) - 3
+
+
+def test_a_truncated_archive_is_kept_for_the_next_call(server, tmp_path, capsys):
+    server.break_after = 1_000
+    assert download(tmp_path / "co3d") == 2
+    assert "at 3000 bytes; call again to resume" in capsys.readouterr().err
+    server.break_after = None
+    assert download(tmp_path / "co3d") == 0
+    assert "bytes=3000-" in server.ranges
+
+
+def test_an_archive_with_another_digest_is_not_unpacked(server, tmp_path, capsys):
+    content = bytearray(server.files[CHUNKS[1]])
+    content[100] ^= 1
+    server.files[CHUNKS[1]] = bytes(content)
+    assert download(tmp_path / "co3d") == 2
+    assert "SHA-256" in capsys.readouterr().err
+    assert not (tmp_path / "co3d/toaster").exists() and files_of(tmp_path / "co3d") == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../outside", "toaster/../../outside", "/outside", "toaster/./x", "toaster\\x", "C:/outside", "toaster//x"],
+)
+def test_paths_that_lead_out_are_refused_before_anything_is_written(server, tmp_path, capsys, name):
+    server.files[CHUNKS[1]] = evil(name)
+    write_catalogue(server)
+    assert download(tmp_path / "co3d") == 2
+    error = capsys.readouterr().err
+    assert "expected paths inside the data folder" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "co3d/toaster").exists() and not (tmp_path / "outside").exists()
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR])
+def test_links_and_devices_are_refused(server, tmp_path, capsys, kind):
+    server.files[CHUNKS[1]] = evil("toaster/link", kind | 0o777)
+    write_catalogue(server)
+    assert download(tmp_path / "co3d") == 2
+    assert "a link or a device" in capsys.readouterr().err and not (tmp_path / "co3d/toaster").exists()
+
+
+def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, capsys):
+    (tmp_path / "co3d").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "co3d/toaster").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    assert download(tmp_path / "co3d") == 2
+    assert "leads out of the data folder" in capsys.readouterr().err and files_of(tmp_path / "elsewhere") == []
+
+
+@pytest.mark.parametrize("content", [b"not a zip archive", zipfile.BadZipFile])
+def test_a_damaged_archive_gives_one_line(server, tmp_path, capsys, content):
+    whole = server.files[CHUNKS[1]]
+    # The second: the directory at the end is whole, a member is not.
+    server.files[CHUNKS[1]] = content if isinstance(content, bytes) else whole[:60] + b"\1" * 20 + whole[80:]
+    write_catalogue(server)
+    assert download(tmp_path / "co3d") == 2
+    assert "is damaged or encrypted" in capsys.readouterr().err
+    assert Co3D(tmp_path / "co3d").categories() == []
+
+
+def test_files_outside_the_category_are_left_out(server, tmp_path):
+    server.files[CHUNKS[1]] = evil("other/file")
+    write_catalogue(server)
+    assert download(tmp_path / "co3d") == 1  # a sequence is missing
+    assert not (tmp_path / "co3d/other").exists() and (tmp_path / "co3d/toaster/good.txt").exists()
+
+
+def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path, capsys, monkeypatch):
+    sizes = [len(server.files[name]) for name in CHUNKS]
+    needed = sum(sizes) + max(sizes)  # both unpacked, and one archive
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=needed - 1))
+    assert download(tmp_path / "co3d") == 2
+    assert "GB free" in capsys.readouterr().err and server.ranges == [] and not (tmp_path / "co3d").exists()
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=needed))
+    assert download(tmp_path / "co3d") == 0
+
+
+def test_a_disk_that_became_too_small_is_found_before_unpacking(server, tmp_path, capsys, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(archives, "check_disk", lambda *_, **options: 0)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=1_000))
+    assert download(tmp_path / "co3d") == 2
+    assert "GB free" in capsys.readouterr().err and not (tmp_path / "co3d/toaster").exists()
+
+
+def test_the_size_is_asked_without_the_content(server):
+    url, size = server.url + CHUNKS[0], len(server.files[CHUNKS[0]])
+    assert remote_size(url) == size and server.ranges == []
+    server.knows_head = False
+    assert remote_size(url) == size
+    with pytest.raises(InputError, match="HTTP 404"):
+        remote_size(server.url + "/missing")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["co3d", "--category", "spaceship"], "'spaceship' is not in co3d (full)"),
+        (["co3d", "--category", "toaster", "--chunks", "3"], "expected 1 to 2"),
+        (["co3d-v1", "--category", "toaster", "--single-sequence"], "co3d-v1 has no single-sequence subset"),
+        (["co3d"], "--category"),
+        (["co4d", "--category", "toaster"], "co4d"),
+    ],
+)
+def test_bad_requests_give_one_line_and_exit_code_2(server, tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "download", *words, "--yes"]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1 and not (tmp_path / "co3d").exists()
+
+
+def test_a_server_that_cannot_be_reached_gives_one_line(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ZSP_LITE_CO3D_URL", "http://127.0.0.1:9")
+    assert download(tmp_path / "co3d") == 2
+    assert "http://127.0.0.1:9/toaster_000.zip cannot be reached" in capsys.readouterr().err
+
+
+def test_an_unknown_data_set_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected one of co3d, co3d-v1"):
+        list_archives("uco3d", "toaster")
+    assert missing_archives(tmp_path, list_archives("co3d", "toaster", chunks=2)) == list_archives(
+        "co3d", "toaster", chunks=2
+    )

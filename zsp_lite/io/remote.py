@@ -1,0 +1,111 @@
+"""Size and parts of a file on a server, without downloading all of it.
+
+Written here because the package `remotezip` brings another HTTP library.
+"""
+
+import http.client
+import io
+import urllib.error
+import urllib.request
+
+from zsp_lite.errors import InputError
+
+_ATTEMPTS = 3  # requests of one part before it is given up
+
+
+def remote_size(url: str, timeout: float = 30.0) -> int | None:
+    """Ask a server for the size of a file in bytes; None if it does not tell.
+
+    Raises:
+        InputError: The server cannot be reached, or has no such file.
+    """
+    try:
+        try:
+            response = urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=timeout)
+        except urllib.error.HTTPError as error:
+            if error.code not in (403, 405, 501):  # servers that refuse HEAD only
+                raise
+            response = urllib.request.urlopen(url, timeout=timeout)  # closed before the content is read
+        with response:
+            length = response.headers.get("Content-Length")
+        return None if length is None else int(length)
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        raise InputError(f"{url} cannot be reached: {_reason(error)}") from error
+
+
+class RemoteFile(io.RawIOBase):
+    """A file on a server, of which only the parts that are read are transferred (HTTP range requests).
+
+    For zipfile and the like; `io.BufferedReader(RemoteFile(url), size)` makes few large requests of many small reads.
+    """
+
+    def __init__(self, url: str, timeout: float = 30.0):
+        """Ask for the size of the file.
+
+        Raises:
+            InputError: The server cannot be reached or does not tell the size.
+        """
+        super().__init__()
+        size = remote_size(url, timeout)
+        if size is None:
+            raise InputError(f"{url}: the server does not tell the size of the file, expected Content-Length")
+        self.url, self.size, self.timeout, self._position = url, size, timeout, 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position in bytes."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Set the position, as for every file."""
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
+        if start + offset < 0:
+            raise ValueError(f"position is {start + offset}, expected at least 0")
+        self._position = start + offset
+        return self._position
+
+    def readinto(self, buffer: bytearray | memoryview) -> int:
+        """Read up to `len(buffer)` bytes.
+
+        Raises:
+            InputError: The server cannot be reached, or does not send parts of files.
+        """
+        end = min(self._position + len(buffer), self.size)
+        if end <= self._position:
+            return 0
+        problem: object = "the connection was closed"
+        for _ in range(_ATTEMPTS):
+            try:
+                if data := self._request(end):
+                    buffer[: len(data)] = data
+                    self._position += len(data)
+                    return len(data)
+            except urllib.error.HTTPError as error:
+                raise InputError(f"{self.url} cannot be read: {_reason(error)}") from error
+            except (OSError, http.client.HTTPException) as error:
+                problem = _reason(error)
+        raise InputError(f"{self.url} cannot be read: {problem}")
+
+    def _request(self, end: int) -> bytes:
+        wanted = f"bytes {self._position}-{end - 1}/"
+        request = urllib.request.Request(self.url, headers={"Range": f"bytes={self._position}-{end - 1}"})
+        with urllib.request.urlopen(request, timeout=self.timeout) as response:
+            if response.status != 206 or not response.headers.get("Content-Range", "").startswith(wanted):
+                raise InputError(f"{self.url}: the server does not send parts of files, expected range requests")
+            try:
+                return response.read()
+            except http.client.IncompleteRead as error:
+                return error.partial  # the next call reads on from there
+
+
+def _reason(error: Exception) -> object:
+    if isinstance(error, urllib.error.HTTPError):
+        return f"HTTP {error.code} {error.reason}"
+    return getattr(error, "reason", error)
