@@ -1,0 +1,73 @@
+"""Sphinx configuration of the course site (`make site`): the notebooks as stored, docs/ and the API reference."""
+
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]  # also Sphinx's source folder, so that all relative links stay as they are
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+_project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+project = "zsp-lite"
+author = ", ".join(person["name"] for person in _project["authors"])
+copyright = author
+language = "en"
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "course",
+]
+root_doc = "docs/index"
+include_patterns = [
+    "*.md",
+    "docs/**.md",
+    "notebooks/README.md",
+    "notebooks/*.ipynb",
+    "notebooks/exercises/source/*/*.ipynb",
+    "notebooks/results/*/README.md",
+    "data_samples/ATTRIBUTION.md",
+    "zsp_lite/weights/MODEL_CARD.md",
+]
+# Sphinx walks through every folder that is not excluded.
+_sources = {"docs", "notebooks", "data_samples", "zsp_lite"}
+exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _sources]
+exclude_patterns += ["**/.ipynb_checkpoints", "notebooks/exercises/release", "data_samples/*/*"]
+
+nb_execution_mode = "off"  # outputs are those stored in the notebooks
+nb_merge_streams = True
+myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4  # the anchors of GitHub
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+default_role = "py:obj"  # `name` in docstrings: a link if the name is documented here
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_use_ivar = True
+
+# Address of the repository on GitHub, for the links "Open in Colab"; without it there are none.
+course_repository = _project.get("urls", {}).get("Repository", "")
+
+html_theme = "sphinx_book_theme"
+html_title = "zsp-lite"
+html_css_files = ["style.css"]
+html_static_path = ["static"]
+templates_path = ["templates"]
+html_additional_pages = {"index": "redirect.html"}
+html_math_renderer = "mathml"
+html_copy_source = False  # the sources of the exercises hold their solutions
+html_show_sourcelink = False
+html_domain_indices = False
+html_theme_options = {
+    "repository_url": course_repository,
+    "use_repository_button": bool(course_repository),
+    "use_download_button": False,  # would offer the source; `course` links to the notebook for students
+    "navbar_persistent": [],  # the search field is in the sidebar
+    "show_navbar_depth": 1,
+    "max_navbar_depth": 1,
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}

@@ -1,0 +1,226 @@
+"""Sphinx extension of the course site: what MyST-NB and the theme do not do with stored notebooks.
+
+- Widgets become the picture that they showed when the notebook was stored; plotly figures become HTML.
+- Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own preprocessors.
+- Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an install cell.
+- Docstrings keep their indented examples.
+- Formulas become MathML, which needs no script from the network.
+"""
+
+import json
+import re
+import shutil
+from copy import deepcopy
+from html import escape, unescape
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import nbformat
+import plotly
+import plotly.io
+from docutils import nodes
+from latex2mathml.converter import convert
+from nbformat import NotebookNode
+from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
+from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
+from traitlets.config import PyFileConfigLoader
+
+WIDGET = "application/vnd.jupyter.widget-view+json"
+PLOTLY = "application/vnd.plotly.v1+json"
+BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
+
+INSTALL_IN_COLAB = """\
+# In Colab, this cell fetches the repository with its sample data and installs zsp-lite (minutes). Elsewhere it does nothing.
+import sys
+
+if "google.colab" in sys.modules:
+    !git clone --quiet --depth 1 {repository} /content/{folder}
+    %pip install --quiet /content/{folder} anywidget
+    %cd /content/{folder}/notebooks
+    !ln -sfn ../data_samples data_samples
+    from google.colab import output
+
+    output.enable_custom_widget_manager()  # the 3D view for clicks on point clouds
+"""
+
+
+def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Prepare the text of a page before it is parsed (Sphinx's event `source-read`)."""
+    path = app.env.doc2path(docname)
+    if path.suffix == ".ipynb":
+        notebook = nbformat.reads(source[0], as_version=4)
+        remove_solutions(notebook, app.srcdir)
+        demote_sections(notebook)
+        widgets = notebook.metadata.pop("widgets", {})
+        for cell in notebook.cells:
+            if cell.cell_type == "code":
+                cell.source = cell.source.removeprefix("# NBVAL_CHECK_OUTPUT\n")
+                cell.outputs = [shown for output in cell.outputs for shown in static_outputs(output, widgets)]
+        app.env.temp_data["alternative texts"] = [
+            output.metadata[form]["alt"]
+            for cell in notebook.cells
+            for output in cell.get("outputs", [])
+            for form in output.get("data", {})
+            if form.startswith("image/")
+        ]
+        notebook.cells.insert(1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository)))
+        source[0] = nbformat.writes(notebook)
+    else:  # a link to a folder has no page to lead to
+        source[0] = re.sub(
+            r"\[([^]]*)\]\(([^)#:\s]+)\)",
+            lambda link: link[1] if (path.parent / link[2]).is_dir() else link[0],
+            source[0],
+        )
+
+
+def remove_solutions(notebook: NotebookNode, root: Path) -> None:
+    """Make the student version of an exercise. Other notebooks have no cells of nbgrader."""
+    if any("nbgrader" in cell.metadata for cell in notebook.cells):
+        config = PyFileConfigLoader("nbgrader_config.py", path=str(root / "notebooks" / "exercises")).load_config()
+        for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
+            clear(config=config).preprocess(notebook, {})
+
+
+def demote_sections(notebook: NotebookNode) -> None:
+    """Leave one heading of the first level, the title; some notebooks use that level for their sections too."""
+    below = ""
+    for cell in notebook.cells[1:]:
+        if cell.cell_type == "markdown":
+            if cell.source.startswith("# ") or "\n# " in cell.source:
+                below = "#"
+            cell.source = re.sub("^(?=#+ )", below, cell.source, flags=re.MULTILINE)
+
+
+def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
+    """The forms of a stored output that need no kernel: HTML of a plotly figure, picture and caption of a widget."""
+    data = output.get("data", {})
+    if PLOTLY in data:
+        figure = plotly.io.from_json(json.dumps(data[PLOTLY]), skip_invalid=True)
+        figure.update_layout(width=None, autosize=True)
+        return [html_output(plotly.io.to_html(figure, include_plotlyjs=False, full_html=False))]
+    if WIDGET in data:
+        return widget_outputs(widgets["application/vnd.jupyter.widget-state+json"]["state"], data[WIDGET]["model_id"])
+    return [output]
+
+
+def html_output(html: str) -> NotebookNode:
+    return nbformat.v4.new_output("display_data", {"text/html": html})
+
+
+def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
+    """The stored picture of a widget, its caption, and the names and values of its controls."""
+    pictures, captions, controls = [], [], []
+
+    def visit(identifier: str) -> None:
+        model = models[identifier]
+        state = model["state"]
+        if model["model_name"] == "ImageModel":
+            (buffer,) = model["buffers"]
+            pictures.append({f"image/{state['format']}": buffer["data"]})
+        elif model["model_name"] == "HTMLModel":
+            captions.append(re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip())
+        elif state.get("description"):
+            value = state["_options_labels"][state["index"]] if "index" in state else state.get("value", "")
+            controls.append(f"{state['description']} = {value}" if value != "" else state["description"])
+        for child in state.get("children", []):
+            visit(child.removeprefix("IPY_MODEL_"))
+
+    visit(identifier)
+    note = html_output(f'<p class="widget">Interactive in a running notebook: {escape(", ".join(controls))}.</p>')
+    if not pictures:
+        return [note]
+    alt, caption = " ".join(captions).removeprefix("Picture: "), captions[-1]
+    (picture,) = pictures
+    metadata = {form: {"alt": unescape(alt)} for form in picture}
+    return [
+        nbformat.v4.new_output("display_data", picture, metadata=metadata),
+        html_output(f'<p class="widget">{caption}</p>'),
+        note,
+    ]
+
+
+def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
+    """Give the pictures of stored outputs their alternative texts, which MyST-NB leaves out (`doctree-read`)."""
+    pictures = [node for node in doctree.findall(nodes.image) if "jupyter_execute" in node["uri"]]
+    for node, alt in zip(pictures, app.env.temp_data.get("alternative texts", []), strict=True):
+        node["alt"] = alt
+
+
+def run_links(docname: str, repository: str) -> str:
+    """HTML with the links to download a notebook and to open it in Colab or in a dev container."""
+    up = "../" * docname.count("/")
+    links = [(f"{up}docs/run_it.html", "Run it"), (f"{up}run/{docname}.ipynb", "Download")]
+    if repository:
+        name = urlsplit(repository).path.strip("/")
+        links += [
+            (f"https://colab.research.google.com/github/{name}/blob/{BRANCH}/run/{docname}.ipynb", "Open in Colab"),
+            (f"https://codespaces.new/{name}", "Open in a dev container"),
+        ]
+    return '<p class="run">' + " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links) + "</p>"
+
+
+def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
+    """Copy a notebook with a first cell that installs zsp-lite in Colab, if the repository's address is known."""
+    notebook = deepcopy(notebook)
+    if repository:
+        folder = repository.rstrip("/").removesuffix(".git").rpartition("/")[2]
+        cell = nbformat.v4.new_code_cell(INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install")
+        notebook.cells.insert(0, cell)
+    return notebook
+
+
+def write_files(app: Sphinx, error: Exception | None) -> None:
+    """Write the notebooks to run and plotly's script (Sphinx's event `build-finished`)."""
+    if error or app.builder.format != "html":
+        return
+    for docname in app.env.found_docs:
+        path = app.env.doc2path(docname)
+        if path.suffix == ".ipynb":
+            notebook = nbformat.read(path, as_version=4)
+            remove_solutions(notebook, app.srcdir)
+            copy = app.outdir / "run" / f"{docname}.ipynb"
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            nbformat.write(runnable(notebook, app.config.course_repository), copy)
+    script = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
+    shutil.copy(script, app.outdir / "_static" / script.name)
+
+
+def add_plotly(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None) -> None:
+    """Load plotly's script on the pages that have a figure of it (`html-page-context`)."""
+    if doctree and any("plotly-graph-div" in node.astext() for node in doctree.findall(nodes.raw)):
+        app.add_js_file("plotly.min.js", priority=100)
+
+
+def mark_examples(app: Sphinx, kind: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """Mark indented blocks of a docstring as literal blocks (`autodoc-process-docstring`, before napoleon)."""
+    text, literal = [], False
+    for line in lines:
+        indented = line.startswith("    ")
+        if not literal and indented and text and not text[-1] and not text[-2].startswith(" "):
+            literal = True
+            text += ["::", ""]
+        literal = literal and (indented or not line)
+        text.append(line if literal else line.replace("|", r"\|"))
+    lines[:] = text
+
+
+def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def visit_displayed_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    translator.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_config_value("course_repository", "", "env", str)
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))
+    app.connect("source-read", read_source)
+    app.connect("doctree-read", describe_pictures)
+    app.connect("autodoc-process-docstring", mark_examples, priority=400)
+    app.connect("html-page-context", add_plotly)
+    app.connect("build-finished", write_files)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
