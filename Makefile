@@ -7,7 +7,7 @@ RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks browser hostile exercises doctor render-env clean
+.PHONY: help demo test check lint format lab notebooks site browser hostile exercises doctor render-env clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -17,6 +17,7 @@ help:
 	@echo "make format     let ruff format all code, notebooks included"
 	@echo "make lab        JupyterLab on the notebooks"
 	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
+	@echo "make site       the course as a web site, in outputs/site/; no notebook is executed"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
 	@echo "make hostile    damaged, oversized and malicious inputs, each in a process with limits (Linux; minutes)"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
@@ -66,6 +67,11 @@ lab: $(STAMP)
 
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
+
+# From the stored outputs of the notebooks. A warning, such as a broken link, is an error.
+site: $(STAMP)
+	$(RUN) -m sphinx -q -W --keep-going -c docs/site -d outputs/site-doctrees . outputs/site
+	@echo "the course site is outputs/site/index.html"
 
 # Skipped where there is no Chromium.
 browser: $(STAMP)

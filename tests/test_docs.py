@@ -125,9 +125,16 @@ def test_the_page_on_installation_lists_every_extra():
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
     jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
-    assert runs == {"test": ["make test"], "avx2": ["make test"], "browser": ["make browser"]}
+    (publish,) = runs.pop("publish")
+    assert runs == {"test": ["make test"], "avx2": ["make test"], "site": ["make site"], "browser": ["make browser"]}
+    assert "gh-pages" in publish and jobs["publish"]["needs"] == ["test", "site"]
+    assert (
+        jobs["publish"]["if"] == "github.event_name == 'push'" and jobs["publish"]["permissions"]["contents"] == "write"
+    )
     assert jobs["avx2"]["env"] == {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
-    assert {"test", "browser"} <= set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
+    assert {"test", "site", "browser"} <= set(
+        re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
+    )
     assert (REPOSITORY / ".ci" / "run").read_text().endswith("exec make test\n")
 
 

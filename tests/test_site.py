@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 
 import nbformat
 import pytest
+
 import zsp_lite
 
 REPOSITORY = Path(__file__).parents[1]
@@ -59,7 +60,9 @@ def site(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pages(site):
     """All pages by their path in the site, without the file of the search."""
-    return {str(path.relative_to(site)): Page(path) for path in sorted(site.rglob("*.html")) if path.name != "search.html"}
+    return {
+        str(path.relative_to(site)): Page(path) for path in sorted(site.rglob("*.html")) if path.name != "search.html"
+    }
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
 INSTALL_IN_COLAB = """\
-# In Colab, this cell fetches the repository with its sample data and installs zsp-lite (minutes). Elsewhere it does nothing.
+# Colab only: fetches the repository with its sample data, installs zsp-lite (minutes).
 import sys
 
 if "google.colab" in sys.modules:
