@@ -47,7 +47,7 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
     project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
     optional = [
         one
-        for extra in ("notebooks", "test", "cluster", "course", "browser", "meshes")
+        for extra in ("notebooks", "test", "cluster", "course", "browser", "meshes", "site")
         for one in project["optional-dependencies"][extra]
     ]
     for requirement in map(Requirement, project["dependencies"] + optional):
