@@ -44,7 +44,8 @@ def test_an_unknown_option_is_one_line_and_exit_code_2(command, capsys):
 def test_help_lists_every_command(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    names = "demo benchmark tables compare synth weights train train-baseline label data models profile doctor".split()
+    names = "demo estimate benchmark tables compare synth weights train train-baseline label data models profile doctor"
+    names = names.split()
     assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
 
 
@@ -66,6 +67,7 @@ def test_help_imports_no_large_library():
         (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range x>=1"),
         (["benchmark", "--pairs", "2.5"], "'--pairs': '2.5' is not a valid integer"),
         (["demo", "--image-size", "small"], "'--image-size': 'small' is not a valid integer"),
+        (["demo", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
         (["demo", "--facet", "keys"], "'keys' is not one of 'key', 'query', 'value', 'token'"),
         (["benchmark", "--methods", ","], "expected names separated by commas"),
         (["train", "--shorten", "nan"], "got 'nan', expected a positive number"),
@@ -151,7 +153,19 @@ def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, mon
     assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "ellipsoid" in text and " of 5" in text and "°" in text and cli.USER_NOTE in text
+    assert "paper" in text and "verified" in text
     assert (tmp_path / "report.html").stat().st_size > 1_000_000  # plotly's script and the pictures
+
+
+def test_the_demo_runs_the_solvers_that_it_is_told(ellipsoids, tmp_path, monkeypatch, capsys):
+    given = []
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(given.append(solvers) or ()))
+    monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
+    monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
+    for words in ([], ["--solver", "paper"], ["--solver", "verified"]):
+        assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path), *words]) == 0
+    assert given == [("paper", "verified"), ("paper",), ("verified",)]
 
 
 def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellipsoids, tmp_path, monkeypatch, capsys):
@@ -187,7 +201,7 @@ def test_layer_facet_and_size_reach_the_backbone_of_the_demo(ellipsoids, tmp_pat
         return CoordinateBackbone()
 
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", load)
-    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone: iter(()))
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     demo = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]

@@ -125,7 +125,7 @@ def test_the_page_begins_with_the_photograph_and_credits_it(results):
 
 def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
-    monkeypatch.setattr(demo, "run_demo", lambda dataset, backbone: iter(()))
+    monkeypatch.setattr(demo, "run_demo", lambda dataset, backbone, solvers: iter(()))
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     assert cli.main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0

@@ -16,7 +16,10 @@ Read the files in this order:
     points       points of the object
     estimates    the result, and the protocol of solvers
     metrics      rotation errors and their statistics
+    pair_result  the estimates of both solvers for one pair
     demo         one pair of each category, from data folder to pose error
+    sources      frames of a sequence, a capture or an image
+    estimation   one pair of your own, from files to a pose
 
     data         CO3D folders, frames, cameras, depth, labels, pairs
     backbones    vision transformers and how to load them
@@ -44,6 +47,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         demo,
         errors,
         estimates,
+        estimation,
         features,
         importers,
         io,
@@ -52,8 +56,10 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         matching,
         metrics,
         minimal,
+        pair_result,
         pipeline,
         points,
+        sources,
         synthetic,
         training,
         verified,
@@ -71,17 +77,20 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
     from zsp_lite.data.frames import Frame
     from zsp_lite.errors import InputError
     from zsp_lite.estimates import PoseEstimate
+    from zsp_lite.estimation import estimate_pose
     from zsp_lite.features import FeatureMap
     from zsp_lite.io import download, files, ply
     from zsp_lite.matching import Matches
     from zsp_lite.pipeline import ZeroShotPose
+    from zsp_lite.sources import open_source
     from zsp_lite.viz import plots, report, scene3d
 
 # Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
 # which `zsp-lite --help` does not need.
 _HOMES = {
-    "": "alignment best_view demo errors estimates features matchers matching metrics minimal pipeline points views "
-    "backbones baselines benchmark cli data importers io labelling synthetic training verified viz widgets",
+    "": "alignment best_view demo errors estimates estimation features matchers matching metrics minimal pair_result "
+    "pipeline points sources views backbones baselines benchmark cli data importers io labelling synthetic training "
+    "verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",
     "backbones.backbone": "Backbone",
@@ -92,12 +101,15 @@ _HOMES = {
     "data.frames": "Frame",
     "errors": "InputError",
     "estimates": "PoseEstimate",
+    "estimation": "estimate_pose",
     "features": "FeatureMap",
     "io": "download files ply",
     "matching": "Matches",
     "pipeline": "ZeroShotPose",
+    "sources": "open_source",
     "viz": "plots report scene3d",
 }
+_FUNCTIONS = ("load_backbone", "estimate_pose", "open_source")
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = ["__version__", *_HOME_OF]
@@ -107,7 +119,7 @@ def __getattr__(name: str):
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = ".".join(filter(None, (__name__, _HOME_OF[name])))
-    if name[0].isupper() or name == "load_backbone":
+    if name[0].isupper() or name in _FUNCTIONS:
         return getattr(importlib.import_module(home), name)
     return importlib.import_module(f"{home}.{name}")
 

@@ -1,7 +1,6 @@
 """The computation of `zsp-lite demo`: a real photograph posed by a synthetic object, and one pair of each category."""
 
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Float
 
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.data.samples import (
     PHOTOGRAPH_CATEGORY,
@@ -21,34 +20,14 @@ from zsp_lite.data.samples import (
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.metrics import rotation_error
+from zsp_lite.pair_result import SEQUENCE_FRAMES, PairResult, label_error, solve_pair
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.synthetic.ground_truth import object_poses
 from zsp_lite.synthetic.recording import POSES_FILE
 
 N_TARGETS = 5
-_SEQUENCE_FRAMES = 6
 # Settings of `ZeroShotPose` on the photograph.
 PHOTOGRAPH_FOREGROUNDS, PHOTOGRAPH_SOLVERS = ("mask", "saliency"), ("paper", "verified")
-
-
-@dataclass(frozen=True, eq=False)
-class DemoResult:
-    """Pose estimate of one pair, compared with its labels.
-
-    Attributes:
-        pair: The evaluation pair.
-        estimate: Its pose estimate.
-        error: Rotation error in degrees.
-        seconds: Run time of the estimate, from frames in memory.
-        sequence: At most six whole frames, evenly spaced over the target sequence, for displaying the propagated pose.
-    """
-
-    pair: Pair
-    estimate: PoseEstimate
-    error: float
-    seconds: float
-    sequence: tuple[Frame, ...]
 
 
 def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
@@ -67,37 +46,43 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
     return pairs
 
 
-def run_demo(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[DemoResult]:
-    """Estimate the poses of `demo_pairs` with the paper's settings, one at a time."""
+def run_demo(dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] = ("paper",)) -> Iterator[PairResult]:
+    """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each solver."""
     method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
-        yield run_pair(dataset, pair, method)
+        yield run_pair(dataset, pair, method, solvers)
 
 
-def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> DemoResult:
+def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None) -> PairResult:
     """Load a pair's frames, estimate its pose, and compare it with the ground truth of the labels.
+
+    Args:
+        dataset: Data folder.
+        pair: Evaluation pair.
+        method: The method.
+        solvers: Names of solvers; by default the method's own.
 
     Raises:
         InputError: A frame or a label of the pair is missing, or the pose cannot be estimated.
     """
     reference, targets = dataset.load_pair(pair)
-
-    start = time.perf_counter()
-    estimate = method.estimate(reference, targets)
-    seconds = time.perf_counter() - start
-
+    estimates = solve_pair(method, reference, targets, solvers)
     labels = read_labels(dataset.root, pair.category)
     for sequence in (pair.reference_sequence, pair.target_sequence):
         if sequence not in labels:
             raise InputError(f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with")
-    truth = relative_pose(
-        labels[pair.reference_sequence], reference.camera,
-        labels[pair.target_sequence], targets[estimate.view].camera,
+    errors = {
+        solver: label_error(estimate, labels[pair.reference_sequence], reference, labels[pair.target_sequence], targets)
+        for solver, estimate in estimates.items()
+    }
+    annotations = dataset.frames(pair.category, pair.target_sequence)
+    chosen = np.linspace(0, len(annotations), SEQUENCE_FRAMES, endpoint=False).astype(int)
+    return PairResult(
+        pair.category,
+        f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
+        f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
+        estimates, errors, tuple(dataset.load(annotations[i]) for i in np.unique(chosen)), pair,
     )  # fmt: skip
-    error = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
-    sequence = dataset.frames(pair.category, pair.target_sequence)
-    chosen = np.linspace(0, len(sequence), _SEQUENCE_FRAMES, endpoint=False).astype(int)
-    return DemoResult(pair, estimate, error, seconds, tuple(dataset.load(sequence[i]) for i in np.unique(chosen)))
 
 
 @dataclass(frozen=True, eq=False)

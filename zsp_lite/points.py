@@ -4,7 +4,7 @@ Patches on the object are `View.foreground`; the functions here work on pixels a
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
@@ -78,15 +78,22 @@ def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarra
     Raises:
         InputError: No pixel of the object has a known depth.
     """
+    return coloured_cloud(view, most, seed)[0]
+
+
+def coloured_cloud(
+    view: View, most: int = 2000, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Gather the points of `object_cloud` with their RGB colours in the image."""
     frame = view.frame
     pixels = object_pixels(frame, _INTERIOR)
     if frame.mask is None:
         rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
         pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
-    points = unproject_depth(frame.depth, frame.camera)[pixels]
+    points, colours = unproject_depth(frame.depth, frame.camera)[pixels], frame.rgb[pixels]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
-    points = points[near_median(points, 2.5)]
-    if len(points) > most:
-        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
-    return points
+    kept = np.flatnonzero(near_median(points, 2.5))
+    if len(kept) > most:
+        kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), most, replace=False))]
+    return points[kept], colours[kept]

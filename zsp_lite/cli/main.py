@@ -23,6 +23,7 @@ from zsp_lite.cli.common import (
 )
 from zsp_lite.cli.data import data, label
 from zsp_lite.cli.download import download as data_download
+from zsp_lite.cli.estimate import SOLVERS, estimate
 from zsp_lite.cli.models import models, print_left_out
 from zsp_lite.errors import InputError
 
@@ -44,7 +45,7 @@ def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (benchmark, tables, compare, profile, data, label, models):
+for command in (estimate, benchmark, tables, compare, profile, data, label, models):
     cli.add_command(command)
 data.add_command(data_download)
 
@@ -84,12 +85,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         "demo",
         "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d",
         "demo --layer last --facet token --out outputs/tokens",
+        "demo --solver paper",
     )
 )
 @click.option("--data", type=PATH, metavar="DIR", show_default="data_samples", help="Folder in CO3D's layout.")
+@click.option(
+    "--solver", type=click.Choice(SOLVERS), default="both",
+    help="The paper's solver, the verified solver, or both, for the pairs of the categories.",
+)  # fmt: skip
 @backbone_options
 @out_option("outputs/demo", "Folder for the report.")
-def demo(data: Path | None, out: Path, **backbone) -> None:
+def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     """Estimate the pose of a real motorcycle and of one pair per category: tables, and a report with pictures.
 
     The real motorcycle is a photograph; its targets are a category `motorcycle` of synthetic objects in the data.
@@ -104,10 +110,11 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo, run_photograph
+    from zsp_lite.pair_result import SOLVER_CHOICES
     from zsp_lite.synthetic.export import SETTINGS_FILE
     from zsp_lite.synthetic.model_export import RENDERED_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
-    from zsp_lite.viz.report import table_row, write_overview, write_report
+    from zsp_lite.viz.report import COLUMNS, table_rows, write_overview, write_report
 
     console = Console()
     folder = data or sample_data()
@@ -127,13 +134,14 @@ def demo(data: Path | None, out: Path, **backbone) -> None:
             table.add_row(*row)
         console.print(table)
     table = Table(title=f"One pair per category in {folder}, backbone {name}")
-    for column in ("category", "chosen view", "inliers", "rotation error", "time"):
-        table.add_column(column, justify="left" if column == "category" else "right")
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column in COLUMNS[:2] else "right")
     results = []
     with console.status("estimating"):
-        for result in run_demo(dataset, model):
+        for result in run_demo(dataset, model, SOLVER_CHOICES[solver]):
             results.append(result)
-            table.add_row(*table_row(result))
+            for row in table_rows(result):
+                table.add_row(*row)
     console.print(table)
     out.mkdir(parents=True, exist_ok=True)
     with console.status("writing the report"):

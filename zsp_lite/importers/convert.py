@@ -23,7 +23,35 @@ READERS: dict[str, Callable[..., list[CaptureFrame]]] = {
     "open3d": read_open3d,
     "lists": read_lists,
 }
+# Files and folders that only a capture of the format has, any of them.
+_SIGNS = {
+    "tum": ("groundtruth.txt",),
+    "nerfstudio": ("transforms.json",),
+    "open3d": ("trajectory.log", "scene/trajectory.log", "odometry.log"),
+    "lists": ("poses.txt",),
+}
 MAX_FRAMES = 100  # about the length of CO3D's sequences
+
+
+def capture_format(folder: str | Path) -> str:
+    """Recognise the format of a capture by the names of its files.
+
+    Returns:
+        A name in `READERS`.
+
+    Raises:
+        InputError: The folder has the files of none, or of several.
+    """
+    found = [name for name, signs in _SIGNS.items() if any((Path(folder) / sign).is_file() for sign in signs)]
+    if len(found) == 1:
+        return found[0]
+    files = "; ".join(f"{name}: {' or '.join(signs)}" for name, signs in _SIGNS.items())
+    if found:
+        raise InputError(f"folder {folder} has files of the formats {', '.join(found)}, expected one of them ({files})")
+    raise InputError(
+        f"folder {folder} is neither CATEGORY/SEQUENCE of a data folder nor a capture, expected one of its files "
+        f"({files}); `zsp-lite data import --help` lists what each format holds"
+    )
 
 
 @dataclass(frozen=True)
@@ -86,7 +114,8 @@ def import_capture(
         frames = masks_from_files(frames, masks)
     elif any(frame.mask is None for frame in frames):
         raise InputError(
-            "the capture has no masks of its own, expected a box in its first picture or a folder of masks"
+            "the capture has no masks of its own, expected a box in its first picture (--box TOP,LEFT,HEIGHT,WIDTH) or "
+            "a folder of masks (--masks DIR)"
         )
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
     if not seen:

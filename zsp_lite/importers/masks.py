@@ -47,7 +47,8 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
         mask = grab_cut(frame.rgb, box)
         if not mask.any():
             raise InputError(
-                f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected mask files"
+                f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected another --box or mask "
+                "files (--masks DIR)"
             )
         masked.append(replace(frame, mask=mask))
         points = np.concatenate([points, _object_points(masked[-1])])

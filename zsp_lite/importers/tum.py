@@ -54,7 +54,8 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
         size = size or image_size(image)
         if intrinsics is None and size != DEFAULT_SIZE:
             raise InputError(
-                f"{image} is {size} pixels, expected intrinsics: the default ones are for {DEFAULT_SIZE} pixels"
+                f"{image} is {size} pixels, expected --intrinsics FX,FY,CX,CY: the default ones are for {DEFAULT_SIZE} "
+                "pixels"
             )
         where = f"{folder / 'groundtruth.txt'}, line {pose[0]}"
         values = parse_numbers(pose[1][1:8], where)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import plotly.graph_objects as go
-from jaxtyping import Real
+from jaxtyping import Real, UInt8
 
 from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 4000  # of both clouds together; more points slow down browsers and enlarge notebooks
+STYLES = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))  # colour, symbol and size of both clouds
 _AXIS_LABELS = {"x": "x (right)", "y": "y (down)", "z": "z (forward)"}
 
 
@@ -17,6 +18,7 @@ def aligned_clouds(
     names: tuple[str, str] = ("reference, aligned", "target"),
     title: str | None = None,
     seed: int = 0,
+    colours: tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]] | None = None,
 ) -> go.Figure:
     """Draw two point clouds in one frame. They differ in colour and in the shape of their markers.
 
@@ -28,19 +30,23 @@ def aligned_clouds(
         names: legend entries.
         title: title above the scene.
         seed: seed of the random subset of at most 2,000 points that is drawn of each cloud.
+        colours: RGB colours of the points; by default one colour per cloud.
 
     Raises:
         InputError: If a cloud is empty or has values that are not finite.
     """
     rng = np.random.default_rng(seed)
     traces, drawn = [], []
-    styles = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))
-    for cloud, name, (colour, symbol, size) in zip((reference, target), names, styles):
+    for index, (cloud, name, (colour, symbol, size)) in enumerate(zip((reference, target), names, STYLES)):
         cloud = np.asarray(cloud, dtype=np.float64)
         if len(cloud) == 0 or not np.isfinite(cloud).all():
             raise InputError(f"point cloud {name!r} of shape {cloud.shape} is empty or not finite")
+        own = None if colours is None else colours[index]
         if len(cloud) > MAX_POINTS // 2:
-            cloud = cloud[np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))]
+            kept = np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))
+            cloud, own = cloud[kept], None if own is None else own[kept]
+        if own is not None:
+            colour = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in own.tolist()]
         # For a cloud of unit standard deviation three decimals are finer than a pixel; they keep the page small.
         cloud = np.round(cloud, 3).astype(np.float32)
         drawn.append(cloud)

@@ -1,0 +1,153 @@
+"""Object masks from depth alone: what stands on the supporting plane where the cameras look.
+
+No box is needed. The plane of the table or floor is fitted to the points of all frames. What is above it falls into
+connected parts; the object is the part at the point that the optical axes approach.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.photograph import fit_plane
+from zsp_lite.errors import InputError
+
+# All lengths are relative to the distance of the cameras from the point that they look at.
+_REACH = 0.7  # points farther from that point are not part of the object
+_PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
+_CLEARANCE = 0.02  # smallest height of a point of the object above the plane
+_VOXEL = 0.07  # parts that are farther apart than this are separate
+_PLANES = 3  # planes to try: the largest may be a wall or a side of the object
+_MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
+_MIN_ON_PLANE = 0.05  # share of the points that must lie on it
+_SURROUNDED = 0.6  # share of the neighbours of a region of unknown depth that are on the object
+_POINTS = 20_000
+_MIN_PIXELS = 100
+
+
+def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
+    """Segment the object in frames of one world that look at it from any sides.
+
+    Args:
+        frames: Frames with depth. In a single frame the object is near the middle of the image.
+
+    Returns:
+        The frames with masks; a mask is empty where the frame does not show the object.
+
+    Raises:
+        InputError: No depth is known, or nothing stands out where the cameras look.
+    """
+    points = [_world_points(frame) for frame in frames]
+    known = [np.isfinite(one[..., 0]) for one in points]
+    if not any(one.any() for one in known):
+        raise InputError(f"no depth is known in any of {len(frames)} frames, expected some to find the object")
+    focus, distance = _focus(frames, points, known)
+    near = [np.linalg.norm(one - focus, axis=-1) < _REACH * distance for one in points]  # False for NaN
+    cloud = np.concatenate([one[chosen] for one, chosen in zip(points, near)])
+    cloud = cloud[:: -(-len(cloud) // _POINTS)] if len(cloud) else cloud
+    centres = np.stack([frame.camera.centre for frame in frames])
+    plane = _supporting_plane(cloud, centres, distance)
+    if plane is not None:
+        normal, offset = plane
+        near = [chosen & (one @ normal - offset > _CLEARANCE * distance) for one, chosen in zip(points, near)]
+    part = _part_at(focus, [one[chosen] for one, chosen in zip(points, near)], _VOXEL * distance)
+    masked = []
+    for frame, one, chosen, depth_known in zip(frames, points, near, known):
+        mask = np.zeros(frame.camera.size, bool)
+        mask[chosen] = part(one[chosen])
+        masked.append(replace(frame, mask=_filled(mask, depth_known)))
+    if not any((frame.mask > 0).sum() >= _MIN_PIXELS for frame in masked):
+        raise InputError(f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks")
+    return masked
+
+
+def _world_points(frame: Frame) -> Float[np.ndarray, "h w 3"]:
+    """World points of all pixels, NaN where the depth is unknown."""
+    if frame.depth is None:
+        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to find the object")
+    points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera))
+    points[frame.depth <= 0] = np.nan
+    return points
+
+
+def _focus(
+    frames: Sequence[Frame], points: Sequence[np.ndarray], known: Sequence[np.ndarray]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return the point that the cameras look at, and their mean distance from it.
+
+    With several cameras this is the point nearest to their optical axes. With one, or with parallel axes, it is the
+    median of the nearest quarter of the points in the central part of the image.
+    """
+    centres = np.stack([frame.camera.centre for frame in frames])
+    axes = np.stack([frame.camera.R[2] for frame in frames])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system = across.sum(axis=0) / len(frames)
+    if np.linalg.eigvalsh(system)[0] > 0.01:  # the axes differ by several degrees
+        focus = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(frames))
+        if (np.einsum("nj,nj->n", focus - centres, axes) > 0).all():
+            return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
+    height, width = frames[0].camera.size
+    middle = np.zeros((height, width), bool)
+    middle[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
+    chosen = points[0][middle & known[0]] if (middle & known[0]).any() else points[0][known[0]]
+    depth = frames[0].camera.to_camera(chosen)[:, 2]
+    focus = np.median(chosen[depth <= np.quantile(depth, 0.25)], axis=0)
+    return focus, float(np.linalg.norm(focus - centres[0]))
+
+
+def _supporting_plane(
+    cloud: Float[np.ndarray, "n 3"], centres: Float[np.ndarray, "v 3"], distance: float
+) -> tuple[Float[np.ndarray, "3"], float] | None:
+    """Fit the plane that the object stands on; its normal points to the cameras. None if there is none."""
+    rest = cloud
+    for _ in range(_PLANES):
+        if len(rest) < _MIN_PIXELS:
+            break
+        normal, offset = fit_plane(rest, _PLANE_DISTANCE * distance)
+        if np.median(centres @ normal - offset) < 0:
+            normal, offset = -normal, -offset
+        height = cloud @ normal - offset
+        on = np.abs(height) < _PLANE_DISTANCE * distance
+        below = (height < -3 * _PLANE_DISTANCE * distance).mean()
+        if on.mean() >= _MIN_ON_PLANE and below <= _MAX_BELOW:
+            return normal, offset
+        rest = rest[np.abs(rest @ normal - offset) >= _PLANE_DISTANCE * distance]
+    return None
+
+
+def _part_at(focus: Float[np.ndarray, "3"], points: Sequence[Float[np.ndarray, "_ 3"]], voxel: float):
+    """Return a function that tells which points belong to the connected part at the focus.
+
+    The part has the most points, each weighted by its distance from the focus.
+    """
+    cloud = np.concatenate(points)
+    if not len(cloud):
+        return lambda some: np.zeros(len(some), bool)
+    low = cloud.min(axis=0)
+    cells = np.floor((cloud - low) / voxel).astype(int)
+    grid = np.zeros(cells.max(axis=0) + 1, bool)
+    grid[tuple(cells.T)] = True
+    parts, _ = ndimage.label(grid, np.ones((3, 3, 3)))
+    weight = np.exp(-np.square(np.linalg.norm(cloud - focus, axis=1) / (8 * voxel)))
+    best = np.bincount(parts[tuple(cells.T)], weight).argmax()
+    return lambda some: parts[tuple(np.floor((some - low) / voxel).astype(int).T)] == best
+
+
+def _filled(mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Add the regions of unknown depth that the mask surrounds, close small gaps and remove single pixels."""
+    holes, count = ndimage.label(~known)
+    ring = ndimage.grey_dilation(holes, (3, 3)) * known  # the known pixels beside each region
+    around, inside = np.bincount(ring.ravel(), minlength=count + 1), np.bincount(ring[mask], minlength=count + 1)
+    surrounded = inside > _SURROUNDED * np.maximum(around, 1)
+    surrounded[0] = False
+    filled = (mask | surrounded[holes]).astype(np.uint8)
+    size = max(3, round(min(mask.shape) / 40) | 1)
+    filled = np.pad(filled, size)
+    filled = cv2.morphologyEx(filled, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    filled = cv2.morphologyEx(filled, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return filled[size:-size, size:-size].astype(np.float32)
