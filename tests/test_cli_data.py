@@ -1,16 +1,18 @@
 """The commands for data: their output, the files they write, and one line for bad input."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
-from test_importers import METRES, write_lists
+from test_importers import METRES, write_lists, write_tum
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.cli.main import main
+from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import Frame, write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
@@ -122,6 +124,28 @@ def test_options_of_transfer_and_import_reach_the_library(tmp_path, monkeypatch)
     assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
     capture = (Path("scan"), {"depth_unit": 0.5})
     assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
+
+
+def test_the_help_of_the_import_lists_what_every_format_holds(capsys):
+    assert main(["data", "import", "--help"]) == 0
+    text = capsys.readouterr().out
+    table = text[text.index("which holds:") : text.index("The object is given by")]
+    assert re.findall(r"^ {4}(\w+) ", table, re.MULTILINE) == list(READERS)
+    for name in ("groundtruth.txt", "transforms.json", "trajectory.log", "poses.txt", "--intrinsics", "--depth-unit"):
+        assert name in table, name
+
+
+def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
+    folder = tmp_path / "scan"
+    camera = Camera(np.eye(3), np.zeros(3), np.full(2, 30.0), np.array([16.0, 12.0]), (24, 32))
+    write_tum(folder, [Frame(np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32), None, camera)])
+    words = ["data", "import", "tum", str(folder), "--root", str(tmp_path / "mine"), "--category", "cup"]
+    assert main([*words, "--sequence", "one"]) == 2
+    assert "expected --intrinsics FX,FY,CX,CY" in capsys.readouterr().err
+    assert main([*words, "--sequence", "one", "--intrinsics", "30,30,16,12"]) == 2
+    error = capsys.readouterr().err
+    assert "(--box TOP,LEFT,HEIGHT,WIDTH)" in error and "(--masks DIR)" in error
+    assert not (tmp_path / "mine").exists()
 
 
 def test_label_without_a_desktop_gives_one_line(root, monkeypatch, capsys):

@@ -5,7 +5,6 @@ import sys
 
 import pytest
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 
 from zsp_lite.cli import doctor
 from zsp_lite.cli.doctor import BAD, NOTE, OK, Check
@@ -81,30 +80,51 @@ def test_a_missing_data_folder_fails_if_the_user_has_set_it(tmp_path, monkeypatc
     assert all(check.fix for check in found.values() if check.state != OK)
 
 
-def test_an_extra_is_listed_with_its_purpose_and_the_command_that_installs_it(monkeypatch):
-    versions = {"transformers": "5.0", "huggingface_hub": "1.0", "dask": "2025.1", "distributed": None}
-    monkeypatch.setattr(doctor, "_version", versions.get)
+REQUIREMENTS = [
+    Requirement(text)
+    for text in (
+        "torch>=2.4",
+        "libusb-package; sys_platform == 'linux'",
+        "transformers>=4.56; extra == 'transformers'",
+        "huggingface-hub>=0.34; extra == 'transformers'",
+        "dask>=2024.1; extra == 'cluster'",
+        "distributed>=2024.1; extra == 'cluster'",
+    )
+]
+
+
+def test_an_extra_is_listed_with_its_purpose_and_the_command_that_installs_all_of_it(monkeypatch):
+    versions = {"transformers": "5.0", "huggingface-hub": "1.0", "dask": "2025.1", "distributed": None}
+    monkeypatch.setattr(doctor, "_requirements", lambda: REQUIREMENTS)
+    monkeypatch.setattr(doctor, "_version", versions.__getitem__)
     found = {check.name: check for check in doctor._extras()}
-    installed, missing = found["extra transformers"], found["extra cluster"]
+    assert list(found) == ["extra transformers", "extra cluster"]  # others are not known to this installation
+    installed, missing = found.values()
     assert installed.state == OK and "transformers 5.0" in installed.found and "hf:NAME" in installed.found
     assert missing.state == NOTE and "distributed not installed" in missing.found and "Dask" in missing.found
     assert missing.fix.endswith("install 'zsp-lite[cluster]'")
 
 
 def test_an_outdated_extra_is_reported(monkeypatch):
-    monkeypatch.setattr(doctor, "_version", lambda module: "4.0")
-    monkeypatch.setattr(doctor, "_extra_specifiers", lambda: {"transformers": SpecifierSet(">=4.56")})
+    monkeypatch.setattr(doctor, "_requirements", lambda: REQUIREMENTS)
+    monkeypatch.setattr(doctor, "_version", lambda package: "4.0")
     old = next(doctor._extras())
     assert old.state == NOTE and "transformers 4.0, expected >=4.56" in old.found and old.fix
 
 
-def test_the_extras_of_the_doctor_are_those_of_the_package():
+def test_without_jupyter_the_whole_extra_for_the_notebooks_is_named(monkeypatch):
+    present = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda package: None if package == "anywidget" else present(package))
+    check = next(check for check in doctor._extras() if check.name == "extra notebooks")
+    assert check.state == NOTE and "anywidget not installed" in check.found and "Jupyter" in check.found
+    assert check.fix.endswith("install 'zsp-lite[notebooks]'")
+
+
+def test_the_doctor_knows_every_extra_but_those_of_developers():
     import tomllib
 
     project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
-    for extra, (modules, _) in doctor.EXTRAS.items():
-        names = {Requirement(one).name for one in project["optional-dependencies"][extra]}
-        assert names == {module.replace("_", "-") for module in modules}
+    assert set(doctor.EXTRAS) == set(project["optional-dependencies"]) - {"test", "dev", "site"}
 
 
 def test_open3d_prints_nothing_in_a_notebook():

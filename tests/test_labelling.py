@@ -17,6 +17,7 @@ from zsp_lite.labelling import Labelling, align_picks, rigid_label
 from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.desktop import label_category
 from zsp_lite.labelling.guess import _frames, guess_alignment
+from zsp_lite.labelling.session import MAX_RESIDUAL
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.export import export_categories
 from zsp_lite.synthetic.recording import POSES_FILE
@@ -257,7 +258,7 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
         np.testing.assert_allclose(cloud[0], target[picked[-1]] @ turn.T)
         return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
 
-    answers = iter(["Seat", "", "back", "arm", "a", "what", "R", "", "a", "q"])
+    answers = iter(["Seat", "", "back", "arm", "a", "what", "R", "", "a", "y", "q"])
     label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x))
     assert labelling.names == ("Seat", "keypoint 2", "back", "arm")
     np.testing.assert_array_equal(labelling.picks("a"), target["a"][:4])  # in world coordinates
@@ -269,6 +270,41 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
     assert list(read_labels(root, "chair")) == ["a", "best"]
     assert "0 picked, 4 expected." in said
     assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
+
+
+def test_a_large_residual_is_accepted_only_if_confirmed(root):
+    labelling = Labelling(root, "chair")
+    pick_all(labelling, "best", corners())
+    pick_all(labelling, "a", corners("a"))
+    assert labelling.doubt("a") == "" and labelling.doubt("b") == ""
+    picks = corners("a")
+    labelling.put("a", np.array([picks[1], picks[0], *picks[2:]]))  # two keypoints confused
+    alignment = labelling.alignment("a")
+    assert alignment.rms > MAX_RESIDUAL == 0.15
+    assert f"residual {100 * alignment.rms:.0f} % of the object's size, above 15 %" in labelling.doubt("a")
+    assert labelling.names[alignment.residuals.argmax()] in labelling.doubt("a")
+    with pytest.raises(InputError, match="sequence a: residual .* expected a smaller one, or confirmed=True"):
+        labelling.accept("a")
+    assert "a" not in read_labels(root, "chair")
+    labelling.accept("a", confirmed=True)
+    assert "a" in read_labels(root, "chair")
+
+
+def test_the_desktop_asks_before_it_accepts_a_large_residual(root):
+    labelling, asked = Labelling(root, "chair"), []
+    pick_all(labelling, "best", corners())
+    picks = corners("a")
+    labelling.put("a", np.array([picks[1], picks[0], *picks[2:]]))  # two keypoints confused
+    answers = iter(["a", "n", "a", "y", "q"])
+
+    def ask(question):
+        asked.append(question)
+        return next(answers)
+
+    picks = iter([[0, 1, 2, 3, 4]])  # of a random cloud
+    label_category(labelling, ask, lambda _: None, pick=lambda *_: next(picks, []), show=lambda *_: None)
+    assert [("nevertheless" in question) for question in asked[:4]] == [False, True, False, True]
+    assert "a: residual" in asked[1] and "a" in read_labels(root, "chair")
 
 
 def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
@@ -285,7 +321,7 @@ def test_the_desktop_reports_bad_picks_and_asks_again(root):
     def guess(sequence):
         raise InputError("no frame has depth")
 
-    answers = iter(["a", "s"])
+    answers = iter(["a", "y", "s"])
     label_category(labelling, lambda _: next(answers), said.append, guess, lambda *_: next(picks, []), lambda *_: None)
     assert any("collinear" in line for line in said) and any("are the same point" in line for line in said)
     assert "b: no guess: no frame has depth" in said

@@ -99,6 +99,25 @@ def test_clicks_give_keypoints_and_an_accepted_label(labelling):
     ]  # fmt: skip
 
 
+def test_a_large_residual_is_accepted_by_a_second_press_only(labelling):
+    box = label_poses(labelling)
+    click_all(box, labelling, "reference", "best")
+    box.buttons["next"].click()
+    picks = corners(labelling, "a")
+    for point in (picks[1], picks[0], *picks[2:]):  # two keypoints confused
+        click(box, "sequence", point)
+    box.buttons["accept"].click()
+    assert (
+        "Not done: residual" in message(box) and "above 15 %" in message(box) and "press accept again" in message(box)
+    )
+    assert "a" not in read_labels(labelling.root, "chair")
+    labelling.move("a", 0, picks[2] + 0.01)  # other picks are asked about anew
+    box.buttons["accept"].click()
+    assert "Not done: residual" in message(box)
+    box.buttons["accept"].click()
+    assert message(box) == "Written: class_labels/chair/a.json. Now b." and "a" in read_labels(labelling.root, "chair")
+
+
 def test_a_new_widget_continues_an_earlier_session(root, labelling):
     box = label_poses(labelling)
     click_all(box, labelling, "reference", "best")

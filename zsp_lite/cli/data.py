@@ -260,7 +260,28 @@ def import_(
     layout: str, folder: Path, root: Path, category: str, sequence: str, box: tuple[int, ...] | None,
     masks: Path | None, frames: int, intrinsics: tuple[float, ...] | None, depth_unit: float | None,
 ) -> None:  # fmt: skip
-    """Import an RGB-D capture as a sequence: a folder in TUM's, nerfstudio's or Open3D's layout, or plain lists."""
+    """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
+
+    The first argument is the format of FOLDER, which holds:
+
+    \b
+      tum         rgb.txt, depth.txt      lines: time file; depth in 1/5000 m
+                  groundtruth.txt         lines: time tx ty tz qx qy qz qw, camera to world
+                  --intrinsics            of the camera, if it is not the benchmark's default
+      nerfstudio  transforms.json         intrinsics, and per frame file_path, depth_file_path and
+                                          transform_matrix; phone scanners export it; depth in mm,
+                                          or depth_unit_scale_factor; mask_path is used if present
+      open3d      color/, depth/          images and 16-bit depth in mm, sorted by the numbers in
+                                          their names
+                  camera_intrinsic.json   as Open3D writes it
+                  trajectory.log          camera to world, one pose per image
+      lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG or .npy
+                  poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
+                  intrinsics.txt          3 x 3 matrix in pixels
+                  --depth-unit            metres per stored depth value, 0.001 by default
+
+    The object is given by --box, by --masks, or by masks of the capture itself.
+    """
     from zsp_lite.importers import READERS, import_capture
 
     given = {"intrinsics": intrinsics, "depth_unit": depth_unit}

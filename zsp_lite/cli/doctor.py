@@ -1,7 +1,6 @@
 """Checks of the installation: packages, backbones, data. Each failed check names the command that fixes it."""
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import sys
@@ -10,19 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from packaging.requirements import InvalidRequirement, Requirement
-from packaging.specifiers import SpecifierSet
 
 from zsp_lite.data.samples import DATA_VARIABLE, REPOSITORY, data_folders
 from zsp_lite.errors import InputError
 
 OK, NOTE, BAD = "ok", "note", "bad"
-# Optional extras: their modules, and what needs them.
+# Optional extras that users need, and for what.
 EXTRAS = {
-    "transformers": (
-        ("transformers", "huggingface_hub"),
-        "backbones hf:NAME, vision transformers in Hugging Face's format (DINOv2, DINOv3, CLIP, ...)",
-    ),
-    "cluster": (("dask", "distributed"), "the benchmark on a Dask cluster (--executor dask://HOST:PORT)"),
+    "notebooks": "the notebooks, in Jupyter",
+    "transformers": "backbones hf:NAME, vision transformers in Hugging Face's format (DINOv2, DINOv3, CLIP, ...)",
+    "meshes": "your own 3D models in COLLADA files (zsp-lite synth --models)",
+    "cluster": "the benchmark on a Dask cluster (--executor dask://HOST:PORT)",
+    "course": "handing out and grading the exercises",
+    "browser": "the notebooks in a real browser (make browser)",
 }
 _PIP = f"{sys.executable} -m pip"  # `pip` on the path may belong to another interpreter
 
@@ -50,7 +49,7 @@ def run_checks(data: Path | None = None) -> list[Check]:
     Args:
         data: CO3D folder to check in addition to the default ones.
     """
-    return [_python(), *_packages(), _torch(), _open3d(), *_backbones(), *_extras(), *_data(data), _jupyter()]
+    return [_python(), *_packages(), _torch(), _open3d(), *_backbones(), *_extras(), *_data(data)]
 
 
 def ok(checks: list[Check]) -> bool:
@@ -147,31 +146,23 @@ def _backbones() -> Iterator[Check]:
 
 
 def _extras() -> Iterator[Check]:
-    """Check the modules of each optional extra."""
-    specifiers = _extra_specifiers()
-    for extra, (modules, purpose) in EXTRAS.items():
-        versions = {module: _version(module) for module in modules}
-        problems = [
-            f"{module} not installed" if version is None else f"{module} {version}, expected {specifiers[module]}"
-            for module, version in versions.items()
-            if version is None or not specifiers.get(module, SpecifierSet()).contains(version, prereleases=True)
-        ]
+    """Check the packages of each optional extra. The fix installs the whole extra."""
+    requirements = [one for one in _requirements() if one.marker is not None and not one.marker.evaluate({"extra": ""})]
+    for extra, purpose in EXTRAS.items():
+        problems, installed = [], []
+        for requirement in (one for one in requirements if one.marker.evaluate({"extra": extra})):
+            version = _version(requirement.name)
+            if version is None:
+                problems.append(f"{requirement.name} not installed")
+            elif not requirement.specifier.contains(version, prereleases=True):
+                problems.append(f"{requirement.name} {version}, expected {requirement.specifier}")
+            else:
+                installed.append(f"{requirement.name} {version}")
         if problems:
             found = f"{'; '.join(problems)} (only for {purpose})"
             yield Check(f"extra {extra}", NOTE, found, f"{_PIP} install 'zsp-lite[{extra}]'")
-        else:
-            installed = ", ".join(f"{module} {version}" for module, version in versions.items())
-            yield Check(f"extra {extra}", OK, f"{installed}: {purpose}")
-
-
-def _extra_specifiers() -> dict[str, SpecifierSet]:
-    """Return the permitted versions of the extras' modules."""
-    optional = [one for one in _requirements() if one.marker is not None and not one.marker.evaluate({"extra": ""})]
-    return {
-        requirement.name.replace("-", "_"): requirement.specifier
-        for requirement in optional
-        if any(requirement.marker.evaluate({"extra": extra}) for extra in EXTRAS)
-    }
+        elif installed:
+            yield Check(f"extra {extra}", OK, f"{', '.join(installed)}: {purpose}")
 
 
 def _requirements() -> list[Requirement]:
@@ -212,14 +203,6 @@ def _data(data: Path | None) -> Iterator[Check]:
     if data is None and not os.environ.get(DATA_VARIABLE):
         fix = f"export {DATA_VARIABLE}=/path/to/co3d (only for your own data)"
         yield Check(f"data: {DATA_VARIABLE}", NOTE, "not set", fix)
-
-
-def _jupyter() -> Check:
-    missing = [name for name in ("jupyterlab", "ipywidgets", "nbconvert") if importlib.util.find_spec(name) is None]
-    if missing:
-        found = f"{', '.join(missing)} not installed (only for the notebooks)"
-        return Check("Jupyter", NOTE, found, f"{_PIP} install {' '.join(missing)}")
-    return Check("Jupyter", OK, f"jupyterlab {importlib.metadata.version('jupyterlab')}")
 
 
 def _not_importable(name: str, error: Exception, fix: str) -> Check:

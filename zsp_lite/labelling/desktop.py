@@ -119,7 +119,11 @@ def _label_sequence(
         show(aligned @ to_window.T, cloud[0] @ to_window.T, f"{sequence}: is it right?")
         answer = _choice(ask, "Accept, redo, skip or quit?", "arsq")
         if answer == "a":
-            say(f"Written: {labelling.accept(sequence)}")
+            doubt = labelling.doubt(sequence)
+            if doubt and _choice(ask, f"{sequence}: {doubt}. Accept it nevertheless?", "yn") == "n":
+                labelling.clear(sequence)
+                continue
+            say(f"Written: {labelling.accept(sequence, confirmed=True)}")
             return True
         if answer in ("s", "q"):
             if answer == "s":

@@ -21,6 +21,9 @@ from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
+# A residual above this fraction of the object's size, measured by the spread of its keypoints, is accepted on request
+# only: usually two keypoints are confused.
+MAX_RESIDUAL = 0.15
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
 
 
@@ -245,14 +248,34 @@ class Labelling:
             return None
         return align_picks(self.picks(self.reference), picks, self.names)
 
-    def accept(self, sequence: str) -> Path:
+    def doubt(self, sequence: str) -> str:
+        """Say why a label should be checked before it is accepted.
+
+        Returns:
+            One line with the residual and the worst keypoint if the RMS residual is above `MAX_RESIDUAL`; "" otherwise.
+        """
+        alignment = self.alignment(sequence)
+        if alignment is None or alignment.rms <= MAX_RESIDUAL:
+            return ""
+        worst = int(alignment.residuals.argmax())
+        return (
+            f"residual {100 * alignment.rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst "
+            f"keypoint is {self.names[worst]} with {100 * alignment.residuals[worst]:.0f} %"
+        )
+
+    def accept(self, sequence: str, confirmed: bool = False) -> Path:
         """Write the labels of a sequence and of the reference (the identity).
+
+        Args:
+            sequence: Name of the sequence.
+            confirmed: Accept also a label that is in `doubt`.
 
         Returns:
             The label file of the sequence.
 
         Raises:
-            InputError: Keypoints are missing, or the sequence is the reference.
+            InputError: Keypoints are missing, the sequence is the reference, or the label is in doubt and not
+                confirmed.
         """
         if self._known(sequence) == self.reference:
             raise InputError(f"sequence {sequence} is the reference: its label is the identity and comes by itself")
@@ -262,6 +285,8 @@ class Labelling:
                 f"sequence {sequence}: {len(self.picks(sequence))} of {len(self.names)} keypoints picked, "
                 f"expected all, at least {MIN_KEYPOINTS}"
             )
+        if not confirmed and (doubt := self.doubt(sequence)):
+            raise InputError(f"sequence {sequence}: {doubt}; expected a smaller one, or confirmed=True")
         centre = self.cloud(self.reference)[0].mean(axis=0)
         label = rigid_label(alignment.sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))

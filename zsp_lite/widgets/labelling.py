@@ -50,6 +50,7 @@ class _LabellingWidget:
         self.history: list[tuple[str, np.ndarray, tuple[str, ...]]] = []
         self.shown: dict[str, object] = {}
         self.subsamples: dict[str, np.ndarray] = {}
+        self.asked: tuple[str, str, bytes] | None = None  # the label in doubt that accept was pressed for
         self.refreshing = False
         self.actions = {
             "undo": self.undo, "redo": self.redo, "guess": self.guess, "accept": self.accept, "skip": self.skip,
@@ -130,7 +131,13 @@ class _LabellingWidget:
         return f"Alignment proposed, confidence {confidence:.0%}. Check it: correct single keypoints, or redo all."
 
     def accept(self) -> str:
-        path = self.labelling.accept(self.current)
+        """Write the label; one in doubt only if accept is pressed twice in a row."""
+        sequence, doubt = self.current, self.labelling.doubt(self.current)
+        asked = sequence, doubt, self.labelling.picks(sequence).tobytes()
+        if doubt and self.asked != asked:
+            self.asked = asked
+            raise InputError(f"{doubt}. Correct the keypoints, or press accept again to write the label nevertheless")
+        path = self.labelling.accept(sequence, confirmed=True)
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
 
     def skip(self) -> str:
