@@ -228,4 +228,9 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
         cv2.imwrite(str(tmp_path / f"{name}_depth.png"), np.rint(1000 * frame.depth).astype(np.uint16))
     monkeypatch.chdir(tmp_path)
     exec(second, names)
+    assert names["pose"].confidence is not None and len(names["pose"].matches) > 10
+    assert (tmp_path / "outputs/cups/report.html").is_file()
+    blocks = python_blocks(REPOSITORY / "docs" / "data_and_backbones.md")
+    (frames,) = (block for block in blocks if "def load_frame" in block)
+    exec(frames, names)
     assert names["estimate"].view == 0 and len(names["estimate"].matches) > 10
