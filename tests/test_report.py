@@ -152,8 +152,11 @@ def test_links_lead_to_the_projects_site_where_its_address_is_known(results, mon
     assert 'href="https://host/course/notebooks/01_features.html"' in render_page(results, "d", "n", "b")
 
 
-def test_without_a_site_and_a_repository_notebooks_are_named_only(results, monkeypatch, tmp_path):
+def test_outside_the_clone_notebooks_are_linked_in_the_repository_or_named_only(results, monkeypatch, tmp_path):
     monkeypatch.setattr("zsp_lite.viz.report.REPOSITORY", tmp_path)
+    monkeypatch.setattr("zsp_lite.viz.report._project_url", {"Repository": "https://host/code"}.get)
+    assert 'href="https://host/code/blob/main/notebooks/01_features.ipynb"' in render_page(results, "d", "n", "b")
+    monkeypatch.setattr("zsp_lite.viz.report._project_url", lambda label: None)
     page = render_page(results, "d", "n", "b")
     assert "More: notebook 01." in page and ".ipynb" not in page
 

@@ -186,13 +186,15 @@ def _explain(text: str) -> Markup:
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:
-    """Link to a notebook: on the project's site, or else in the repository; a name alone if there is neither."""
+    """Link to a notebook: on the project's site, in the clone, or in the repository; a name alone if there is none."""
     label = Markup("notebook {}").format(name[:2])
     local = REPOSITORY / "notebooks" / f"{name}.ipynb"
     if site := _project_url("Documentation"):
         address = f"{site.rstrip('/')}/notebooks/{name}.html"
     elif local.is_file():
         address = Path(os.path.relpath(local, folder)).as_posix()
+    elif repository := _project_url("Repository"):
+        address = f"{repository.rstrip('/')}/blob/main/notebooks/{name}.ipynb"
     else:
         return label
     return Markup('<a href="{}">{}</a>').format(address, label)
