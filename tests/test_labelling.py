@@ -272,17 +272,29 @@ def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
     assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
 
 
+def confused(points):
+    """The points with the first two exchanged."""
+    return np.array([points[1], points[0], *points[2:]])
+
+
 def test_a_large_residual_is_accepted_only_if_confirmed(root):
     labelling = Labelling(root, "chair")
-    pick_all(labelling, "best", corners())
-    pick_all(labelling, "a", corners("a"))
-    assert labelling.doubt("a") == "" and labelling.doubt("b") == ""
-    picks = corners("a")
-    labelling.put("a", np.array([picks[1], picks[0], *picks[2:]]))  # two keypoints confused
-    alignment = labelling.alignment("a")
-    assert alignment.rms > MAX_RESIDUAL == 0.15
-    assert f"residual {100 * alignment.rms:.0f} % of the object's size, above 15 %" in labelling.doubt("a")
-    assert labelling.names[alignment.residuals.argmax()] in labelling.doubt("a")
+    pick_all(labelling, "best", 4 * corners())
+    assert labelling.relative_residuals("a") is None and labelling.doubt("a") == ""
+    pick_all(labelling, "a", 4 * corners("a"))
+    assert labelling.doubt("a") == ""
+    labelling.put("a", confused(4 * corners("a")))
+    # The longest side of the cloud, without the points beyond the 1st and 99th percentile.
+    size = max(np.ptp(np.percentile(labelling.cloud("a")[0], [1, 99], axis=0), axis=0))
+    distance = labelling.alignment("a").sim3.apply(labelling.picks("best")) - labelling.picks("a")
+    expected = np.linalg.norm(distance, axis=1) / size
+    np.testing.assert_allclose(labelling.relative_residuals("a"), expected)
+    rms = np.sqrt(np.square(expected).mean())
+    assert rms > MAX_RESIDUAL == 0.15
+    assert labelling.doubt("a") == (
+        f"residual {100 * rms:.0f} % of the object's size, above 15 %; the worst keypoint is "
+        f"{labelling.names[expected.argmax()]} with {100 * expected.max():.0f} %"
+    )
     with pytest.raises(InputError, match="sequence a: residual .* expected a smaller one, or confirmed=True"):
         labelling.accept("a")
     assert "a" not in read_labels(root, "chair")
@@ -292,9 +304,8 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
 
 def test_the_desktop_asks_before_it_accepts_a_large_residual(root):
     labelling, asked = Labelling(root, "chair"), []
-    pick_all(labelling, "best", corners())
-    picks = corners("a")
-    labelling.put("a", np.array([picks[1], picks[0], *picks[2:]]))  # two keypoints confused
+    pick_all(labelling, "best", 4 * corners())
+    labelling.put("a", confused(4 * corners("a")))
     answers = iter(["a", "n", "a", "y", "q"])
 
     def ask(question):

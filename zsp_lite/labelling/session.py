@@ -21,8 +21,8 @@ from zsp_lite.io.files import plain_name, read_bytes, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
-# A residual above this fraction of the object's size, measured by the spread of its keypoints, is accepted on request
-# only: usually two keypoints are confused.
+# A label whose RMS residual is above this fraction of the object's size is accepted on request only: usually two
+# keypoints are confused. The size is the longest side of the point cloud without outliers.
 MAX_RESIDUAL = 0.15
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
 
@@ -248,19 +248,31 @@ class Labelling:
             return None
         return align_picks(self.picks(self.reference), picks, self.names)
 
+    def relative_residuals(self, sequence: str) -> Float[np.ndarray, " n"] | None:
+        """Return the residual of each keypoint relative to the object's size; None before all keypoints are picked.
+
+        The residuals of an `Alignment` are relative to the spread of the picks, which is several times smaller.
+        """
+        alignment = self.alignment(sequence)
+        if alignment is None:
+            return None
+        low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
+        distance = alignment.residuals * np.sqrt(self.picks(sequence).var(axis=0).mean())
+        return distance / max(float((high - low).max()), 1e-12)
+
     def doubt(self, sequence: str) -> str:
         """Say why a label should be checked before it is accepted.
 
         Returns:
             One line with the residual and the worst keypoint if the RMS residual is above `MAX_RESIDUAL`; "" otherwise.
         """
-        alignment = self.alignment(sequence)
-        if alignment is None or alignment.rms <= MAX_RESIDUAL:
+        residuals = self.relative_residuals(sequence)
+        if residuals is None or (rms := float(np.sqrt(np.square(residuals).mean()))) <= MAX_RESIDUAL:
             return ""
-        worst = int(alignment.residuals.argmax())
+        worst = int(residuals.argmax())
         return (
-            f"residual {100 * alignment.rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst "
-            f"keypoint is {self.names[worst]} with {100 * alignment.residuals[worst]:.0f} %"
+            f"residual {100 * rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst keypoint is "
+            f"{self.names[worst]} with {100 * residuals[worst]:.0f} %"
         )
 
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
