@@ -5,6 +5,7 @@ OUT ?= outputs/demo
 VENV := .venv
 RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
+LAB := my_notebooks
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
 .PHONY: help demo test check lint format lab notebooks site browser hostile exercises doctor render-env clean
@@ -15,7 +16,7 @@ help:
 	@echo "make check      the unit tests that are not slow"
 	@echo "make lint       ruff: format and lint of all code, notebooks included"
 	@echo "make format     let ruff format all code, notebooks included"
-	@echo "make lab        JupyterLab on the notebooks"
+	@echo "make lab        JupyterLab on your own copy of the notebooks, $(LAB)/, made once"
 	@echo "make notebooks  re-execute all notebooks in place, outputs kept"
 	@echo "make site       the course as a web site, in outputs/site/; no notebook is executed"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
@@ -61,9 +62,14 @@ format: $(STAMP)
 	$(RUN) -m ruff format .
 	$(RUN) -m ruff check --fix .
 
-# Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs.
+# On a copy, so that the tracked notebooks stay as they are. Open3D brings dash along, whose JupyterLab extension would ask
+# for a build that nothing here needs; without an address for news, JupyterLab does not ask whether to fetch them.
 lab: $(STAMP)
-	$(RUN) -m jupyter lab --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" notebooks
+	@[ -d $(LAB) ] || { cp -R notebooks $(LAB) && echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
+	@echo "Changes are saved in $(LAB)/. For a fresh copy, move that folder away and run make lab again."
+	@[ "$$(id -u)" != 0 ] || echo "You are root, as in most containers. JupyterLab refuses to run as root without --allow-root, so it is given."
+	$(RUN) -m jupyter lab $$([ "$$(id -u)" != 0 ] || echo --allow-root) --LabApp.news_url=None \
+	  --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" $(LAB)
 
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)

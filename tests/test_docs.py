@@ -100,7 +100,8 @@ def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
     named = set(re.findall(r"\bZSP_LITE_\w+", markdown(page)))
-    named |= {code for code in _INLINE_CODE.findall(markdown(page)) if re.fullmatch(r"\$?[A-Z0-9]+(_[A-Z0-9]+)+", code)}
+    pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
+    named |= {code for code in _INLINE_CODE.findall(markdown(page)) if re.fullmatch(pattern, code)}
     for name in named:
         assert any(name.removeprefix("$") in path.read_text() for path in files), name
 
@@ -125,7 +126,8 @@ def test_the_page_on_installation_lists_every_extra():
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
     jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
-    (publish,) = runs.pop("publish")
+    (publish,), (install,) = runs.pop("publish"), runs.pop("install")
+    assert 'pip" install .' in install and install.strip().endswith('zsp-lite" demo')
     assert runs == {"test": ["make test"], "avx2": ["make test"], "site": ["make site"], "browser": ["make browser"]}
     assert "gh-pages" in publish and jobs["publish"]["needs"] == ["test", "site"]
     assert (

@@ -84,9 +84,10 @@ def benchmark(
     from zsp_lite.benchmark.run import evaluate, plan_run
     from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
     from zsp_lite.cli.terminal import print_tables
-    from zsp_lite.data.samples import data_folders
+    from zsp_lite.data.samples import data_folders, sample_data
 
-    root = data_folders(data)[0][1]
+    origin, root = data_folders(data)[0]
+    root = sample_data() if origin == "data_samples" else root
     config = backbone_config(**backbone)
     if plan:
         planned = plan_run(root, config, methods, pairs, targets, seed, out, categories, allow_other_version)

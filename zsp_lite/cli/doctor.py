@@ -189,7 +189,7 @@ def _data(data: Path | None) -> Iterator[Check]:
         return
     for name, folder in data_folders(data):
         sample = name == "data_samples"
-        fix = "copy data_samples/ from the repository" if sample else f"set {name} to a CO3D folder"
+        fix = "zsp-lite demo (makes them once)" if sample else f"set {name} to a CO3D folder"
         try:
             categories = Co3D(folder).categories()
             problem = f"{folder}: no category (a folder with frame_annotations.jgz)"

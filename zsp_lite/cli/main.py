@@ -153,6 +153,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 
 @cli.command(
     epilog=examples(
+        "synth --preset demo --out outputs/demo-data",
         "synth --preset samples --out outputs/procedural",
         "synth --preset eval --out outputs/eval",
         "synth --preset paper --out outputs/paper",
@@ -164,8 +165,8 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="Procedural objects: samples (4 categories; not data_samples/), eval (10), or paper: 20 categories of 10 "
-    "sequences of 100 frames, about an hour and a half and 1.4 GB. An existing folder is completed.",
+    help="Procedural objects: demo (3 categories, 15 s), samples (4; not data_samples/), eval (10), or paper: 20 "
+    "categories of 10 sequences of 100 frames, about an hour and a half and 1.4 GB. An existing folder is completed.",
 )  # fmt: skip
 @click.option(
     "--category", "categories", multiple=True, metavar="NAME",

@@ -67,7 +67,10 @@ class Co3D:
         self.root = Path(root)
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
-            raise InputError(f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE}")
+            raise InputError(
+                f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE} as "
+                "`zsp-lite synth --preset demo --out FOLDER` makes it"
+            )
         self._index: tuple[str, FrameIndex] | None = None
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 

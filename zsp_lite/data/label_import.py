@@ -52,7 +52,10 @@ def import_labels(
             category would have two reference sequences.
     """
     if not Path(root).is_dir():
-        raise InputError(f"data folder {root} does not exist, expected a folder with categories in CO3D's layout")
+        raise InputError(
+            f"data folder {root} does not exist, expected a folder with categories in CO3D's layout, as `zsp-lite data "
+            "download` or `zsp-lite synth --preset demo --out FOLDER` makes it"
+        )
     files, labels = _read_published(source, sha256, categories)
     for category, imported in labels.items():
         _check_one_reference(root, category, imported)

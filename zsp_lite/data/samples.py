@@ -1,17 +1,25 @@
-"""Sample data: the default data folders (the user's, or that of the repository), and a photograph with depth.
+"""Sample data: the default data folders (the user's, the repository's or a made one), and a photograph with depth.
 
 `zsp-lite doctor` imports this module, also where a package is missing: packages are imported by the functions.
 """
 
+import logging
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from zsp_lite.errors import InputError
+
 if TYPE_CHECKING:
+    from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.frames import Frame
+    from zsp_lite.data.pairs import Pair
+
+logger = logging.getLogger(__name__)
 
 DATA_VARIABLE = "ZSP_LITE_DATA"  # environment variable with the path of the user's CO3D folder
 REPOSITORY = Path(__file__).resolve().parents[2]
+MADE_SAMPLES = "samples-2"  # in the cache; the number is that of the renderer, `synthetic.export.RENDERER`
 
 PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
@@ -30,13 +38,72 @@ def data_folders(data: Path | None = None) -> list[tuple[str, Path]]:
     folders = [("--data", data)] if data is not None else []
     if os.environ.get(DATA_VARIABLE):
         folders.append((DATA_VARIABLE, Path(os.environ[DATA_VARIABLE])))
-    return [*folders, ("data_samples", sample_data())]
+    return [*folders, ("data_samples", find_sample_data())]
+
+
+def find_sample_data() -> Path:
+    """Return the path of the sample data, without making it.
+
+    This is `data_samples/` in the current folder or else in the repository, or, outside a clone, the folder in the
+    cache in which `sample_data` makes synthetic objects.
+    """
+    from zsp_lite.io.download import cache_folder
+
+    for folder in (Path("data_samples"), REPOSITORY / "data_samples"):
+        if folder.is_dir():
+            return folder
+    return cache_folder() / MADE_SAMPLES
 
 
 def sample_data() -> Path:
-    """Return the sample data folder: `data_samples/` in the current folder, or else in the repository."""
-    here = Path("data_samples")
-    return here if here.is_dir() else REPOSITORY / "data_samples"
+    """Return the folder of the sample data.
+
+    Outside a clone of the repository, synthetic objects are made once in the cache, which takes about 15 s (the preset
+    "demo" of `zsp-lite synth`). An interrupted call is completed by the next one.
+
+    Raises:
+        InputError: Another process is making the samples, or the cache cannot be written.
+    """
+    folder = find_sample_data()
+    if folder.is_dir():
+        return folder
+    from tqdm import tqdm
+
+    from zsp_lite.io.locks import writing
+    from zsp_lite.synthetic.export import export_preset
+
+    part = folder.with_name(folder.name + ".part")
+    # A warning, because a program without logging settings shows nothing else.
+    logger.warning(
+        "No data_samples/ here: making synthetic samples in %s, once, as `zsp-lite synth --preset demo` does", folder
+    )
+    try:
+        with writing(part):
+            export_preset("demo", part, progress=lambda jobs: tqdm(jobs, "making samples", disable=None))
+        part.rename(folder)
+    except OSError as error:
+        raise InputError(
+            f"samples cannot be made in {folder} ({error}); set ZSP_LITE_CACHE to a folder that can be written, or "
+            f"{DATA_VARIABLE} to a data folder"
+        ) from error
+    return folder
+
+
+def example_pair(dataset: "Co3D") -> "Pair":
+    """Return a pair of the sample data for a first try.
+
+    Of `data_samples/`, this is a pair of bicycles that is chosen by its result: the first of the stored pairs with five
+    targets whose error with zsp-tiny is below 15 degrees. Of other data, it is the first pair of the first category.
+
+    Raises:
+        InputError: The data has no pose labels.
+    """
+    from zsp_lite.data.pairs import Pair
+    from zsp_lite.demo import demo_pairs
+
+    chosen = Pair("bicycle", "bmx", 9, "tricycle", (5, 9, 14, 19, 0))
+    folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))
+    return chosen if all(folder.is_dir() for folder in folders) else demo_pairs(dataset)[0]
 
 
 def motorcycle_photograph() -> "Frame":

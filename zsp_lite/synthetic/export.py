@@ -29,7 +29,7 @@ from zsp_lite.synthetic.validation_categories import VALIDATION
 SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATION}
 GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
-_RENDERER = 2  # folders that another renderer began are not completed
+RENDERER = 2  # folders that another renderer began are not completed
 LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
@@ -60,6 +60,8 @@ _EVAL = (
 )  # fmt: skip
 
 PRESETS = {
+    # The sample data outside the repository, made in some 15 s: the photograph of the demo needs a motorcycle.
+    "demo": Preset(("bicycle", "chair", "motorcycle"), 2, 12, 176, pairs=10, targets=(1, 3, 5)),
     "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
     "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
     # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
@@ -130,7 +132,7 @@ def export_categories(
             f"export has {sequences} sequences of {frames} frames of {image_size} pixels, expected at least 1, 1 and 32"
         )
     out = Path(out)
-    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout, "renderer": _RENDERER}
+    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout, "renderer": RENDERER}
     _write_settings(out, settings)
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs) if progress else jobs:

@@ -35,6 +35,7 @@ from zsp_lite.errors import InputError
 if TYPE_CHECKING:
     from ipywidgets import ValueWidget, VBox
 
+MAX_HEIGHT = "420px"  # of a picture
 _LABEL = {"description_width": "initial"}
 
 
@@ -93,7 +94,9 @@ def interactive_figure(
     widgets = load_package()
     plt.close(figure)  # otherwise the notebook shows it a second time
     canvas = FigureCanvasAgg(figure)
-    picture = widgets.Image(format="png", layout={"max_width": "100%", "object_fit": "contain"})
+    # Not stretched in wide windows, and low enough for the controls to stay in sight on a screen of 800 pixels.
+    size = {"max_width": "100%", "max_height": MAX_HEIGHT, "align_self": "flex-start", "object_fit": "contain"}
+    picture = widgets.Image(format="png", layout=size)
     # Image widgets have no alternative text, and JupyterLab fails on images with a tooltip.
     described = widgets.HTML(f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>')
     caption = widgets.HTML()

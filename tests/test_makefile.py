@@ -1,0 +1,73 @@
+"""The Makefile: pip's settings reach pip, and `make lab` works on a copy, also as root. Python is a script here."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+import zsp_lite
+
+REPOSITORY = Path(__file__).parents[1]
+# Writes down its arguments and pip's settings. `-m venv FOLDER` makes a copy of itself.
+PYTHON = """#!/bin/sh
+echo "$* [$PIP_INDEX_URL] [$PIP_EXTRA_INDEX_URL]" >> "$LOG"
+[ "$2" != venv ] || { mkdir -p "$3/bin" && cp "$0" "$3/bin/python"; }
+"""
+
+pytestmark = pytest.mark.skipif(not shutil.which("make"), reason="make is not installed")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("Makefile", "environment.txt", "pyproject.toml"):
+        shutil.copy(REPOSITORY / name, tmp_path)
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "notebooks/00.ipynb").write_text("original")
+    for name, content in (("python", PYTHON), ("id", "#!/bin/sh\necho $USER_ID\n")):
+        path = tmp_path / "bin" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(content)
+        path.chmod(0o755)
+    return tmp_path
+
+
+def make(folder: Path, target: str, **environment) -> tuple[str, list[str]]:
+    """What `make` printed, and the calls of Python."""
+    log = folder / "calls"
+    path = f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(("PIP_", "MAKE", "MFLAGS"))}
+    variables = inherited | {"LOG": str(log), "PATH": path, "PYTHON": str(folder / "bin/python")} | environment
+    run = subprocess.run(["make", target], cwd=folder, env=variables, capture_output=True, text=True, check=True)
+    return run.stdout, log.read_text().splitlines()
+
+
+def test_the_users_package_index_reaches_pip(folder):
+    _, calls = make(folder, "doctor", PIP_INDEX_URL="https://mine/simple", PIP_EXTRA_INDEX_URL="https://cpu/whl")
+    (install,) = [call for call in calls if "pip install" in call and "environment.txt" in call]
+    assert install.endswith("[https://mine/simple] [https://cpu/whl]")
+
+
+@pytest.mark.parametrize(("user", "is_root"), [("0", True), ("1000", False)])
+def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, user, is_root):
+    text, calls = make(folder, "lab", USER_ID=user)
+    assert ("--allow-root" in calls[-1]) == ("You are root" in text) == is_root
+    assert "--LabApp.news_url=None" in calls[-1] and " my_notebooks " in calls[-1]
+    (folder / "my_notebooks/00.ipynb").write_text("changed")
+    text, _ = make(folder, "lab", USER_ID=user)
+    assert (folder / "notebooks/00.ipynb").read_text() == "original"
+    assert (folder / "my_notebooks/00.ipynb").read_text() == "changed" and "move that folder away" in text
+
+
+def test_the_copy_of_the_notebooks_is_not_tracked():
+    assert "my_notebooks/" in (REPOSITORY / ".gitignore").read_text().splitlines()
+
+
+def test_the_version_is_the_same_everywhere():
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    (latest, *_) = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert zsp_lite.__version__ == str(citation["version"]) == latest
+    assert citation["preferred-citation"]["title"] in (REPOSITORY / "README.md").read_text()

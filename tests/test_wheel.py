@@ -1,0 +1,121 @@
+"""The wheel and the source archive: their content, and the wheel in an empty folder without the repository."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+from zsp_lite.data import samples
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.errors import InputError
+from zsp_lite.synthetic.export import RENDERER
+
+REPOSITORY = Path(__file__).parents[1]
+FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The folder with the wheel and the source archive, built from a copy of the repository."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    for folder in ("zsp_lite", "data_samples/class_labels", "notebooks/results"):
+        shutil.copytree(REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in FILES:
+        shutil.copy(REPOSITORY / name, source)
+    code = f"from setuptools import build_meta as b; b.build_wheel({str(out)!r}); b.build_sdist({str(out)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def wheel(built):
+    (path,) = built.glob("zsp_lite-*.whl")
+    return path
+
+
+def test_the_wheel_has_the_package_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        metadata = next(name for name in names if name.endswith(".dist-info/METADATA"))
+        fields = Parser().parsestr(archive.read(metadata).decode())
+    assert {name.split("/")[0] for name in names} == {"zsp_lite", metadata.split("/")[0]}
+    assert "zsp_lite/data/co3d_archives.json" in names and "zsp_lite/weights/zsp-tiny.safetensors" in names
+    assert fields["Name"] == "zsp-lite" and fields["License-Expression"] == "MIT"
+    assert fields["Description-Content-Type"] == "text/markdown" and fields["Requires-Python"] == ">=3.11"
+    assert fields.get_all("Classifier") and fields["Version"] == fields["Version"].strip()
+
+
+def test_the_source_archive_has_no_samples_and_no_notebooks(built):
+    (path,) = built.glob("zsp_lite-*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.split("/")[1] for name in archive.getnames() if "/" in name}
+    assert names == {"zsp_lite", "zsp_lite.egg-info", "setup.cfg", "PKG-INFO", *FILES}
+
+
+@pytest.mark.slow
+def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
+    """README's first example and the demo, with nothing of the repository on the path; a second call makes nothing."""
+    site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
+    empty.mkdir()
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([*install, str(wheel)], check=True)
+    (example, *_) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    code = (
+        f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n{example}\nassert len(targets) == 5\n"
+        "from zsp_lite.cli.main import main; raise SystemExit(main(['demo']))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(site), "ZSP_LITE_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    environment.pop("ZSP_LITE_DATA", None)
+    run = subprocess.run([sys.executable, "-P", "-c", code], cwd=empty, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count("making synthetic samples") == 1
+    assert "Photographed motorcycle" in run.stdout and (empty / "outputs/demo/report.html").is_file()
+    assert [path.name for path in cache.iterdir()] == [f"samples-{RENDERER}"]
+
+
+def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_path, monkeypatch):
+    monkeypatch.setattr(samples, "REPOSITORY", tmp_path / "nowhere")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    calls = []
+
+    def export(preset, out, progress):
+        calls.append((preset, sorted(path.name for path in out.iterdir() if not path.name.startswith("."))))
+        (out / f"made {len(calls)}").touch()
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("zsp_lite.synthetic.export.export_preset", export)
+    with pytest.raises(KeyboardInterrupt):
+        samples.sample_data()
+    made = tmp_path / "cache" / f"samples-{RENDERER}"
+    assert samples.find_sample_data() == made and not made.exists()
+    assert samples.sample_data() == made
+    assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
+    assert samples.sample_data() == made and calls == [("demo", []), ("demo", ["made 1"])]
+
+
+def test_a_missing_data_folder_names_the_command_that_makes_one(tmp_path):
+    with pytest.raises(InputError, match="zsp-lite synth --preset demo --out"):
+        Co3D(tmp_path / "nowhere")
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    (tmp_path / "cache").touch()
+    monkeypatch.setattr(samples, "REPOSITORY", tmp_path / "nowhere")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(InputError, match="set ZSP_LITE_CACHE to a folder that can be written"):
+        samples.sample_data()
+
+
+def test_the_example_pair_of_other_data_is_the_first(ellipsoids):
+    pair = samples.example_pair(ellipsoids)
+    assert pair.category == "ellipsoid" and len(pair.target_frames) == 5
