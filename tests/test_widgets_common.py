@@ -61,6 +61,13 @@ def test_the_description_is_text_and_no_tooltip_which_jupyterlab_cannot_show_on_
     assert any("a &lt; b" in getattr(child, "value", "") for child in widget.children if child is not widget.picture)
 
 
+def test_a_picture_keeps_its_size_and_leaves_room_for_the_controls():
+    figure, _ = plt.subplots(figsize=(1, 1))
+    layout = common.interactive_figure(figure, {}, lambda: "", "nothing").picture.layout
+    assert (layout.max_width, layout.max_height) == ("100%", "420px")
+    assert layout.align_self == "flex-start" and layout.object_fit == "contain"  # not stretched
+
+
 def test_values_for_the_latency_always_change_the_control():
     for control in (
         common.slider("x", 0, 9, 3),
