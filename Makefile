@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 LAB := my_notebooks
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks site browser hostile exercises doctor render-env clean
+.PHONY: help demo test check lint format lab notebooks site browser hostile fuzz exercises doctor render-env clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -21,6 +21,7 @@ help:
 	@echo "make site       the course as a web site, in outputs/site/; no notebook is executed"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
 	@echo "make hostile    damaged, oversized and malicious inputs, each in a process with limits (Linux; minutes)"
+	@echo "make fuzz       ten minutes of damaged and invented files for every reader"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
 	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1 GB)"
@@ -85,6 +86,9 @@ browser: $(STAMP)
 
 hostile: $(STAMP)
 	$(RUN) -m tests.hostile
+
+fuzz: $(STAMP)
+	OMP_NUM_THREADS=1 $(RUN) -m tests.fuzzing --seconds 600
 
 # nbgrader starts the program `alembic`, which is in the environment's bin folder.
 exercises: $(STAMP)

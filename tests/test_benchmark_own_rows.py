@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -294,6 +294,43 @@ def test_answers_that_are_none_are_refused_or_fail(tmp_path):
     for methods in ([], {"a": 3}, ["nowhere:nothing"], ["./here.py:nothing"], "nonesuch"):
         with pytest.raises(InputError):
             resolve(methods)
+
+
+def fails(problem):
+    raise KeyError("angle")
+
+
+class NotANumber(CoordinateBackbone):
+    def __call__(self, images):
+        return [replace(one, keys=one.keys * float("nan")) for one in super().__call__(images)]
+
+
+def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
+    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
+    where = r"failed: .*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"
+    rows = {
+        "function": (fails, where),
+        "object": (type("Estimator", (), {"estimate": lambda self, reference, targets: fails(None)})(), where),
+        "view": (lambda problem: (np.eye(3), "first"), "ValueError: invalid literal"),
+    }
+    for name, (row, told) in rows.items():
+        with pytest.raises(InputError, match=told):
+            evaluate(small_folder(), BACKBONE, {name: row}, **settings)
+    assert read_records(tmp_path).rows == {}
+
+
+def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_failed(tmp_path):
+    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
+    with pytest.raises(InputError, match="keys, .* hold values that are not finite"):
+        evaluate(small_folder(), NotANumber(grid=8), ["ours"], **settings)
+    assert read_records(tmp_path).rows == {}
+
+
+def test_a_module_that_fails_to_import_is_refused_in_one_line(tmp_path, monkeypatch):
+    (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3"):
+        resolve(["row_that_exits:a"])
 
 
 def test_groups_are_made_of_rows_and_rows_of_known_features():

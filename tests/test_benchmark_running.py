@@ -221,13 +221,29 @@ def test_what_was_evaluated_together_with_a_failure_is_saved(tmp_path):
     assert executor.submitted == 4 and len(read_records(tmp_path).evaluations) >= 3
 
 
+def test_threads_and_a_cache_that_cannot_be_are_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "file").touch()
+    for options, message in (
+        ({"threads": 10**11}, "threads is"),
+        ({"cache": tmp_path / "file/x"}, "cache folder .*/x"),
+    ):
+        with pytest.raises(InputError, match=message):
+            evaluate(small_folder(), QUICK, ["ours-bv"], 1, 2, out=tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
 def test_unusable_executors_are_refused(monkeypatch):
     monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
-    for executor, message in (("dask://127.0.0.1:1", "no scheduler"), ("nowhere:Pool", "module:Class"), ("x", "dask:")):
+    for executor, message in (
+        ("dask://127.0.0.1:1", "no scheduler"), ("nowhere:Pool", "module:Class"), ("x", "dask:"),
+        ("json:loads", "cannot be made for 1 workers: .*TypeError"), ("os:_exit", "is a builtin_function"),
+        ("benchmark_folder:small_folder", "is a _lru_cache_wrapper"), ("getpass:getuser", "gave a str|cannot be made"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=message), open_workers(executor):
             pass
-    with pytest.raises(InputError, match="workers"), open_workers(None, 0):
-        pass
+    for number in (0, 10**11, 1.5):
+        with pytest.raises(InputError, match="workers"), open_workers(None, number):
+            pass
 
 
 def work_of(rows, pairs: int, targets: int, category: str = "lump") -> dict:

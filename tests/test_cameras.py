@@ -152,7 +152,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"t": "somewhere"}, "t is 'somewhere'"),
         ({"focal_length": [500, 0]}, "expected at least 0.001 pixels"),
         ({"principal_point": [np.nan, 0]}, "principal_point is not finite"),
-        ({"size": (0, 5)}, "expected positive"),
+        ({"size": (0, 5)}, "expected .height, width., integers from 1"),
         ({"size": 5}, "image size is 5"),
         ({"size": (np.inf, 5)}, "image size is .*inf"),
     ],

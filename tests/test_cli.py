@@ -64,7 +64,7 @@ def test_help_imports_no_large_library():
     [
         ([], "Missing command"),
         (["fly"], "No such command 'fly'"),
-        (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range x>=1"),
+        (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range 1<=x<=1000000"),
         (["benchmark", "--pairs", "2.5"], "'--pairs': '2.5' is not a valid integer"),
         (["demo", "--image-size", "small"], "'--image-size': 'small' is not a valid integer"),
         (["demo", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
@@ -105,6 +105,17 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["train", "--shorten", "1e308", "--out", "x"], "1e+308"),
         (["train", "--self-distillation", "--start-from", "a", "--out", "x"], "--start-from"),
         (["weights", "fetch", "resnet"], "resnet"),
+        (["data", "check", "a\0b"], "without null bytes"),
+        (["demo", "--out", "a\0b"], "without null bytes"),
+        (["benchmark", "--pairs", "1000000000"], "1<=x<=1000000"),
+        (
+            ["synth", "--category", "chair", "--sequences", "901", "--out", "x"],
+            "sequences is 901, expected an integer from 1",
+        ),
+        (
+            ["synth", "--category", "chair", "--frames", "10001", "--out", "x"],
+            "frames is 10001, expected an integer from 1",
+        ),
         (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
     ],
 )

@@ -316,7 +316,7 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
 
 def test_tum_pictures_of_another_size_need_intrinsics(tmp_path, views):
     write_tum(tmp_path, views)
-    with pytest.raises(InputError, match="expected intrinsics: the default ones are for"):
+    with pytest.raises(InputError, match="expected --intrinsics FX,FY,CX,CY: the default ones are for"):
         READERS["tum"](tmp_path)
 
 

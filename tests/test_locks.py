@@ -40,6 +40,27 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     assert not list((tmp_path / "cup").glob(".*"))
 
 
+@pytest.mark.parametrize(
+    "command", [["synth", "--category", "chair", "--out"], ["train", "--objects", "1", "--out"]], ids=lambda one: one[0]
+)
+def test_a_command_that_writes_a_folder_is_refused_beside_another_writer(tmp_path, capsys, command):
+    from zsp_lite.cli.main import main
+
+    with writing(tmp_path / "out"):
+        assert main([*command, str(tmp_path / "out")]) == 2
+    assert "another process is writing to it" in capsys.readouterr().err
+
+
+def test_a_folder_in_which_nothing_was_written_is_removed(tmp_path):
+    with writing(tmp_path / "new"):
+        pass
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(InputError, match="folder .*file/new cannot be made: not a directory"):
+        (tmp_path / "file").touch()
+        with writing(tmp_path / "file/new"):
+            pass
+
+
 def test_a_folder_is_free_after_an_error(tmp_path):
     with pytest.raises(ZeroDivisionError), writing(tmp_path):
         raise ZeroDivisionError

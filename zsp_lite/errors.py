@@ -3,6 +3,7 @@
 import math
 import numbers
 import reprlib
+import traceback
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +23,20 @@ class InputError(ValueError):
 
     def __init__(self, message: str):
         super().__init__(message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}")
+
+
+class FatalError(InputError):
+    """An InputError that ends a benchmark run, because it concerns the backbone or the code of a row.
+
+    Any other InputError of a row counts the pair as failed.
+    """
+
+
+def describe_failure(error: BaseException) -> str:
+    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f"{frames[-1].filename}, line {frames[-1].lineno}: " if frames else ""
+    return " ".join(f"{place}{type(error).__name__}: {error}".split())
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | None = None) -> None:
@@ -61,8 +76,9 @@ def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None
     """
     import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
 
-    if not (np.abs(values) <= most).all():  # False for NaN too
-        raise InputError(f"{name} holds {np.max(np.abs(values))}, expected finite numbers of at most {most:g}")
+    sizes = np.abs(values)
+    if not (sizes <= most).all():  # False for NaN too
+        raise InputError(f"{name} holds {np.max(sizes)}, expected finite numbers of at most {most:g}")
 
 
 def real_array(name: str, values: object) -> "np.ndarray":

@@ -13,9 +13,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from zsp_lite.errors import InputError
+from zsp_lite.arguments import checked
+from zsp_lite.errors import FatalError, InputError, real_array
 from zsp_lite.io.html import picture_html
 
 Grid = tuple[int, int]  # (rows, columns) of patches
@@ -33,7 +35,8 @@ class FeatureMap:
         global_feature: (E,) feature of the whole image.
 
     Raises:
-        InputError: Shapes do not fit together, or values are not finite.
+        InputError: Shapes do not fit together.
+        FatalError: Values are not finite.
     """
 
     keys: Float[Tensor, "h w d"]
@@ -53,7 +56,7 @@ class FeatureMap:
                 f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
         if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
-            raise InputError("FeatureMap: keys, saliency or global feature hold values that are not finite")
+            raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape
@@ -110,6 +113,20 @@ class FeatureExtractor(Protocol):
         ...
 
 
+def finite_tensor(name: str, values: ArrayLike | Tensor) -> Tensor:
+    """Convert real numbers to a tensor.
+
+    Raises:
+        InputError: The values are of another type or not finite.
+    """
+    if not isinstance(values, Tensor):
+        real_array(name, values)  # a check; the type is kept
+    tensor = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
+    if tensor.is_complex() or not tensor.isfinite().all():
+        raise InputError(f"{name} holds values that are no finite real numbers")
+    return tensor
+
+
 @lru_cache(maxsize=32)
 def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     """Compute, for each bin and patch, the index of the patch that fills it.
@@ -147,6 +164,7 @@ def average_pool(x: Tensor, axis: int) -> Tensor:
     return total.div_(count.view(-1, *[1] * (x.ndim - 1 - axis)))
 
 
+@checked
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
     """Compute the log-binned descriptor of every patch: its 17 bins, concatenated in the order of `bin_indices`.
 
@@ -154,9 +172,10 @@ def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float
         x: (B, H, W, D) keys.
 
     Raises:
-        InputError: x has another shape, or an empty one.
+        InputError: x has another shape, or an empty one, or is not finite.
     """
-    x = torch.as_tensor(x)
+    x = finite_tensor("log_bin: x", x)
+    x = x if x.is_floating_point() else x.to(torch.float32)
     if x.ndim != 4 or 0 in x.shape:
         raise InputError(f"log_bin: x has shape {tuple(x.shape)}, expected (B, H, W, D), none of them 0")
     b, h, w, d = x.shape

@@ -22,8 +22,9 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
+from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_integer, check_seed
-from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap, Grid, average_pool, bin_indices
+from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap, Grid, average_pool, bin_indices, finite_tensor
 from zsp_lite.matchers import MATCHERS, Matcher
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
@@ -58,6 +59,7 @@ class Matches:
         )
 
 
+@checked
 def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     """Compute the cosine similarity of the log-binned descriptors of all pairs of patches.
 
@@ -69,11 +71,12 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
         (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have similarity 0.
 
     Raises:
-        InputError: Keys have another shape, or unequal channels.
+        InputError: Keys have another shape, are not finite, or have unequal channels.
     """
     return similarities(ref, [target])[0]
 
 
+@checked
 def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute `similarity` of one reference with several targets."""
     keys1 = _keys(ref, "ref")
@@ -93,6 +96,7 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     return results
 
 
+@checked
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see `similarities`)."""
     first = F.normalize(_keys(ref, "ref").flatten(0, 1), dim=1)
@@ -102,6 +106,7 @@ def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n
     ]
 
 
+@checked
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
 ) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
@@ -110,6 +115,7 @@ def nearest_neighbours(
     return sim.argmax(dim=1), sim.argmax(dim=0)
 
 
+@checked
 def cyclical_distances(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
     grid1: Grid,
@@ -133,9 +139,11 @@ def cyclical_distances(
         (H1, W1) negative distances in patches; -inf where u, v or u' is not foreground.
 
     Raises:
-        InputError: Shapes do not fit together.
+        InputError: Shapes do not fit together, or a similarity is not finite.
     """
-    sim, grid1, grid2 = torch.as_tensor(sim), tuple(grid1), tuple(grid2)
+    sim, grid1, grid2 = finite_tensor("cyclical_distances: sim", sim), tuple(grid1), tuple(grid2)
+    if min(*grid1, *grid2) < 1:
+        raise InputError(f"cyclical_distances: grids are {grid1} and {grid2}, expected positive sizes")
     n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
     if tuple(sim.shape) != (n1, n2):
         raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, grids expect {(n1, n2)}")
@@ -154,6 +162,7 @@ def cyclical_distances(
     return distance.masked_fill(~valid, -torch.inf).view(grid1)
 
 
+@checked
 def match(
     ref: FeatureMap,
     target: FeatureMap,
@@ -239,7 +248,8 @@ def match(
 
 def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
     """Get the keys as a float32 tensor and check their shape."""
-    keys = torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
+    keys = features.keys if isinstance(features, FeatureMap) else finite_tensor(f"similarity: {name}", features)
+    keys = keys.to(torch.float32)
     if keys.ndim != 3 or 0 in keys.shape:
         raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D)")
     return keys

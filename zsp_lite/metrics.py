@@ -11,12 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError
+from zsp_lite.arguments import checked
+from zsp_lite.errors import InputError, check_magnitude, real_array
 
 RESAMPLES = 2000
 _FEWEST_OBJECTS = 3
+_ROTATION_TOLERANCE = 1e-2  # largest entry of |R @ R.T - I|
 
 
+@checked
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the geodesic angle between rotations, exact near 0 and 180 degrees.
 
@@ -31,13 +34,10 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
         Angles (...) in degrees in [0, 180]; a float for a single pair.
 
     Raises:
-        InputError: For other shapes and non-finite values.
+        InputError: For other shapes and matrices that are no rotations.
     """
-    first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if first.shape[-2:] != (3, 3) or second.shape[-2:] != (3, 3):
-        raise InputError(f"rotation_error: shapes {first.shape} and {second.shape}, expected (..., 3, 3)")
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        raise InputError("rotation_error: non-finite rotation, expected finite values")
+    first, second = _rotations("first", first), _rotations("second", second)
+    _check_broadcast("rotation_error", first.shape[:-2], second.shape[:-2])
     relative = np.swapaxes(first, -1, -2) @ second
     twice_sine = np.sqrt(
         np.square(relative[..., 2, 1] - relative[..., 1, 2])
@@ -48,18 +48,23 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
+@checked
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the Euclidean distance between translations (..., 3), in their unit.
 
     Raises:
-        InputError: For other shapes.
+        InputError: For other shapes, and values above 1e9 or not finite.
     """
-    first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    first, second = real_array("translation_error: first", first), real_array("translation_error: second", second)
     if first.shape[-1:] != (3,) or second.shape[-1:] != (3,):
         raise InputError(f"translation_error: shapes {first.shape} and {second.shape}, expected (..., 3)")
+    _check_broadcast("translation_error", first.shape, second.shape)
+    for name, values in (("first", first), ("second", second)):
+        check_magnitude(f"translation_error: {name}", values)
     return np.linalg.norm(first - second, axis=-1)[()]
 
 
+@checked
 def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = None) -> np.ndarray | float:
     """Compute the percentage of errors strictly below the threshold; Acc30 is threshold=30.
 
@@ -74,6 +79,7 @@ def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = No
     return 100 * _mean(_errors(errors) < threshold, weights)
 
 
+@checked
 def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | float:
     """Compute the median of errors, optionally weighted.
 
@@ -98,6 +104,7 @@ def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | 
     return ((ordered[lower] + ordered[upper]) / 2)[()]
 
 
+@checked
 def object_weights(
     objects: Sequence[tuple[str, str]] | np.ndarray,
     categories: Sequence[str] | np.ndarray | None = None,
@@ -151,11 +158,13 @@ def object_weights(
     return weights
 
 
+@checked
 def pair_weights(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
     """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
     return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
 
 
+@checked
 def bootstrap_ci(
     errors: ArrayLike,
     statistic: Callable[[np.ndarray, np.ndarray], np.ndarray],
@@ -174,10 +183,11 @@ def bootstrap_ci(
     Returns:
         The lower and the upper end of the interval.
     """
-    errors = _errors(errors)
+    errors = _errors(errors, -np.inf, np.inf)
     return _interval(statistic(errors, pair_weights(len(errors)) if weights is None else weights), level)
 
 
+@checked
 def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
     """Compute the paper's figures of rotation errors, with 95 % bootstrap intervals.
 
@@ -205,6 +215,7 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
     return summary | {"above150": float(100 * np.mean(errors > 150))}
 
 
+@checked
 def mean_category_median(
     errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Float[np.ndarray, "resamples n"]
 ) -> tuple[float, tuple[float, float]]:
@@ -221,6 +232,7 @@ def mean_category_median(
     return float(np.mean([median(errors[one]) for one in members])), _interval(replicates)
 
 
+@checked
 def paired_difference(
     first: ArrayLike,
     second: ArrayLike,
@@ -262,6 +274,7 @@ def paired_difference(
     return result
 
 
+@checked
 def paired_test(
     first: ArrayLike,
     second: ArrayLike,
@@ -301,6 +314,7 @@ def paired_test(
     }
 
 
+@checked
 def sign_test(first: ArrayLike, second: ArrayLike) -> float:
     """Compute the exact two-sided p value of McNemar's test.
 
@@ -336,10 +350,29 @@ def _multiplicities(n: int, resamples: int, rng: np.random.Generator) -> Int[np.
     return np.bincount(draws.ravel(), minlength=resamples * n).reshape(resamples, n)
 
 
-def _errors(errors: ArrayLike) -> np.ndarray:
-    errors = np.asarray(errors, dtype=np.float64)
+def _rotations(name: str, values: ArrayLike) -> Float[np.ndarray, "*batch 3 3"]:
+    matrices = real_array(f"rotation_error: {name}", values)
+    if matrices.shape[-2:] != (3, 3):
+        raise InputError(f"rotation_error: {name} has shape {matrices.shape}, expected (..., 3, 3)")
+    check_magnitude(f"rotation_error: {name}", matrices)
+    deviation = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max(initial=0)
+    if deviation > _ROTATION_TOLERANCE or (np.linalg.det(matrices) < 0).any():
+        raise InputError(f"rotation_error: {name} is no rotation, expected R @ R.T = identity, det R = 1")
+    return matrices
+
+
+def _check_broadcast(function: str, first: tuple[int, ...], second: tuple[int, ...]) -> None:
+    try:
+        np.broadcast_shapes(first, second)
+    except ValueError as error:
+        raise InputError(f"{function}: shapes {first} and {second} do not fit together") from error
+
+
+def _errors(errors: ArrayLike, low: float = 0.0, high: float = 180.0) -> np.ndarray:
+    """Convert rotation errors to an array of at least one number from `low` to `high` degrees."""
+    errors = real_array("errors", errors)
     if errors.ndim == 0 or errors.shape[-1] == 0:
         raise InputError(f"errors of shape {errors.shape}, expected at least one along the last axis")
-    if np.isnan(errors).any():
-        raise InputError("errors hold NaN, expected numbers")
+    if not ((errors >= low) & (errors <= high)).all():  # False for NaN too
+        raise InputError(f"errors hold {errors.min()} to {errors.max()}, expected {low:g} to {high:g} degrees")
     return errors

@@ -1,7 +1,7 @@
 """Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
+from zsp_lite.arguments import checked
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_integer, check_number
@@ -99,6 +100,7 @@ class ZeroShotPose:
         check_number("threshold", self.threshold, above=0)
         check_number("saliency_threshold", self.saliency_threshold)
 
+    @checked
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
 
@@ -122,11 +124,13 @@ class ZeroShotPose:
             views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
         return self.estimate_from_views(views[0], views[1:], timings)
 
-    def views(self, frames: Sequence[Frame]) -> list[View]:
+    @checked
+    def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, as `estimate` does."""
         crops = [object_crop(frame, crop_size(self.backbone)) for frame in frames]
         return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
 
+    @checked
     def estimate_from_views(
         self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
     ) -> PoseEstimate:
@@ -143,11 +147,13 @@ class ZeroShotPose:
             pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
         return self.estimate_from_pairs(reference, targets, pairs, timings)
 
+    @checked
     def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
         """Compute the cosine similarities between the reference's and each target's patch descriptors."""
         function = similarities if self.binning else key_similarities
         return function(reference.features, [target.features for target in targets])
 
+    @checked
     def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
         """Match the reference with one target view (sec. 4.1), from their similarities."""
         matches = match(
@@ -159,6 +165,7 @@ class ZeroShotPose:
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
         )
 
+    @checked
     def estimate_from_pairs(
         self,
         reference: View,
@@ -203,6 +210,7 @@ class ZeroShotPose:
         return self.solver
 
 
+@checked
 def align_best_view(
     reference: View,
     targets: Sequence[View],
@@ -242,6 +250,7 @@ def align_best_view(
     return PoseEstimate(sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags)
 
 
+@checked
 def view_alignment(reference: View, target: View) -> Sim3:
     """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
 

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from zsp_lite.arguments import checked
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
+_MOST_PIXELS = 4096
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
 _MASK_SHARE = 0.25
 
@@ -73,16 +75,25 @@ class View:
         return np.asarray(self.foreground.cpu()) & self.patch_points[1]
 
 
+@checked
 def crop_size(backbone: FeatureExtractor | None) -> int:
-    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one."""
-    return getattr(backbone, "image_size", IMAGE_SIZE)
+    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one.
+
+    Raises:
+        InputError: `image_size` is not an integer from 1 to 4096.
+    """
+    size = getattr(backbone, "image_size", IMAGE_SIZE)
+    check_integer("image_size of the backbone", size, 1, _MOST_PIXELS)
+    return size
 
 
+@checked
 def has_saliency(backbone: FeatureExtractor | None) -> bool:
     """Tell whether a backbone separates the object from the background: its `has_saliency`, or True without one."""
     return getattr(backbone, "has_saliency", True)
 
 
+@checked
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
 
@@ -95,6 +106,7 @@ def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
 
 
+@checked
 def extract_views(
     backbone: FeatureExtractor,
     frames: Sequence[Frame],
@@ -109,10 +121,13 @@ def extract_views(
         foreground: "saliency" or "mask" (see `frame_view`).
         saliency_threshold: A patch is foreground if its saliency is above this.
     """
+    if not callable(backbone):
+        raise InputError(f"backbone is {backbone!r}, expected a callable that maps images to feature maps")
     maps = backbone([frame.rgb for frame in frames])
     return [frame_view(frame, features, foreground, saliency_threshold) for frame, features in zip(frames, maps)]
 
 
+@checked
 def frame_view(
     frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = SALIENCY_THRESHOLD
 ) -> View:
@@ -136,6 +151,7 @@ def frame_view(
     return View(frame, features, features.foreground(saliency_threshold), soft)
 
 
+@checked
 def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used for pose estimation.
 
@@ -149,6 +165,7 @@ def frame_defect(frame: Frame) -> str:
     return "" if (frame.depth > 0).any() else "no known depth"
 
 
+@checked
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
     """Select the target views that a pose can be estimated in.
 
@@ -174,6 +191,7 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
     return usable, tuple(flags)
 
 
+@checked
 def soft_saliency(
     features: FeatureMap, size: tuple[int, int], threshold: float = SALIENCY_THRESHOLD
 ) -> Float[np.ndarray, "height width"]:
@@ -188,6 +206,7 @@ def soft_saliency(
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
+@checked
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
     """Select the patches of which the frame's mask covers at least a quarter.
 

@@ -241,25 +241,34 @@ CAPTURES = [
     ("open3d", "trajectory of texts", _text("trajectory.log", "0 0 0\n" + "a b c d\n" * 4)),
     ("open3d", "trajectory of 1e200", _text("trajectory.log", "0 0 0\n" + "1e200 0 0 1e200\n" * 4)),
     ("open3d", "image that is a link out of the folder", _link("rgb/0.png", "/etc/passwd")),
+    ("open3d", "depth folder that is a link out of the folder", lambda root: (
+        (root / "depth").rename(root.parent / "other"), (root / "depth").symlink_to(root.parent / "other"))),
+    ("open3d", "trajectory that is a link out of the folder", _link("trajectory.log", "/etc/passwd")),
+    ("nerfstudio", "distortion of 1e5", _json(NERF, k1=1e5)),
+    ("nerfstudio", "depth unit of 1e8", _json(NERF, depth_unit_scale_factor=1e8)),
+    ("lists", "list that is a link out of the folder", _link("rgb.txt", "/etc/passwd")),
     ("open3d", "image that is a pipe", lambda root: strange_files()["pipe"](root / "rgb/0.png")),
 ]  # fmt: skip
 
 
-def _import(layout, change):
+def _read(layout, change=lambda root: None):
     def call(folder):
         root = _capture(folder, layout)
         change(root)
         options = {"intrinsics": (30.0, 30.0, 16.0, 12.0)} if layout == "tum" else {}
-        return import_capture(READERS[layout](root, **options), folder / "data", "cup", "new", box=(2, 2, 20, 20))
+        return [frame.load() for frame in READERS[layout](root, **options)]
 
     return call
 
 
+for layout in READERS:
+    case("capture", f"{layout}: nothing wrong", _read(layout), answers=True)
 for layout, name, change in CAPTURES:
-    case("capture", f"{layout}: {name}", _import(layout, change))
+    case("capture", f"{layout}: {name}", _read(layout, change))
 for box in ((0, 0, 10**9, 10**9), (-5, 0, 10, 10), (0, 0, 0, 0)):
     case("capture", f"box {box}", lambda folder, box=box: import_capture(
-        READERS["lists"](_capture(folder, "lists")), folder / "data", "cup", "new", box=box))  # fmt: skip
-for name in ("..", "a/b", "", "a\0b", ".hidden", "x" * 5000, "\udcff"):
+        READERS["lists"](_capture(folder, "lists")), folder / "data", "cup", "new", box=box), says="box")  # fmt: skip
+for name in ("..", "a/b", "", "a\0b", ".hidden", "x" * 5000):
     case("capture", f"sequence named {name[:10]!r}", lambda folder, name=name: import_capture(
-        READERS["lists"](_capture(folder, "lists")), folder / "data", "cup", name, box=(2, 2, 20, 20)))  # fmt: skip
+        READERS["lists"](_capture(folder, "lists")), folder / "data", "cup", name, box=(2, 2, 20, 20)),
+        says="sequence name")  # fmt: skip

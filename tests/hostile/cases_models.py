@@ -156,23 +156,31 @@ CONFIGS = {
     "code of its own": {"auto_map": {"AutoModel": "code.Model"}, "model_type": "own"},
     "unknown model": {"model_type": "[/1]"},
     "another model": {"model_type": "bert"},
-    "missing weights": {},
 }
 
 
-def _model(change):
+def _model(change=lambda model: None):
     def call(folder):
+        from transformers import ViTConfig, ViTModel
+
         model = folder / "model"
-        model.mkdir()
-        (model / "config.json").write_text(json.dumps(VIT | change))
-        save_file({"a": torch.zeros(1)}, model / "model.safetensors")
-        return load_backbone(f"hf:{model}")
+        ViTModel(ViTConfig(**VIT), add_pooling_layer=False).save_pretrained(model)
+        change(model)
+        return load_backbone(f"hf:{model}", image_size=32)
 
     return call
 
 
-for name, change in CONFIGS.items():
-    case("model", name, _model(change))
-case("model", "100,000 levels", lambda folder: (
-    (folder / "model").mkdir(), (folder / "model/config.json").write_text('{"a":' * 100_000),
-    save_file({"a": torch.zeros(1)}, folder / "model/model.safetensors"), load_backbone(f"hf:{folder}/model"))[-1])  # fmt: skip
+def _configured(**values):
+    def change(model):
+        path = model / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return change
+
+
+case("model", "nothing wrong", _model(), answers=True)
+for name, values in CONFIGS.items():
+    case("model", name, _model(_configured(**values)))
+case("model", "100,000 levels", _model(lambda model: (model / "config.json").write_text('{"a":' * 100_000)))
+case("model", "missing weights", _model(lambda model: save_file({"a": torch.zeros(1)}, model / "model.safetensors")))

@@ -9,6 +9,7 @@ import sys
 
 from tests.hostile.harness import Wrong, case, command, gzip_bomb, strange_files
 from zsp_lite.benchmark.results import read_results
+from zsp_lite.benchmark.summary import summarise_rows
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.io.files import write_atomic
 
@@ -74,10 +75,13 @@ for value in ("1,2,3", "a,b,c,d", "nan,1,2,3", "1e400,1,2,3", "1.5,1,2,3", "1,2,
 # results
 def _results(change=lambda content: None):
     keys = [f"cup/a:{i}/b:0,1" for i in range(4)]
+    errors = [1.0, 2.0, 3.0, 4.0]
+    data = {"root": "d", "categories": ["cup"], "pairs": 4, "targets": 2, "seed": 0}
+    summary = summarise_rows({"ours": {key: {"error": error} for key, error in zip(keys, errors)}})
     content = {
-        "summary": {}, "settings": {"data": "d", "backbone": "n 0", "targets": 2, "seed": 0, "methods": {}},
-        "invocations": [], "pairs": keys,
-        "rows": {"ours": {"pair": [0, 1, 2, 3], "error": [1.0, 2.0, 3.0, 4.0], "view": [0, 0, 0, 0]}},
+        "summary": {"data": data, "backbone": "n", **summary}, "invocations": [], "pairs": keys,
+        "settings": {"data": "d", "backbone": "n 0", "targets": 2, "seed": 0, "methods": {}},
+        "rows": {"ours": {"pair": [0, 1, 2, 3], "error": errors, "view": [0, 0, 0, 0]}},
     }  # fmt: skip
     return change(content) or content
 
@@ -107,7 +111,16 @@ RESULTS = {
     "row a number": lambda content: content.__setitem__("rows", {"ours": 5}),
     "no summary": lambda content: content.pop("summary") and None,
     "empty": lambda content: {"": 0},
+    "summary of other errors": lambda content: content["summary"]["methods"]["ours"].update(median=50.0),
+    "summary of more pairs": lambda content: content["summary"]["methods"]["ours"].update(n=400),
+    "summary of another row": lambda content: content["summary"]["methods"].update(x=content["summary"]["methods"]["ours"]),
+    "accuracy of 400 percent": lambda content: content["summary"]["methods"]["ours"].update(acc30=400.0),
+    "accuracy a text": lambda content: content["summary"]["methods"]["ours"].update(acc30="all"),
+    "targets missing": lambda content: content["summary"]["data"].pop("targets") and None,
 }  # fmt: skip
+case("results", "nothing wrong", lambda folder: (_write(_results())(folder), read_results(folder / "r.json.gz"))[1],
+     answers=True)  # fmt: skip
+command("results", "tables of nothing wrong", "tables", "ROOT/r.json.gz", change=_write(_results()), codes=(0,))
 for name, change in RESULTS.items():
     case("results", name, lambda folder, change=change: (
         _write(_results(change))(folder), read_results(folder / "r.json.gz"))[1])  # fmt: skip

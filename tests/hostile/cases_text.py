@@ -2,12 +2,12 @@
 
 import gzip
 import json
-import shutil
 
 from tests.hostile.cases_runs import _results, _write
 from tests.hostile.harness import Wrong, case, command
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown
 from zsp_lite.benchmark.reports import write_reports
+from zsp_lite.benchmark.summary import summarise_rows
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.cli.terminal import print_tables
 from zsp_lite.viz.plots import show_images
@@ -23,13 +23,10 @@ def _named(name):
         content["pairs"] = [f"{name.replace('/', '')}/a:{i}/b:0,1" for i in range(4)]
         content["rows"][name] = content["rows"].pop("ours")
         content["settings"]["methods"] = {name: "m"}
-        from zsp_lite.benchmark.summary import summarise_rows
-
-        rows = {name: {key: {"error": 5.0} for key in content["pairs"]}}
+        errors = content["rows"][name]["error"]
+        rows = {name: {key: {"error": error} for key, error in zip(content["pairs"], errors)}}
         data = {"root": name, "categories": [name.replace("/", "")], "pairs": 4, "targets": 2, "seed": 0}
         content["summary"] = {"data": data, "backbone": name, **summarise_rows(rows)}
-        for row in content["summary"]["methods"].values():
-            row |= {"failed": 0, "flagged": 0}
 
     return _results(change)
 
@@ -64,10 +61,13 @@ for name in NAMES:
             (folder / parent / "cup").rename(folder / parent / new)
         for file in ("frame_annotations.jgz", "sequence_annotations.jgz"):
             path = folder / "data" / new / file
-            text = json.loads(gzip.decompress(path.read_bytes()))
-            path.write_bytes(gzip.compress(json.dumps(text).encode()))
+            text = gzip.decompress(path.read_bytes()).replace(b'"cup/', json.dumps(f"{new}/").encode()[:-1])
+            path.write_bytes(gzip.compress(text.replace(b'"cup"', json.dumps(new).encode())))
 
-    command("text", f"data check of a category {name[:20]!r}", "data", "check", "ROOT/data", change=renamed, codes=(1,))
+    # 1 and 2: a name with a backslash, or one that JSON cannot hold.
+    codes = (1, 2) if "\\" in name or "\udcff" in name or len(name) > 200 else (0,)
+    command(
+        "text", f"data check of a category {name[:20]!r}", "data", "check", "ROOT/data", change=renamed, codes=codes
+    )
     command("text", f"benchmark of a category {name[:20]!r}", "benchmark", "--data", "ROOT/data", "--pairs", "1", "--targets",
-            "1", "--methods", "icp", "--out", "ROOT/out", change=lambda folder, renamed=renamed: (
-                renamed(folder), shutil.rmtree(folder / "data/class_labels")))  # fmt: skip
+            "1", "--methods", "icp", "--out", "ROOT/out", change=renamed, codes=codes)  # fmt: skip

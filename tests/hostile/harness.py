@@ -32,12 +32,14 @@ class Case:
         name: What is hostile.
         call: Called with the case's own copy of the folder of `prepare`. Checks of an answer raise `Wrong`.
         answers: The call may return. Otherwise it must raise InputError.
+        says: Part of the message, where another defect of the input would be refused as well.
     """
 
     group: str
     name: str
     call: Callable[[Path], object]
     answers: bool = False
+    says: str = ""
 
     def outcome(self, folder: Path) -> tuple[str, str]:
         found = self.call(folder)
@@ -49,12 +51,14 @@ class Case:
         text = str(error)
         if "\n" in text or len(text) > 1500:
             return "wrong", f"error of {len(text)} characters in {text.count(chr(10)) + 1} lines: {text}"
+        if self.says not in text:
+            return "wrong", f"refused for another reason than {self.says!r}: {text}"
         return "refused", text
 
 
-def case(group: str, name: str, call: Callable[[Path], object], answers: bool = False) -> None:
+def case(group: str, name: str, call: Callable[[Path], object], answers: bool = False, says: str = "") -> None:
     """Register a case."""
-    CASES.append(Case(group, name, call, answers))
+    CASES.append(Case(group, name, call, answers, says))
 
 
 def command(group: str, name: str, *argv: str, change: Callable[[Path], object] | None = None, codes=(2,)) -> None:

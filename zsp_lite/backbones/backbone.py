@@ -118,6 +118,8 @@ def image_batches(
     images: Sequence[Image], size: int, batch_size: int, device: torch.device
 ) -> Iterator[Float[Tensor, "b 3 s s"]]:
     """Yield images in batches on a device (see `prepare_images`)."""
+    if not isinstance(images, Sequence | np.ndarray | Tensor) or isinstance(images, str | bytes):
+        raise InputError(f"images is a {type(images).__name__}, expected a list of (H, W, 3) arrays")
     for first in range(0, len(images), batch_size):
         yield prepare_images(images[first : first + batch_size], size, first).to(device)
 

@@ -8,6 +8,7 @@ imported on first use.
 
 import inspect
 import json
+import os
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from zsp_lite.io.files import file_size
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's
+MOST_PIXELS = 2048  # of a side; the time of attention grows with the fourth power of the side
 # The only files that are downloaded or read: weights in safetensors format, no pickle files, no code.
 FILES = (
     "config.json", "preprocessor_config.json", "processor_config.json", "model*.safetensors",
@@ -187,7 +189,7 @@ def model_folder(name: str) -> Path:
     if not wanted:
         raise InputError(f"{name}: expected a folder or a hub name OWNER/MODEL after {PREFIX}")
     folder = Path(wanted).expanduser()
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # False for a name that is too long, where Path.is_dir raises
         folder = _from_hub(wanted, name)
     if not (folder / "config.json").is_file():
         raise InputError(f"{name}: {folder} has no config.json, expected a model in Hugging Face's format")
@@ -201,8 +203,8 @@ def _has_weights(folder: Path) -> bool:
 
 
 def nearest_multiple(size: int, patch_size: int) -> int:
-    """Round `size` to a positive multiple of `patch_size`. Raises InputError for a size below 1."""
-    check_integer("image_size", size, 1)
+    """Round `size` to a positive multiple of `patch_size`. Raises InputError for a size below 1 or above 2048."""
+    check_integer("image_size", size, 1, MOST_PIXELS)
     return max(1, round(size / patch_size)) * patch_size
 
 

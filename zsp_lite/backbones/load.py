@@ -1,5 +1,6 @@
 """Loading of backbones: by name, from a checkpoint file, from a model in Hugging Face's format, or several of these."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,13 +127,13 @@ def load_backbone(
         if model.mean is not None:
             options |= {"mean": model.mean, "std": model.std}
         folder = Path(name.removeprefix(PREFIX)).expanduser()
-        label = PREFIX + folder.resolve().name if folder.is_dir() else name
+        label = PREFIX + folder.resolve().name if os.path.isdir(folder) else name
         return Backbone(model, full_name(label, model.depth), block, heads, **options)
 
     path = Path(name).expanduser()
     if name in available_backbones():
         path, label = download(name), name
-    elif path.is_file():
+    elif os.path.isfile(path):  # False for a name that is too long, where Path.is_file raises
         label = path.stem
     else:
         raise InputError(

@@ -13,7 +13,7 @@ from zsp_lite.benchmark.provenance import library_version
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.io.files import write_atomic
+from zsp_lite.io.files import make_folder, write_atomic
 
 _PARTS = ("keys", "saliency", "global_feature")
 _UNCACHED = ("rootsift",)  # computed faster than read
@@ -28,10 +28,13 @@ class FeatureCache:
     Args:
         folder: The folder; made where it does not exist.
         extractors: By name (see `extractors`).
+
+    Raises:
+        InputError: The folder cannot be made.
     """
 
     def __init__(self, folder: str | Path, extractors: Mapping[str, Any]):
-        self.folder, self.extractors = Path(folder), extractors
+        self.folder, self.extractors = make_folder(folder, "cache folder"), extractors
         self._fingerprints = {name: fingerprint(one) for name, one in extractors.items() if name not in _UNCACHED}
 
     def path(self, features: str, frame: Frame) -> Path:

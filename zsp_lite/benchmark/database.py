@@ -11,6 +11,7 @@ run.lock, which the operating system releases when the process ends. Other proce
 """
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.io.files import make_folder, read_bytes, write_atomic
 
 SETTINGS, DATABASE, LOCK = "run.json", "run.sqlite", "run.lock"
 _TIMEOUT = 60  # seconds to wait for the end of a read or of a transaction
@@ -64,8 +65,7 @@ class RunFolder:
     """
 
     def __init__(self, out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False):
-        self._out = out = Path(out)
-        out.mkdir(parents=True, exist_ok=True)
+        self._out = out = make_folder(out, "folder of the run")
         check_settings(out, settings, allow_other_version)  # a refused folder gets no lock and no database
         try:
             with ExitStack() as opened:
@@ -179,7 +179,7 @@ def check_settings(out: str | Path, settings: Mapping[str, Any], allow_other_ver
         InputError: If the folder holds a run with other settings.
     """
     out = Path(out)
-    if not (out / SETTINGS).is_file():
+    if not os.path.lexists(out / SETTINGS):  # a pipe or a broken link is no new run
         if (out / "pairs.jsonl").is_file():
             raise InputError(f"{out} holds pairs.jsonl without {SETTINGS}; choose another folder")
         if finished_results(out):

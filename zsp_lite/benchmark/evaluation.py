@@ -14,7 +14,7 @@ from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.best_view import mask_iou
 from zsp_lite.data.labels import PoseLabel, relative_pose
 from zsp_lite.data.pairs import Pair
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError, describe_failure
 from zsp_lite.metrics import rotation_error, translation_error
 from zsp_lite.pipeline import view_alignment
 from zsp_lite.views import has_saliency, patch_mask
@@ -47,6 +47,7 @@ def evaluate_pair(
 
     Raises:
         InputError: If a pose label or a file is missing. (Rows that raise InputError count as failed.)
+        FatalError: If features are not finite, or the function of a row raises another exception.
     """
     for sequence in (pair.reference_sequence, pair.target_sequence):
         if sequence not in labels:
@@ -78,9 +79,11 @@ def _evaluate(
 ) -> dict[str, Any]:
     start = time.perf_counter()
     try:
-        answer = as_answer(method.solve(problem)) if method.solve else _answer(method, problem, truths)
+        answer = _solve(method, problem) if method.solve else _answer(method, problem, truths)
         if not 0 <= answer.view < len(truths):
             raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
+    except FatalError:
+        raise
     except InputError as error:
         return {"error": FAILED, "failed": str(error)}
     details = {"timings": {"total": time.perf_counter() - start}} | dict(answer.details)
@@ -100,6 +103,20 @@ def _evaluate(
         ]  # fmt: skip
     timings = {stage: round(seconds, 5) for stage, seconds in details.pop("timings").items()}
     return result | details | {"note": answer.note, "timings": timings}
+
+
+def _solve(method: Method, problem: Problem) -> Answer:
+    """Call the function of a row. Raises FatalError if it is not of this library and raises no InputError."""
+    try:
+        return as_answer(method.solve(problem))
+    except InputError:
+        raise
+    except Exception as error:
+        own = getattr(method.solve, "estimator", method.solve)
+        module = getattr(own, "__module__", None) or type(own).__module__
+        if module.startswith("zsp_lite."):
+            raise
+        raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
 
 
 def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:

@@ -4,6 +4,7 @@ A chunk is a few pairs of one category that share frames. Workers return the rec
 loses the chunks that were being evaluated.
 """
 
+import inspect
 import os
 import signal
 import threading
@@ -29,10 +30,11 @@ from zsp_lite.benchmark.store import FrameStore, torch_threads
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer, describe_failure
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
+MOST_WORKERS = 4096  # also of threads
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
@@ -139,8 +141,7 @@ def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[W
     Raises:
         InputError: If the executor is none of these, or cannot be reached.
     """
-    if number < 1:
-        raise InputError(f"workers is {number}, expected at least 1")
+    check_integer("workers", number, 1, MOST_WORKERS)
     if executor is None and number == 1:
         yield Workers(None, 1)
     elif executor is None:
@@ -152,14 +153,26 @@ def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[W
         with _dask(executor.removeprefix("dask://")) as workers:
             yield workers
     else:
-        try:
-            made = import_object(executor)
-        except InputError as error:
-            raise InputError(
-                f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor ({error})"
-            ) from error
-        with made(number) as opened:
+        with _make_executor(executor, number) as opened:
             yield Workers(opened, number)
+
+
+def _make_executor(path: str, number: int) -> Executor:
+    """Call the class "module:Class" of an executor, or a function that returns one, with the number of workers."""
+    expected = "expected dask://HOST:PORT or module:Class of an executor"
+    try:
+        maker = import_object(path)
+    except InputError as error:
+        raise InputError(f"executor {path!r}: {expected} ({error})") from error
+    if not (inspect.isfunction(maker) or (isinstance(maker, type) and issubclass(maker, Executor))):
+        raise InputError(f"executor {path!r} is a {type(maker).__name__}, {expected}")
+    try:
+        made = maker(number)
+    except Exception as error:  # it is not of this library
+        raise InputError(f"executor {path!r} cannot be made for {number} workers: {describe_failure(error)}") from error
+    if not isinstance(made, Executor):
+        raise InputError(f"executor {path!r} gave a {type(made).__name__}, {expected}")
+    return made
 
 
 def evaluate_chunks(

@@ -105,7 +105,7 @@ def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> No
         text = read_bytes(Path(path), "document").decode()
     except UnicodeDecodeError as error:
         raise InputError(f"document {path} is not UTF-8 text ({error})") from error
-    write_atomic(path, insert_tables(text, tables, pairs).encode())
+    write_atomic(path, insert_tables(text, tables, pairs).encode(errors="replace"))
 
 
 def short_group(group: str) -> str:

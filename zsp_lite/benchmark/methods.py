@@ -15,7 +15,7 @@ from typing import Any, Literal
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.robustness import DAMAGES, Damaged
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, describe_failure
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 
@@ -230,8 +230,10 @@ def import_object(path: str) -> Any:
         found = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
+    except (ImportError, AttributeError) as error:
         raise InputError(f"{path!r} cannot be imported: {error}") from error
+    except (Exception, SystemExit) as error:  # a module may raise anything
+        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
     return found
 
 

@@ -3,10 +3,14 @@
 import gzip
 import json
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
 
 from zsp_lite.benchmark.database import SETTINGS, Records, read_records, read_settings
 from zsp_lite.benchmark.summary import category_of, summarise_rows, summarise_run
@@ -18,6 +22,7 @@ logger = logging.getLogger(__name__)
 RESULTS = "results.json.gz"
 _NEEDED = ("data", "backbone", "targets", "seed")  # of run.json, for the summary
 _DECIMALS = 4  # of degrees and lengths in an export
+_KEY = re.compile(r"[^/]+/[^/]+:\d+/[^/]+:\d+(,\d+)*")
 _EXPORTED = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
 
 
@@ -65,6 +70,7 @@ def results_of(settings: Mapping[str, Any], records: Records) -> Results:
             rows[name] = {key: found[key] for _, key in keys}
     if not rows:
         raise InputError(f"{settings['data']}: the run has no finished pair yet")
+    _check_rows(rows, f"of {settings['data']}")
     data = {
         "root": settings["data"], "categories": call["categories"], "pairs": max(map(len, rows.values())),
         "targets": settings["targets"], "seed": settings["seed"],
@@ -92,32 +98,112 @@ def read_results(path: str | Path) -> Results:
     except (ValueError, RecursionError) as error:
         raise InputError(f"results {path}: not a gzip file with JSON, or damaged ({error})") from error
     try:
-        keys = content["pairs"]
-        rows = {
-            name: {
-                keys[index]: {part: row[part][i] for part in _EXPORTED if row.get(part) and row[part][i] is not None}
-                for i, index in enumerate(row["pair"])
-            }
-            for name, row in content["rows"].items()
-        }
-        _check_rows(rows, path)
-        if not rows:
-            raise KeyError("no rows")
-        return Results(content["summary"], content["settings"], content["invocations"], rows)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise InputError(f"results {path}: not a run's results ({error!r})") from error
+        file = msgspec.convert(content, _File)
+        summary = msgspec.convert(file.summary, _Summary)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise InputError(f"results {path}: not a run's results ({error})") from error
+    rows = {name: _row(name, columns, file.pairs, path) for name, columns in file.rows.items()}
+    _check_rows(rows, str(path))
+    _check_summary(summary, rows, path)
+    return Results(file.summary, file.settings, file.invocations, rows)
 
 
-def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> None:
+def _row(name: str, columns: Mapping[str, list], keys: Sequence[str], path: Path) -> dict[str, dict[str, Any]]:
+    """Convert the columns of a row to what it found for each pair."""
+    indices = columns.get("pair", [])
+    if {len(columns[part]) for part in _EXPORTED if part in columns} - {len(indices)} or not indices:
+        raise InputError(f"results {path}: columns of row {name} differ in length, expected one entry per pair")
+    known = all(isinstance(index, int) and 0 <= index < len(keys) for index in indices)
+    if not known or len(set(indices)) < len(indices):
+        raise InputError(f"results {path}: pairs of row {name} are not different ones from 0 to {len(keys) - 1}")
+    parts = [part for part in _EXPORTED if part in columns]
+    return {
+        keys[index]: {part: columns[part][i] for part in parts if columns[part][i] is not None}
+        for i, index in enumerate(indices)
+    }
+
+
+def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], where: str) -> None:
     """Raise InputError if an error is not an angle from 0 to 180 degrees, or a confidence not from 0 to 1."""
     for name, row in rows.items():
         for key, found in row.items():
-            if not isinstance(key, str) or "/" not in key:
-                raise InputError(f"results {path}: {key!r} is no key of a pair, expected CATEGORY/...")
+            if not _KEY.fullmatch(key):
+                raise InputError(
+                    f"results {where}: {key!r} is no key of a pair, expected CATEGORY/SEQUENCE:FRAME/SEQUENCE:FRAME,..."
+                )
             for part, most in (("error", 180.0), ("confidence", 1.0)):
-                value = found[part] if part == "error" else found.get(part, 0.0)
+                value = found.get(part, None if part == "error" else 0.0)
                 if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:
-                    raise InputError(f"results {path}: {part} of {name} on {key} is {value!r}, expected 0 to {most:g}")
+                    raise InputError(f"results {where}: {part} of {name} on {key} is {value!r}, expected 0 to {most:g}")
+
+
+def _check_summary(summary: "_Summary", rows: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> None:
+    """Raise InputError if the summary is of other rows than those of the file."""
+    if not rows or summary.methods.keys() != rows.keys():
+        raise InputError(
+            f"results {path}: summary of rows {', '.join(summary.methods)}, the file has {', '.join(rows)}"
+        )
+    for name, row in rows.items():
+        found, stored = float(np.median([one["error"] for one in row.values()])), summary.methods[name]
+        if stored.n != len(row) or not abs(stored.median - found) <= 10**-_DECIMALS:
+            raise InputError(
+                f"results {path}: row {name} has {len(row)} pairs with a median of {found:g} degrees, expected "
+                f"{stored.n} with {stored.median:g} as in its summary"
+            )
+
+
+_Angle, _Percent = Annotated[float, msgspec.Meta(ge=0, le=180)], Annotated[float, msgspec.Meta(ge=0, le=100)]
+_Interval = tuple[float, float]
+
+
+class _Figures(msgspec.Struct):
+    """Figures of the tables; see `metrics.summarise`."""
+
+    n: Annotated[int, msgspec.Meta(ge=1)]
+    median: _Angle
+    acc30: _Percent
+    acc15: _Percent
+    above150: _Percent
+    median_ci: _Interval
+    acc30_ci: _Interval
+    acc15_ci: _Interval
+
+
+class _RowFigures(_Figures, kw_only=True):
+    mean_category_median: _Angle
+    mean_category_median_ci: _Interval
+    failed: int
+    flagged: int
+    per_category: dict[str, _Figures]
+
+
+class _Difference(msgspec.Struct):
+    accuracy_gain: float
+    accuracy_gain_ci: _Interval
+    accuracy_gain_p: float
+    sign_test_p: float
+
+
+class _Data(msgspec.Struct):
+    root: str
+    categories: list[str]
+    pairs: int
+    targets: int
+
+
+class _Summary(msgspec.Struct):
+    data: _Data
+    backbone: str
+    methods: dict[str, _RowFigures]
+    against_ours: dict[str, _Difference] = {}
+
+
+class _File(msgspec.Struct):
+    summary: dict[str, Any]
+    settings: dict[str, Any]
+    invocations: list[dict[str, Any]]
+    pairs: list[str]
+    rows: dict[str, dict[str, list[Any]]]
 
 
 def read_runs(paths: Sequence[str | Path]) -> Results:

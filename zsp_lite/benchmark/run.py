@@ -12,6 +12,7 @@ from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.database import RunFolder, check_settings, finished_results
 from zsp_lite.benchmark.execution import (
     CHUNK_SIZE,
+    MOST_WORKERS,
     Setup,
     available_cores,
     evaluate_chunks,
@@ -29,8 +30,8 @@ from zsp_lite.benchmark.robustness import Damaged
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.errors import InputError
-from zsp_lite.io.files import write_atomic
+from zsp_lite.errors import InputError, check_integer
+from zsp_lite.io.files import make_folder, write_atomic
 from zsp_lite.pipeline import ZeroShotPose
 
 
@@ -90,6 +91,10 @@ def evaluate(
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
     settings = _settings(root, loaded, extractors, rows, row_pairs, pairs, targets, seed)
     _check_rows(rows, extractors)
+    if threads is not None:
+        check_integer("threads", threads, 1, MOST_WORKERS)
+    if cache is not None:
+        make_folder(cache, "cache folder")  # before anything is written
     with RunFolder(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
         threads = threads or max(1, available_cores() // opened.number)
         setup = Setup(

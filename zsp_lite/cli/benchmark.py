@@ -228,7 +228,7 @@ def compare(first: Path, second: Path, rows: list[str] | None, out: Path | None)
 
 
 @click.command(epilog=examples("profile", "profile --repeats 2"))
-@click.option("--repeats", type=COUNT, metavar="N", default=5, help="Runs behind each median.")
+@click.option("--repeats", type=click.IntRange(1, 1000), metavar="N", default=5, help="Runs behind each median.")
 def profile(repeats: int) -> None:
     """Measure time and memory of every stage, and of the plain loops that it replaces."""
     from zsp_lite.cli.profile import measure_all

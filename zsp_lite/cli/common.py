@@ -18,9 +18,20 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound=Callable)
 
-COUNT = click.IntRange(min=1)
+COUNT = click.IntRange(1, 1_000_000)
 SEED = click.IntRange(min=0)
-PATH = click.Path(path_type=Path)
+
+
+class _Path(click.Path):
+    """A path as `pathlib.Path`; null bytes, which no file system has, are refused."""
+
+    def convert(self, value, parameter, context):
+        if "\0" in str(value):
+            self.fail(f"got {value!r}, expected a path without null bytes", parameter, context)
+        return Path(super().convert(value, parameter, context))
+
+
+PATH = _Path()
 
 
 def names(text: str) -> list[str]:

@@ -3,6 +3,7 @@
 Each command imports what it needs inside its function, so that `--help` stays quick.
 """
 
+import io
 import logging
 import sys
 from collections.abc import Sequence
@@ -61,6 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     logging.basicConfig(format="%(message)s")
     logging.getLogger("zsp_lite").setLevel(logging.INFO)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # notebooks and tests have others
+            stream.reconfigure(errors="backslashreplace")  # names of files need not be valid text
     try:
         with cli.make_context("zsp-lite", list(sys.argv[1:] if argv is None else argv)) as context:
             return cli.invoke(context) or 0
@@ -116,7 +120,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
     from zsp_lite.viz.report import COLUMNS, table_rows, write_overview, write_report
 
-    console = Console()
+    console = Console(markup=False)  # names may hold brackets
     folder = data or sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
@@ -219,6 +223,7 @@ def synth(
         raise InputError("--engine, --landscape and --depth-bits go with --models")
     from tqdm import tqdm
 
+    from zsp_lite.io.locks import writing
     from zsp_lite.synthetic.export import export_categories, export_preset
 
     if models_folder:
@@ -232,19 +237,22 @@ def synth(
 
         if engine == "cycles":
             render_python()  # missing: say so before any work
-        left_out = export_models(
-            models_folder, out, frames or 24, seed, image_size or 256, landscape=landscape, depth_bits=depth_bits,
-            renderer=path_traced_views if engine == "cycles" else render_views, progress=tqdm,
-        )  # fmt: skip
-        print_left_out(left_out)
-        write_contact_sheet(models_folder, out / "models.html")
-        write_label_overlay(out / "label_overlay.jpg", Co3D(out))
+        with writing(out):
+            left_out = export_models(
+                models_folder, out, frames or 24, seed, image_size or 256, landscape=landscape, depth_bits=depth_bits,
+                renderer=path_traced_views if engine == "cycles" else render_views, progress=tqdm,
+            )  # fmt: skip
+            print_left_out(left_out)
+            write_contact_sheet(models_folder, out / "models.html")
+            write_label_overlay(out / "label_overlay.jpg", Co3D(out))
     elif preset:
         if sequences or frames:
             raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
-        export_preset(preset, out, seed, progress=tqdm)
+        with writing(out):
+            export_preset(preset, out, seed, progress=tqdm)
     else:
-        export_categories(list(categories), out, sequences or 4, frames or 24, seed, progress=tqdm)
+        with writing(out):
+            export_categories(list(categories), out, sequences or 4, frames or 24, seed, progress=tqdm)
     print(f"Written: {out}")
 
 
@@ -337,6 +345,7 @@ def train(
         raise InputError("--photo has no weights to start from; expected --start-from")
     from dataclasses import replace
 
+    from zsp_lite.io.locks import writing
     from zsp_lite.training.loop import keep_freed_memory
     from zsp_lite.training.recipe import CONTINUATION, PHOTO_INFORMED, TrainingConfig
     from zsp_lite.training.train import train as train_backbone
@@ -350,9 +359,13 @@ def train(
         from zsp_lite.training.distillation import LONG_RUN, distil
 
         run = replace(LONG_RUN, seed=seed, steps=max(1, round(LONG_RUN.steps * shorten)))
-        written = distil(run, config, out, renders)
+        with writing(out):
+            written = distil(run, config, out, renders)
     else:
-        written = train_backbone(config, out, renders, start_from=start_from, models=models, backgrounds=backgrounds)
+        with writing(out):
+            written = train_backbone(
+                config, out, renders, start_from=start_from, models=models, backgrounds=backgrounds
+            )
     print(f"Written: {written}")
 
 
@@ -381,8 +394,13 @@ def train_baseline(name: str, out: Path | None, objects: int | None, steps: int 
     else:
         from zsp_lite.training.posecontrast import PoseContrastConfig as Config
         from zsp_lite.training.posecontrast import train
+    from zsp_lite.io.locks import writing
+
     given = {key: value for key, value in (("objects", objects), ("steps", steps)) if value}
-    print(f"Written: {train(Config(seed=seed, **given), out or Path('outputs') / name)}")
+    folder = out or Path("outputs") / name
+    with writing(folder):
+        written = train(Config(seed=seed, **given), folder)
+    print(f"Written: {written}")
 
 
 @cli.command(epilog=examples("doctor", "doctor --data path/to/co3d"))

@@ -4,12 +4,14 @@ A camera maps world points to camera coordinates by `x_cam = R @ x_world + t` (c
 +z forward). Pixel coordinates are (x, y) with pixel centres at half-integers: the image covers [0, W] x [0, H].
 """
 
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
 
+from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_magnitude, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
@@ -24,6 +26,7 @@ _AXES = np.array([-1.0, -1.0, 1.0])
 _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
 _MIN_FOCAL_LENGTH = 1e-3  # pixels
+MOST_PIXELS = 1_000_000  # of a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,7 @@ class Camera:
         )
 
     @classmethod
+    @checked
     def from_pytorch3d(
         cls,
         R: Real[np.ndarray, "3 3"] | Sequence,
@@ -104,6 +108,7 @@ class Camera:
         # NDC axes point left and up, pixel axes right and down: hence the minus.
         return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
 
+    @checked
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
         """Convert to a PyTorch3D camera; the inverse of `from_pytorch3d`.
 
@@ -137,14 +142,17 @@ class Camera:
         """Camera centre in world coordinates."""
         return -self.R.T @ self.t
 
+    @checked
     def to_camera(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Transform points (..., 3) from world to camera coordinates."""
         return np.asarray(points, dtype=np.float64) @ self.R.T + self.t
 
+    @checked
     def to_world(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Transform points (..., 3) from camera to world coordinates."""
         return (np.asarray(points, dtype=np.float64) - self.t) @ self.R
 
+    @checked
     def project(
         self, points: Real[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
@@ -165,6 +173,7 @@ class Camera:
             pixels = in_camera[..., :2] / depth[..., None] * self.focal_length + self.principal_point
         return pixels, depth
 
+    @checked
     def unproject_camera(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
@@ -181,17 +190,20 @@ class Camera:
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
 
+    @checked
     def unproject(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
         """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
 
+    @checked
     def crop(self, box: Box) -> "Camera":
         """Return the camera of the image cropped to `box` (top, left, height, width): the principal point moves."""
         top, left, height, width = box
         return replace(self, principal_point=self.principal_point - (left, top), size=(height, width))
 
+    @checked
     def resize(self, size: Sequence[int]) -> "Camera":
         """Return the camera of the image resized to (height, width): the intrinsics are scaled per axis."""
         size = _image_size(size)
@@ -226,10 +238,7 @@ def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> 
 
 
 def _image_size(size: Sequence[int]) -> tuple[int, int]:
-    try:
-        height, width = (int(side) for side in size)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"image size is {size!r}, expected (height, width)") from error
-    if height <= 0 or width <= 0:
-        raise InputError(f"image size is {(height, width)}, expected positive (height, width)")
-    return height, width
+    sides = tuple(size) if isinstance(size, Sequence | np.ndarray) else ()
+    if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
+        raise InputError(f"image size is {size!r}, expected (height, width), integers from 1 to {MOST_PIXELS}")
+    return int(sides[0]), int(sides[1])

@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
+from zsp_lite.arguments import checked
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number
 
 
+@checked
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
     """Decode CO3D's depth: the bits of each 16-bit value are those of a float16.
 
@@ -26,10 +28,12 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
     """
     check_number("depth scale_adjustment", scale_adjustment, above=0)
     check_magnitude("depth scale_adjustment", scale_adjustment)
-    depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
+    with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
+        depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
+@checked
 def encode_depth(
     depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
 ) -> UInt16[np.ndarray, "h w"]:
@@ -53,6 +57,7 @@ def encode_depth(
     return (encoded + step // 2) // step * step
 
 
+@checked
 def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
     """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting.
 
@@ -78,6 +83,7 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     return np.where(known, depth, filled.clip(low, high))
 
 
+@checked
 def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """Compute the point (H, W, 3) of each pixel in camera coordinates; unknown depth (0) gives the origin."""
     depth = np.asarray(depth, dtype=np.float64)
@@ -87,6 +93,7 @@ def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.
     return camera.unproject_camera(np.stack([x, y], axis=-1), depth)
 
 
+@checked
 def patch_points(
     depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:

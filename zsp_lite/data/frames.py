@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
+from zsp_lite.arguments import checked
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
-from zsp_lite.io.images import decode_image
+from zsp_lite.io.images import MAX_PIXELS, decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 
@@ -75,6 +76,7 @@ class Frame:
         return f"frame {self.name}" if self.name else "frame"
 
 
+@checked
 def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
     """Compute the bounding box of the mask above a threshold, padded and clipped to the image.
 
@@ -101,6 +103,7 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
     return top, left, bottom - top, right - left
 
 
+@checked
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
     """Crop a frame to the bounding box of its object mask (see `mask_to_bbox`).
 
@@ -115,6 +118,7 @@ def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -
         raise InputError(f"{frame._label}: {error}") from error
 
 
+@checked
 def crop_frame(frame: Frame, box: Box) -> Frame:
     """Crop a frame and its camera.
 
@@ -139,6 +143,7 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
     )
 
 
+@checked
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio.
 
@@ -149,8 +154,13 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     Args:
         frame: The frame.
         size: New (height, width), pixels.
+
+    Raises:
+        InputError: The size is not positive or too large.
     """
     camera = frame.camera.resize(size)
+    if camera.size[0] * camera.size[1] > MAX_PIXELS:
+        raise InputError(f"resize_frame: size is {camera.size}, expected at most {MAX_PIXELS} pixels")
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
     rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)
@@ -165,6 +175,7 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
 
 
+@checked
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read the colours (H, W, 3) of an image file.
 
@@ -176,6 +187,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(image[..., ::-1])
 
 
+@checked
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1].
 
@@ -185,6 +197,7 @@ def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
+@checked
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
     """Read a CO3D depth file: a 16-bit PNG that holds the bits of float16 values.
 
@@ -201,6 +214,7 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
     return decode_depth(read_grey16(path), scale_adjustment)
 
 
+@checked
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     """Read the values (H, W) of a 16-bit greyscale PNG.
 
@@ -213,16 +227,19 @@ def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     return bits
 
 
+@checked
 def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
     """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
     _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
+@checked
 def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
     """Write probabilities (H, W) in [0, 1] as an 8-bit PNG."""
     _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
 
 
+@checked
 def write_depth(
     path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
 ) -> None:
@@ -233,6 +250,7 @@ def write_depth(
     _encode(path, ".png", encode_depth(depth, scale_adjustment, bits), [])
 
 
+@checked
 def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
     """Write a boolean mask (H, W) as a 1-bit PNG, which reads as 255 and 0."""
     _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])

@@ -11,13 +11,14 @@ from jaxtyping import Float, Real
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_magnitude, check_number
 from zsp_lite.io.files import path_inside, read_bytes, read_npy
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 # Largest deviation of a pose from a rigid transform: poses in files are decimal numbers of few digits.
 _RIGID_TOLERANCE = 2e-2
+_MOST_DISTORTION = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,9 @@ class CaptureFrame:
         depth_unit: World units per stored depth value.
         distortion: OpenCV's coefficients k1, k2, p1, p2, k3, or () for none. Image, depth and mask are undistorted.
         mask: Mask file, or None.
+
+    Raises:
+        InputError: The depth unit is not positive or above 1e9, or a coefficient is above 100.
     """
 
     image: Path
@@ -42,6 +46,11 @@ class CaptureFrame:
     depth_unit: float = 0.001
     distortion: tuple[float, ...] = ()
     mask: Path | None = None
+
+    def __post_init__(self):
+        check_number(f"{self.depth}: depth unit", self.depth_unit, above=0)
+        check_magnitude(f"{self.depth}: depth unit", self.depth_unit)
+        check_magnitude(f"{self.image}: distortion", self.distortion, _MOST_DISTORTION)
 
     def load(self) -> Frame:
         """Load the frame.

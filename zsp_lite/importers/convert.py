@@ -16,6 +16,7 @@ from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.open3d_folder import read_open3d
 from zsp_lite.importers.tum import read_tum
 from zsp_lite.io.files import plain_name
+from zsp_lite.io.locks import writing
 
 READERS: dict[str, Callable[..., list[CaptureFrame]]] = {
     "tum": read_tum,
@@ -97,7 +98,8 @@ def import_capture(
         max_frames: Maximum number of frames, evenly spaced.
 
     Raises:
-        InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
+        InputError: The capture cannot be read, segmented or fused, the sequence exists, or another process imports into
+            the folder. Nothing is written then.
     """
     plain_name(category, "category"), plain_name(sequence, "sequence")
     folder = Path(root) / category / sequence
@@ -126,8 +128,11 @@ def import_capture(
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
     times = [capture[index].time - capture[0].time for index in seen]
     data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
-    folder.mkdir(parents=True, exist_ok=True)
-    unfinished.touch()
-    write_co3d(root, category, [data])
-    unfinished.unlink()
+    with writing(root):
+        if folder.exists() and not unfinished.is_file():  # another process was faster
+            raise InputError(f"{folder} exists already, expected another sequence name")
+        folder.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
+        write_co3d(root, category, [data])
+        unfinished.unlink()
     return ImportResult(len(frames), empty, len(points), scale)

@@ -19,6 +19,7 @@ from zsp_lite.importers.capture import (
     parse_numbers,
     read_rows,
 )
+from zsp_lite.io.files import path_inside
 
 
 def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
@@ -33,12 +34,12 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
     """
     folder = Path(folder)
     columns = {"rgb.txt": 1, "depth.txt": 1, "poses.txt": 12}
-    rows = {name: read_rows(folder / name, count, "list") for name, count in columns.items()}
+    rows = {name: read_rows(path_inside(folder, name), count, "list") for name, count in columns.items()}
     counts = {name: len(found) for name, found in rows.items()}
     if len(set(counts.values())) > 1 or not counts["rgb.txt"]:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers, at least 1")
-    matrix = _intrinsics(folder / "intrinsics.txt")
+    matrix = _intrinsics(path_inside(folder, "intrinsics.txt"))
     size, frames = None, []
     for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
         where = f"{folder / 'poses.txt'}, line {pose_line}"

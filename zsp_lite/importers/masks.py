@@ -11,6 +11,7 @@ from jaxtyping import Float
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.frames import Frame, read_mask
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import path_inside
 from zsp_lite.points import object_pixels, object_points
 
 _ITERATIONS = 4  # of GrabCut
@@ -72,7 +73,7 @@ def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]
         stem = Path(frame.name).stem
         if stem not in files:
             raise InputError(f"folder {folder} has no mask {stem}.png for the image {frame.name}")
-        masked.append(replace(frame, mask=read_mask(files[stem])))
+        masked.append(replace(frame, mask=read_mask(path_inside(folder, files[stem].name))))
     return masked
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, listed_file
-from zsp_lite.io.files import read_bytes
+from zsp_lite.io.files import path_inside, read_bytes
 
 FILE = "transforms.json"
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -62,7 +62,7 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
         InputError: The file is invalid, no frame has depth, the camera model is another one, intrinsics are missing, or
             k4 is not 0.
     """
-    path = Path(folder) / FILE
+    path = path_inside(folder, FILE)
     content = decode(read_bytes(path, FILE), _File, path)
     if content.camera_model not in _MODELS:
         raise InputError(f"{path}: camera_model is {content.camera_model!r}, expected one of {', '.join(_MODELS)}")
@@ -82,7 +82,10 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
         if given["k4"]:
             raise InputError(f"{where}: k4 is {given['k4']}, expected 0: OpenCV's distortion model has no r^8 term")
         pose = np.array(frame.transform_matrix) @ _TO_OPENCV
-        size = int(given["h"]), int(given["w"])
+        size = given["h"], given["w"]
+        if any(isinstance(side, float) and not side.is_integer() for side in size):
+            raise InputError(f"{where}: h and w are {size}, expected integers")
+        size = int(size[0]), int(size[1])
         camera = camera_from_pose(pose, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
         image, depth = (listed_file(Path(folder), name, where) for name in (frame.file_path, frame.depth_file_path))
         mask = None if frame.mask_path is None else listed_file(Path(folder), frame.mask_path, where)

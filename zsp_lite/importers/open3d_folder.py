@@ -9,8 +9,15 @@ from jaxtyping import Float
 
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, camera_from_pose, parse_numbers, read_rows
-from zsp_lite.io.files import read_bytes
+from zsp_lite.importers.capture import (
+    HALF_PIXEL,
+    CaptureFrame,
+    camera_from_pose,
+    listed_file,
+    parse_numbers,
+    read_rows,
+)
+from zsp_lite.io.files import path_inside, read_bytes
 
 _COLOURS = "color", "image", "rgb"
 _INTRINSICS = "camera_intrinsic.json", "intrinsic.json", "camera_primesense.json"
@@ -32,7 +39,8 @@ def read_open3d(folder: str | Path) -> list[CaptureFrame]:
         folder: The capture.
 
     Raises:
-        InputError: A part is missing or invalid, or the numbers of images, depth maps and poses differ.
+        InputError: A part is missing or invalid, leads out of the folder, or the numbers of images, depth maps and
+            poses differ.
     """
     folder = Path(folder)
     colours = _images(folder, _COLOURS)
@@ -77,7 +85,8 @@ def _images(folder: Path, names: tuple[str, ...]) -> list[Path]:
     for name in names:
         found = [path for path in (folder / name).glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
         if found:
-            return sorted(found, key=_by_number)
+            files = [listed_file(folder, f"{name}/{path.name}", f"capture {folder}") for path in found]
+            return sorted(files, key=_by_number)
     raise InputError(f"capture {folder} has no pictures in {', '.join(f'{name}/' for name in names)}")
 
 
@@ -90,5 +99,5 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 def _first(folder: Path, names: tuple[str, ...]) -> Path:
     for name in names:
         if (folder / name).is_file():
-            return folder / name
+            return path_inside(folder, name)
     raise InputError(f"capture {folder} has none of {', '.join(names)}, expected one")

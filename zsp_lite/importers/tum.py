@@ -13,6 +13,7 @@ from zsp_lite.importers.capture import (
     parse_numbers,
     read_rows,
 )
+from zsp_lite.io.files import path_inside
 
 # The benchmark's default camera. Its pixel centres are at integers.
 DEFAULT_INTRINSICS, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (480, 640)
@@ -40,7 +41,7 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
     fx, fy, cx, cy = intrinsics or DEFAULT_INTRINSICS
     lists = {}
     for name, columns in (("rgb.txt", 2), ("depth.txt", 2), ("groundtruth.txt", 8)):
-        rows = read_rows(folder / name, columns, "list")
+        rows = read_rows(path_inside(folder, name), columns, "list")
         if not rows:
             raise InputError(f"list {folder / name} is empty, expected lines of {columns} columns")
         times = parse_numbers([words[0] for _, words in rows], str(folder / name))

@@ -60,6 +60,16 @@ def _remove_leftovers(folder: Path) -> None:
             Path(path).unlink(missing_ok=True)
 
 
+def make_folder(path: str | Path, what: str) -> Path:
+    """Make a folder unless it exists, with those above it. Raises InputError if that is not possible."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the path
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{what} {_shown(path)} cannot be made: {reason.lower()}") from error
+    return Path(path)
+
+
 def read_bytes(path: str | Path, what: str) -> bytes:
     """Read a file.
 

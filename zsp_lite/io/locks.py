@@ -2,10 +2,11 @@
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import make_folder
 
 LOCK = ".writing.lock"
 
@@ -19,13 +20,16 @@ def writing(folder: str | Path) -> Iterator[None]:
     Raises:
         InputError: Another process writes to the folder, or the folder cannot be written.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    new = not Path(folder).exists()
+    folder = make_folder(folder, "folder")
     try:
         lock = sqlite3.connect(folder / LOCK, timeout=0)
     except sqlite3.Error as error:
         raise InputError(f"{folder / LOCK} cannot be opened for writing ({error}); choose another folder") from error
-    with closing(lock):
+    with ExitStack() as opened:
+        if new:
+            opened.callback(_remove_if_empty, folder)  # after an error, before which nothing was written
+        opened.enter_context(closing(lock))
         try:
             lock.execute("BEGIN EXCLUSIVE")
         except sqlite3.Error as error:
@@ -35,3 +39,8 @@ def writing(folder: str | Path) -> Iterator[None]:
         finally:
             with suppress(OSError):  # Windows keeps an open file
                 (folder / LOCK).unlink()
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):  # not empty
+        folder.rmdir()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
+from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
@@ -14,6 +15,7 @@ _COLOURS = ("red", "green", "blue")
 _VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in _COLOURS])
 
 
+@checked
 def write_ply(
     path: str | Path,
     points: Real[np.ndarray, "n 3"],
@@ -31,14 +33,13 @@ def write_ply(
         normals: Normals, (n, 3); zeros if not given.
 
     Raises:
-        InputError: The arrays differ in length.
+        InputError: The arrays have other shapes, or values above 1e9 or not finite.
     """
+    check_magnitude(f"point cloud {path}", points)
+    check_magnitude(f"colours of point cloud {path}", colours, 255)
     vertices = np.zeros(len(points), dtype=_VERTEX)
-    normals = np.zeros(points.shape) if normals is None else normals
+    normals = np.zeros((len(points), 3)) if normals is None else normals
     for names, values in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals), (_COLOURS, colours)):
-        if np.shape(values) != (len(points), 3):
-            raise InputError(f"point cloud {path}: {', '.join(names)} have shape {np.shape(values)}, "
-                             f"expected {(len(points), 3)}")  # fmt: skip
         for name, column in zip(names, np.asarray(values).T):
             vertices[name] = column
     properties = "".join(f"property {'uchar' if name in _COLOURS else 'float'} {name}\n" for name in _VERTEX.names)
@@ -46,6 +47,7 @@ def write_ply(
     write_atomic(path, header.encode("ascii") + vertices.tobytes())
 
 
+@checked
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
     """Read the vertices of a binary or ASCII PLY file.
 

@@ -8,13 +8,15 @@ from pathlib import Path
 from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.data.co3d import Co3D, SequenceData
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.recording import (
+    MOST_FRAMES,
+    MOST_PIXELS,
     read_poses,
     record_sequence,
     stable_hash,
@@ -30,6 +32,7 @@ SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATI
 GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
 RENDERER = 2  # folders that another renderer began are not completed
+_MOST_SEQUENCES = 900  # of a category: their names have three digits
 LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
@@ -127,10 +130,10 @@ def export_categories(
             raise InputError(f"category is {category!r}, expected one of {', '.join([*SPLITS, *sorted(GENERATORS)])}")
     if layout not in LAYOUTS:
         raise InputError(f"layout is {layout!r}, expected one of {', '.join(LAYOUTS)}")
-    if min(sequences, frames) < 1 or image_size < 32:
-        raise InputError(
-            f"export has {sequences} sequences of {frames} frames of {image_size} pixels, expected at least 1, 1 and 32"
-        )
+    check_integer("sequences", sequences, 1, _MOST_SEQUENCES)
+    check_integer("frames", frames, 1, MOST_FRAMES)
+    check_integer("image_size", image_size, 32, MOST_PIXELS)
+    check_integer("seed", seed, 0)
     out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout, "renderer": RENDERER}
     _write_settings(out, settings)

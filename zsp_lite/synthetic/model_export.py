@@ -13,6 +13,8 @@ from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.synthetic.models import Model, list_models
 from zsp_lite.synthetic.recording import (
+    MOST_FRAMES,
+    MOST_PIXELS,
     Sensor,
     read_poses,
     record_sequence,
@@ -89,8 +91,8 @@ def export_models(
         InputError: If the folder holds no usable model, a setting is out of its range, or `out` was written with
             other settings.
     """
-    check_integer("frames", frames, 1)
-    check_integer("image_size", image_size, 32)
+    check_integer("frames", frames, 1, MOST_FRAMES)
+    check_integer("image_size", image_size, 32, MOST_PIXELS)
     check_integer("seed", seed, 0)
     check_integer("depth_bits", depth_bits, 1, 10)
     models, out = list_models(folder), Path(out)

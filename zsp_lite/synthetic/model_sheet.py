@@ -97,7 +97,7 @@ def write_contact_sheet(
         folder=str(folder), views=list(VIEWS), rows=rows, unusable=unusable, models_file=MODELS_FILE,
         colours={axis: f"rgb{colour}" for axis, colour in AXIS_COLOURS.items()},
     )  # fmt: skip
-    write_atomic(path, page.encode())
+    write_atomic(path, page.encode(errors="replace"))
     return unusable
 
 

@@ -20,6 +20,7 @@ from zsp_lite.synthetic.sequences import RenderedSequence, Renderer, render_sequ
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 JPEG_QUALITY = 88
+MOST_FRAMES, MOST_PIXELS = 10_000, 4096  # of a sequence; of a side of an image
 
 
 @runtime_checkable

@@ -99,7 +99,7 @@ def write_report(
     """
     path = Path(path)
     page = render_page(results, data, data_note, backbone, photograph, path.parent)
-    write_atomic(path, page.encode())
+    write_atomic(path, page.encode(errors="replace"))
     return path
 
 

@@ -1,0 +1,290 @@
+"""Fuzzing of everything that reads files: damaged and invented files must be read or refused by InputError.
+
+    python -m tests.fuzzing --seconds 600             hypothesis, new inputs in every run
+    python -m tests.fuzzing --atheris "point cloud"   atheris (pip install 'zsp-lite[fuzz]'), guided by coverage
+
+tests/test_fuzzing.py runs the same targets for some seconds with the same inputs each time.
+"""
+
+import argparse
+import gzip
+import json
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))  # the helpers of the tests
+
+import cv2
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import save
+
+from zsp_lite.backbones.checkpoints import read_checkpoint
+from zsp_lite.benchmark.results import read_results
+from zsp_lite.benchmark.summary import summarise_rows
+from zsp_lite.data.annotations import SEQUENCES_FILE, SequenceAnnotation, decode, decompress, read_frame_index
+from zsp_lite.data.frames import read_depth, read_image
+from zsp_lite.data.labels import parse_label
+from zsp_lite.errors import InputError
+from zsp_lite.importers import READERS
+from zsp_lite.io.ply import read_ply
+
+ROOT = Path(tempfile.mkdtemp(prefix="fuzzing-"))  # every target overwrites its own files
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        read: Reads the content of a file.
+        seed: A valid content; text formats are mutated as bytes, JSON also as values.
+        is_json: Whether the content is JSON.
+    """
+
+    read: Callable[[bytes], object]
+    seed: bytes
+    is_json: bool = False
+
+
+def _file(name: str, read: Callable[[Path], object], pack: Callable[[bytes], bytes] = lambda data: data):
+    path = ROOT / name
+
+    def run(data: bytes):
+        path.write_bytes(pack(data))
+        return read(path)
+
+    return run
+
+
+def _gzip(data: bytes) -> bytes:
+    return gzip.compress(data, 1)
+
+
+def _frames(path: Path) -> None:
+    index = read_frame_index(path)
+    for position in range(len(index.keys)):
+        index.frame(position)
+
+
+def _capture(layout: str, name: str, others: dict[str, bytes]):
+    """Reader of a capture of which one file is fuzzed."""
+    root = ROOT / f"{layout} {Path(name).stem}"
+    for part in ("rgb", "depth"):
+        (root / part).mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(root / "rgb/0.png"), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(root / "depth/0.png"), np.full((24, 32), 1000, np.uint16))
+    for other, content in others.items():
+        (root / other).write_bytes(content)
+    options = {"intrinsics": (30.0, 30.0, 16.0, 12.0)} if layout == "tum" else {}
+
+    def run(data: bytes):
+        (root / name).write_bytes(data)
+        for frame in READERS[layout](root, **options)[:3]:
+            frame.load()
+
+    return run
+
+
+def _png(bits: bytes) -> bytes:
+    """A 16-bit PNG of fuzzed values: damage of the file itself would only reach the checksums."""
+    values = np.frombuffer(bits[: 2 * (len(bits) // 2)], np.uint16)
+    return cv2.imencode(".png", values[:, None])[1].tobytes() if len(values) else bits
+
+
+def _header(text: bytes) -> bytes:
+    """A .safetensors file with a fuzzed header."""
+    return struct.pack("<Q", len(text)) + text + bytes(8)
+
+
+_EYE = np.eye(4).tolist()
+_FRAME = {
+    "sequence_name": "a", "frame_number": 1, "frame_timestamp": 0.1, "image": {"path": "a.jpg", "size": [24, 32]},
+    "depth": {"path": "d.png", "scale_adjustment": 1.0, "mask_path": None}, "mask": {"path": "m.png", "mass": 5.0},
+    "viewpoint": {"R": np.eye(3).tolist(), "T": [0, 0, 1], "focal_length": [2, 2], "principal_point": [0, 0]},
+}  # fmt: skip
+_SEQUENCE = {"sequence_name": "a", "category": "cup", "point_cloud": {"path": "p.ply", "quality_score": 1.0}}
+_NERF = {
+    "fl_x": 30, "cx": 16, "cy": 12, "w": 32, "h": 24, "k1": 0.1,
+    "frames": [{"file_path": "rgb/0.png", "depth_file_path": "depth/0.png", "transform_matrix": _EYE}],
+}  # fmt: skip
+_KEYS = [f"cup/a:{i}/b:0,1" for i in range(4)]
+_SUMMARY = summarise_rows({"ours": {key: {"error": float(i)} for i, key in enumerate(_KEYS)}})
+_RESULTS = {
+    "summary": {"data": {"root": "d", "categories": ["cup"], "pairs": 4, "targets": 2}, "backbone": "n", **_SUMMARY},
+    "settings": {"data": "d", "backbone": "n 0", "targets": 2, "seed": 0, "methods": {}}, "invocations": [],
+    "pairs": _KEYS, "rows": {"ours": {"pair": [0, 1, 2, 3], "error": [0.0, 1.0, 2.0, 3.0]}},
+}  # fmt: skip
+_PLY = "ply\nformat {} 1.0\nelement vertex 3\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
+_TENSORS = save({"a": np.zeros(2, np.float32)})
+
+
+def _text(content: object) -> bytes:
+    return json.dumps(content).encode()
+
+
+TARGETS: dict[str, Target] = {
+    "frame annotations": Target(_file("frames.jgz", _frames, _gzip), _text([_FRAME]), True),
+    "sequence annotations": Target(
+        _file(SEQUENCES_FILE, lambda path: decode(decompress(path), list[SequenceAnnotation], path), _gzip),
+        _text([_SEQUENCE]), True,
+    ),
+    "gzip": Target(_file("annotations.jgz", _frames), _gzip(_text([_FRAME]))),
+    "label": Target(
+        lambda data: parse_label(data, "label"), _text({"trans": _EYE, "seq": "b", "reference_seq": "a"}), True
+    ),
+    "point cloud": Target(_file("ascii.ply", read_ply), (_PLY.format("ascii") + "0 0 0\n1 0 0\n0 1 0\n").encode()),
+    "binary point cloud": Target(
+        _file("binary.ply", read_ply),
+        _PLY.format("binary_little_endian").encode() + np.eye(3, dtype="<f4").tobytes(),
+    ),
+    "depth": Target(_file("depth.png", read_depth, _png), np.arange(0, 65535, 999, np.uint16).tobytes()),
+    "image": Target(
+        _file("image.jpg", read_image), cv2.imencode(".jpg", np.zeros((9, 9, 3), np.uint8))[1].tobytes()
+    ),
+    "header of a checkpoint": Target(
+        _file("header.safetensors", read_checkpoint, _header), _TENSORS[8 : 8 + int.from_bytes(_TENSORS[:8], "little")],
+        True,
+    ),
+    "checkpoint": Target(_file("whole.safetensors", read_checkpoint), _TENSORS),
+    "tum": Target(
+        _capture("tum", "groundtruth.txt", {"rgb.txt": b"0.0 rgb/0.png\n", "depth.txt": b"0.0 depth/0.png\n"}),
+        b"# time tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n",
+    ),
+    "tum list": Target(
+        _capture(
+            "tum", "rgb.txt", {"groundtruth.txt": b"0.0 0 0 0 0 0 0 1\n", "depth.txt": b"0.0 depth/0.png\n"}
+        ),
+        b"0.0 rgb/0.png\n0.5 rgb/0.png\n",
+    ),
+    "nerfstudio": Target(_capture("nerfstudio", "transforms.json", {}), _text(_NERF), True),
+    "results": Target(_file("r.json.gz", read_results, _gzip), _text(_RESULTS), True),
+}  # fmt: skip
+
+
+def check(name: str, data: bytes) -> bool:
+    """Read a content. Returns whether it was accepted; raises what is no InputError."""
+    try:
+        TARGETS[name].read(data)
+    except InputError as error:
+        assert "\n" not in str(error) or "\n" in data.decode(errors="replace"), error
+        return False
+    return True
+
+
+_STRANGE = st.sampled_from(
+    [
+        b"",
+        b"\0",
+        b"\xff",
+        b"-1",
+        b"1e308",
+        b"1e-300",
+        b"NaN",
+        b"9" * 30,
+        b"[",
+        b"{",
+        b'"',
+        b"\n",
+        b"#",
+        b"/../",
+        b"\xed\xa0\x80",
+    ]
+)
+
+
+@st.composite
+def mutated(draw, seed: bytes) -> bytes:
+    """A content with parts that were replaced, removed or repeated."""
+    data = seed
+    for _ in range(draw(st.integers(1, 4))):
+        start = draw(st.integers(0, len(data)))
+        end = min(len(data), start + draw(st.integers(0, 12)))
+        part = draw(_STRANGE | st.binary(max_size=8) | st.just(data[start:end] * 3))
+        data = data[:start] + part + data[end:]
+    return data
+
+
+_NUMBERS = st.integers() | st.floats() | st.sampled_from([10**30, 1e308, -1e308, 1e155, 1e-300, 0, -1, 2**63, 1 << 53])
+_VALUES = st.recursive(
+    st.none() | st.booleans() | _NUMBERS | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@st.composite
+def changed_json(draw, seed: bytes) -> bytes:
+    """A JSON document of which one or two values were replaced, or members removed."""
+    content = json.loads(seed)
+    for _ in range(draw(st.integers(1, 2))):
+        places = list(_places(content))
+        parent, key = places[draw(st.integers(0, len(places) - 1))]
+        if draw(st.integers(0, 4)) == 0:
+            del parent[key]
+        else:
+            parent[key] = draw(_VALUES)
+        if not content:
+            break
+    return json.dumps(content).encode()
+
+
+def _places(content):
+    """The members of a JSON document, as (object or list, key or index)."""
+    for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+        yield content, key
+        if isinstance(value, dict | list):
+            yield from _places(value)
+
+
+def inputs(name: str) -> st.SearchStrategy[bytes]:
+    """Contents for a target."""
+    target = TARGETS[name]
+    return mutated(target.seed) | changed_json(target.seed) if target.is_json else mutated(target.seed)
+
+
+def run(name: str, examples: int, derandomize: bool) -> None:
+    """Read many contents; the first that raises another error than InputError is printed in its smallest form."""
+    options = dict(
+        deadline=None, database=None, derandomize=derandomize, suppress_health_check=list(HealthCheck),
+        phases=(Phase.explicit, Phase.generate, Phase.shrink),
+    )  # fmt: skip
+
+    @settings(max_examples=examples, **options)
+    @given(inputs(name))
+    def test_one(data: bytes) -> None:
+        check(name, data)
+
+    test_one()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--atheris", choices=list(TARGETS), metavar="TARGET", help=", ".join(TARGETS))
+    arguments = parser.parse_args()
+    if arguments.atheris:
+        import atheris
+
+        def test_one(data: bytes) -> None:
+            check(arguments.atheris, data)
+
+        atheris.instrument_all()
+        atheris.Setup([sys.argv[0], f"-max_total_time={arguments.seconds:.0f}"], test_one)
+        return atheris.Fuzz()
+    end, rounds = time.monotonic() + arguments.seconds, 0
+    while time.monotonic() < end:
+        for name in TARGETS:
+            run(name, 200, derandomize=False)
+        rounds += 1
+    print(f"{rounds * 200} inputs of each of {len(TARGETS)} kinds: read, or refused by InputError")
+
+
+if __name__ == "__main__":
+    main()
