@@ -1,6 +1,7 @@
 """A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
 
 from collections.abc import Iterator, Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -9,9 +10,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
-from zsp_lite.backbones.huggingface import HuggingFaceViT, nearest_multiple
+from zsp_lite.backbones.huggingface import nearest_multiple
 from zsp_lite.backbones.precision import Precision, autocast, supported_precision
-from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.backbones.vit import Tokens
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import FeatureMap
 
@@ -21,11 +22,26 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
+@runtime_checkable
+class TransformerNetwork(Protocol):
+    """A `torch.nn.Module` with these members, such as `vit.VisionTransformer`, which documents them."""
+
+    image_size: int
+    patch_size: int
+    embed_dim: int
+    depth: int
+    num_heads: int
+
+    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int, facet: Facet) -> Tokens:
+        """Compute patch descriptors, CLS attention and CLS output."""
+        ...
+
+
 class Backbone:
     """Vision transformer as feature extractor of the method (section 4.1).
 
     Args:
-        model: Network with `extract(images, layer, facet)`.
+        model: Network.
         name: Name used in tables and reports.
         layer: Block that describes the patches (see `block_index`). Default: block 9 counted from 0, or the last block
             of a shallower network. The paper writes "the 9th ViT layer"; its published code counts from 0.
@@ -53,7 +69,7 @@ class Backbone:
 
     def __init__(
         self,
-        model: VisionTransformer | HuggingFaceViT,
+        model: TransformerNetwork,
         name: str,
         layer: int | str | None = None,
         saliency_heads: Sequence[int] | None = None,

@@ -9,15 +9,17 @@ import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.checkpoints import build_vit, metadata_integer, metadata_integers, read_checkpoint
+from zsp_lite.backbones.checkpoints import build_vit, load_weights, metadata_integer, metadata_integers, read_checkpoint
 from zsp_lite.backbones.combined import CombinedBackbone, is_combination, parse_combination
 from zsp_lite.backbones.convolutional import ConvolutionalBackbone, ConvolutionalNetwork
 from zsp_lite.backbones.efficientnet import EfficientNetLite0
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
+from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
 from zsp_lite.backbones.precision import Precision
 from zsp_lite.backbones.pretrained import available_backbones, check_geometry, download, using, verify_download
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import plain_name
 
 # Convolutional networks with trained weights, by name. `pretrained.PACKAGED` says where the weights are.
 CONVOLUTIONAL: dict[str, Callable[[], ConvolutionalNetwork]] = {"effnet-lite0": EfficientNetLite0}
@@ -142,8 +144,16 @@ def load_backbone(
         )
     with using(name, path):
         weights, metadata = read_checkpoint(path)
+        photo_input = None
+        if TRANSFORMER in metadata:
+            photo_input, photo_path, path = weights, path, _transformer_beside(path, metadata)
+            weights, metadata = read_checkpoint(path)
         model = build_vit(weights, num_heads or metadata_integer(metadata, "num_heads", path), path.name)
         check_geometry(name, model)
+        if photo_input is not None:
+            model = PhotoInformedViT(model)
+            load_weights(model.photo_input, photo_input, photo_path.name)
+            options |= {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}  # the network normalises its parts' inputs
     block = metadata_integer(metadata, "key_block", path) if layer is None else layer
     if saliency_heads is None:
         saliency_heads = metadata_integers(metadata, "saliency_heads", path)
@@ -166,6 +176,14 @@ def verify(name_or_path: str | Path) -> None:
         backbone([ramp])
     except InputError as error:
         raise InputError(f"{name_or_path}: {error}") from error
+
+
+def _transformer_beside(path: Path, metadata: dict[str, str]) -> Path:
+    """Return the file of the transformer that a photo input belongs to; it is in the same folder."""
+    transformer = path.with_name(plain_name(metadata[TRANSFORMER], f"checkpoint {path}: transformer"))
+    if not transformer.is_file():
+        raise InputError(f"{path} is the photo input of {transformer.name}, expected that file beside it")
+    return transformer
 
 
 def _refuse(name: str, reason: str, **options) -> None:

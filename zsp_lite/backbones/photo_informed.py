@@ -19,7 +19,7 @@ from zsp_lite.backbones.facets import Facet
 from zsp_lite.backbones.vit import Tokens, VisionTransformer
 
 BLOCK, CHANNELS = 10, 112  # of EfficientNet-Lite0: the last map of stride 16
-PHOTO_INPUT = ("key_mean", "projection.linear.weight", "projection.linear.bias")  # weights beside those of the parts
+TRANSFORMER = "transformer"  # key of the metadata of a photo input: file name of its transformer
 DETAIL = 2  # sides of the photo network's images, as a multiple of the transformer's
 
 
@@ -36,6 +36,20 @@ class PhotoProjection(nn.Module):
         return self.linear(F.layer_norm(features.flatten(2).transpose(1, 2), (CHANNELS,)))
 
 
+class PhotoInput(nn.Module):
+    """What a photo-informed transformer has beside its two parts; the content of its file.
+
+    Attributes:
+        projection: Maps the photo network's features to tokens.
+        key_mean: Mean key of each block, which is subtracted from the keys.
+    """
+
+    def __init__(self, depth: int, dim: int):
+        super().__init__()
+        self.projection = PhotoProjection(dim)
+        self.register_buffer("key_mean", torch.zeros(depth, dim))
+
+
 class PhotoInformedViT(nn.Module):
     """Vision transformer with the features of EfficientNet-Lite0 added to its patch tokens.
 
@@ -45,22 +59,20 @@ class PhotoInformedViT(nn.Module):
     Attributes:
         image_size, patch_size, embed_dim, depth, num_heads: As those of `VisionTransformer`; image_size and patch_size
             are in pixels of the larger image.
-        projection: Maps the photo network's features to tokens.
-        key_mean: Mean key of each block, which is subtracted from the keys.
     """
 
     def __init__(self, vit: VisionTransformer):
         super().__init__()
-        self.vit, self.photo_network, self.projection = vit, EfficientNetLite0(), PhotoProjection(vit.embed_dim)
+        self.vit, self.photo_network = vit, EfficientNetLite0()
+        self.photo_input = PhotoInput(vit.depth, vit.embed_dim)
         self.image_size, self.patch_size = DETAIL * vit.image_size, DETAIL * vit.patch_size
         self.embed_dim, self.depth, self.num_heads = vit.embed_dim, vit.depth, vit.num_heads
-        self.register_buffer("key_mean", torch.zeros(vit.depth, vit.embed_dim))
 
     def inputs(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"]]:
         """Return the transformer's images, and the features to add to its patch tokens."""
-        added = self.projection(self.photo_network.features(images, BLOCK))
+        added = self.photo_input.projection(self.photo_network.features(images, BLOCK))
         return normalize(F.avg_pool2d(images, DETAIL)), added
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
@@ -72,4 +84,4 @@ class PhotoInformedViT(nn.Module):
         """
         small, added = self.inputs(images)
         tokens = self.vit.extract(small, layer, facet, added)
-        return replace(tokens, keys=tokens.keys - self.key_mean[layer]) if facet == "key" else tokens
+        return replace(tokens, keys=tokens.keys - self.photo_input.key_mean[layer]) if facet == "key" else tokens

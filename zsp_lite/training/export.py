@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, normalize
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.backbones.photo_informed import PHOTO_INPUT, PhotoInformedViT
+from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
 from zsp_lite.backbones.pretrained import TINY
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -60,14 +60,14 @@ def export_photo_input(model: Trainee, renders: RenderSet, backbone: Path, path:
         The path.
     """
     network = PhotoInformedViT(load_backbone(backbone, "cpu").model)
-    network.projection.load_state_dict(model.photo_projection.state_dict())
+    network.photo_input.projection.load_state_dict(model.photo_projection.state_dict())
     parts = _export_images(renders, network.image_size).split(8)
     for part in parts:
         x, _ = network.vit.embed(*network.inputs(part))
-        for mean, activations in zip(network.key_mean, network.vit.run_blocks(x), strict=True):
+        for mean, activations in zip(network.photo_input.key_mean, network.vit.run_blocks(x), strict=True):
             mean += activations.key[:, 1:].mean((0, 1)) / len(parts)
-    weights = {name: network.state_dict()[name].half() for name in PHOTO_INPUT}
-    return _write(weights, {"name": path.stem}, path)
+    weights = {name: value.half() for name, value in network.photo_input.state_dict().items()}
+    return _write(weights, {"name": path.stem, TRANSFORMER: backbone.name}, path)
 
 
 def export_convolutional(network: nn.Module, path: Path) -> Path:
