@@ -196,18 +196,19 @@ def test_safetensors_bring_their_settings_and_arguments_override_them(vit, pictu
     assert (other.layer, other.saliency_heads) == (0, (3,))
 
 
-def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
-    monkeypatch.setattr(pretrained, "TINY", tmp_path / "zsp-tiny.safetensors")
-    with pytest.raises(InputError, match="zsp-lite train"):
-        load_backbone()
-    save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "4"})
-    digest = hashlib.sha256((tmp_path / "zsp-tiny.safetensors").read_bytes()).hexdigest()
-    (tmp_path / "SHA256SUMS").write_text(f"{digest}  zsp-tiny.safetensors\n")
-    assert load_backbone().name == "zsp-tiny"
-    assert available_backbones()["zsp-tiny"] == tmp_path / "zsp-tiny.safetensors"
-    save_file(vit.state_dict(), tmp_path / "zsp-tiny.safetensors", metadata={"num_heads": "2"})
+def test_an_embedded_backbone_is_found_by_its_name_and_checked(vit, tmp_path, monkeypatch):
+    path = tmp_path / "zsp-tiny.safetensors"
+    monkeypatch.setattr(pretrained, "WEIGHTS", tmp_path)
+    monkeypatch.setitem(pretrained.EMBEDDED, "zsp-tiny", path)
+    with pytest.raises(InputError, match="zsp-tiny.safetensors is missing; reinstall zsp-lite"):
+        load_backbone("zsp-tiny")
+    save_file(vit.state_dict(), path, metadata={"num_heads": "4"})
+    (tmp_path / "SHA256SUMS").write_text(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  zsp-tiny.safetensors\n")
+    assert load_backbone("zsp-tiny").name == "zsp-tiny"
+    assert available_backbones()["zsp-tiny"] == path
+    save_file(vit.state_dict(), path, metadata={"num_heads": "2"})
     with pytest.raises(InputError, match="zsp-tiny.safetensors is damaged: its SHA-256 is .*, expected .* as in SHA25"):
-        load_backbone()
+        load_backbone("zsp-tiny")
 
 
 class Harmful:

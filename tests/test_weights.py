@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
+from zsp_lite.backbones.efficientnet import weights_file
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.backbones.pretrained import SUMS, TINY, check_shipped
+from zsp_lite.backbones.pretrained import EMBEDDED, SUMS, TINY, WEIGHTS, check_shipped
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.extractors import random_backbone
 from zsp_lite.data.co3d import Co3D
@@ -22,16 +23,21 @@ from zsp_lite.training.recipe import CONTINUATION
 from zsp_lite.views import object_crop, patch_mask
 
 
-def test_the_file_is_small_and_in_half_precision():
-    assert TINY.stat().st_size <= 12e6
-    with safe_open(TINY, "pt") as file:
-        assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
+def test_the_files_are_small_and_in_half_precision():
+    """The default backbone has at most 30 MB of weights, those of the photo network included."""
+    for path in EMBEDDED.values():
+        assert path.stat().st_size <= 12e6
+        with safe_open(path, "pt") as file:
+            assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
+    parts = EMBEDDED["zsp-tiny-photo"], TINY, weights_file()
+    assert sum(path.stat().st_size for path in parts) <= 30e6
 
 
 def test_the_digests_of_all_shipped_weights_are_those_of_the_files():
-    """After a change of the weights: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS."""
-    files = sorted(TINY.parent.glob("*.safetensors"))
-    assert [line.split()[1] for line in (TINY.parent / SUMS).read_text().splitlines()] == [path.name for path in files]
+    """After a change of the weights: cd zsp_lite/weights && sha256sum *.safetensors */*.safetensors > SHA256SUMS."""
+    files = sorted(WEIGHTS.rglob("*.safetensors"))
+    listed = [line.split()[1] for line in (WEIGHTS / SUMS).read_text().splitlines()]
+    assert sorted(listed) == sorted(path.relative_to(WEIGHTS).as_posix() for path in files)
     for path in files:
         check_shipped(path)
 

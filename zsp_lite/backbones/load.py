@@ -17,7 +17,7 @@ from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
 from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
 from zsp_lite.backbones.precision import Precision
-from zsp_lite.backbones.pretrained import available_backbones, check_geometry, download, using, verify_download
+from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, check_geometry, download, using, verify_download
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name
 
@@ -42,7 +42,7 @@ class BackboneConfig:
 
 
 def load_backbone(
-    name_or_path: str | Path | BackboneConfig = "zsp-tiny",
+    name_or_path: str | Path | BackboneConfig = DEFAULT,
     device: str | torch.device | None = None,
     *,
     num_heads: int | None = None,
@@ -58,8 +58,8 @@ def load_backbone(
     Args:
         name_or_path: One of:
 
-            - a name of `available_backbones`: "zsp-tiny" (part of the package), or a DINO model such as "dino_vits8",
-              which is downloaded to `cache_folder()` on first use;
+            - a name of `available_backbones`: "zsp-tiny-photo" or "zsp-tiny" (part of the package), or a DINO model
+              such as "dino_vits8", which is downloaded to `cache_folder()` on first use;
             - "effnet-lite0", a convolutional network trained with ImageNet's class labels, which has no saliency;
             - a checkpoint in the DINO layout: a .safetensors file, or a torch file of tensors only, also nested under
               "teacher", "state_dict" or "model";

@@ -1,5 +1,5 @@
-"""Backbones that have a name: the embedded "zsp-tiny", the DINO models released by Caron et al. (2021), and networks
-whose weights are files of other packages.
+"""Backbones that have a name: the embedded ones, the DINO models released by Caron et al. (2021), and networks whose
+weights are files of other packages.
 
 The SHA-256 of the package's own weights are in weights/SHA256SUMS. Of the released models only the first digits of an
 MD5 digest were published, which can be forged: the sizes of the network are compared with the release's, and the
@@ -21,8 +21,16 @@ from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash, pinned
 from zsp_lite.io.files import read_bytes, sha256
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
-TINY = Path(__file__).parents[1] / "weights" / "zsp-tiny.safetensors"
-SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS
+WEIGHTS = Path(__file__).parents[1] / "weights"
+TINY = WEIGHTS / "zsp-tiny.safetensors"
+# Networks that this project trained. The folder `earlier` is part of the repository only, not of the wheel.
+EMBEDDED = {
+    "zsp-tiny-photo": WEIGHTS / "zsp-tiny-photo.safetensors",
+    "zsp-tiny": TINY,
+    "zsp-tiny-primitives": WEIGHTS / "earlier" / "zsp-tiny-primitives.safetensors",
+}
+DEFAULT = "zsp-tiny-photo"
+SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensors */*.safetensors > SHA256SUMS
 _GROWTH = 1.1  # of a file compared with its weights in float32: names, and the parts of training
 
 
@@ -75,7 +83,7 @@ PACKAGED = {"effnet-lite0": efficientnet.weights_file}
 
 def available_backbones() -> dict[str, Path | None]:
     """Return the names of all backbones with their file, or None if it is not downloaded or installed."""
-    paths = {"zsp-tiny": TINY} | {name: weights.path for name, weights in PRETRAINED.items()}
+    paths = EMBEDDED | {name: weights.path for name, weights in PRETRAINED.items()}
     found = {name: path if path.is_file() else None for name, path in paths.items()}
     for name, weights_file in PACKAGED.items():
         try:
@@ -99,10 +107,10 @@ def download(name: str) -> Path:
     """
     if name.startswith(PREFIX):
         return model_folder(name)
-    if name == "zsp-tiny":
-        if not TINY.is_file():
-            raise InputError(f"zsp-tiny: {TINY.name} is not in the package; `zsp-lite train` makes it")
-        return TINY
+    if name in EMBEDDED:
+        if not EMBEDDED[name].is_file():
+            raise InputError(f"{name}: {EMBEDDED[name]} is missing; reinstall zsp-lite, or take it from the repository")
+        return EMBEDDED[name]
     if name in PACKAGED:
         return PACKAGED[name]()
     if name not in PRETRAINED:
@@ -112,7 +120,7 @@ def download(name: str) -> Path:
         return fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=weights.most_bytes)
     except InputError as error:
         raise InputError(
-            f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use zsp-tiny"
+            f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use {DEFAULT}"
         ) from error
 
 
@@ -122,16 +130,16 @@ def using(name: str, path: Path) -> AbstractContextManager:
     Raises:
         InputError: The file of the package is not that of SHA256SUMS, or a released one is not that of its first use.
     """
-    if path == TINY:
+    if path in EMBEDDED.values():
         check_shipped(path)
     return pinned(path) if name in PRETRAINED else nullcontext()
 
 
 def check_shipped(path: Path) -> None:
     """Raise InputError if a file of weights in the package is not the one that SHA256SUMS beside it lists."""
-    lines = read_bytes(path.with_name(SUMS), "digests").decode().splitlines()
+    lines = read_bytes(WEIGHTS / SUMS, "digests").decode().splitlines()
     digests = {name: digest for digest, name in (line.split(maxsplit=1) for line in lines)}
-    expected, found = digests.get(path.name, "none"), sha256(path, "weights")
+    expected, found = digests.get(path.relative_to(WEIGHTS).as_posix(), "none"), sha256(path, "weights")
     if found != expected:
         raise InputError(f"{path} is damaged: its SHA-256 is {found}, expected {expected} as in {SUMS}; reinstall it")
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     help="Sequences to label.",
 )  # fmt: skip
 @click.option("--guess", is_flag=True, help="Propose each alignment by pose estimation first.")
-@click.option("--backbone", metavar="NAME", default="zsp-tiny", help="Backbone of --guess, as for `benchmark`.")
+@click.option("--backbone", metavar="NAME", default="zsp-tiny-photo", help="Backbone of --guess, as for `benchmark`.")
 @click.option("--list", "list_only", is_flag=True, help="Print the progress of every sequence, and exit.")
 @click.option("--contact-sheet", type=PATH, metavar="PNG", help="Draw the candidate sequences into a file, and exit.")
 def label(

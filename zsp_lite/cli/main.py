@@ -271,7 +271,7 @@ def list_weights() -> None:
     from zsp_lite.backbones.pretrained import available_backbones
 
     for name, path in available_backbones().items():
-        print(f"{name:12} {path or f'not downloaded: zsp-lite weights fetch {name}'}")
+        print(f"{name:19} {path or f'not downloaded: zsp-lite weights fetch {name}'}")
 
 
 @weights.command(epilog=examples("weights fetch dino_vits8", "weights fetch hf:facebook/dinov2-small"))

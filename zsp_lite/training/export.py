@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, normalize
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
-from zsp_lite.backbones.pretrained import TINY
+from zsp_lite.backbones.pretrained import EMBEDDED
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import MEAN, STD
@@ -89,7 +89,7 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
     Args:
         config: Configuration of the run.
         source: The checkpoint.pt of a run of `train`, whose averaged weights are taken; an exported .safetensors file;
-            or "zsp-tiny". Exported weights have no heads.
+            or the name of an embedded transformer, such as "zsp-tiny". Exported weights have no heads.
 
     Raises:
         InputError: If the file does not exist, is damaged, or has a network of another size.
@@ -120,7 +120,7 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
 
 def weights_file(source: str | Path) -> Path:
     """Return the path of a source of `starting_weights`."""
-    return TINY if str(source) == "zsp-tiny" else Path(source).expanduser()
+    return EMBEDDED.get(str(source), Path(source).expanduser())
 
 
 @torch.no_grad()
