@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast_tiny
 from zsp_lite.baselines.rootsift import RootSift
@@ -24,6 +25,8 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "none": lambda backbone: None,  # for rows that use depth only
     "backbone": lambda backbone: backbone,
     "random": lambda backbone: random_backbone(backbone),
+    "zsp-tiny": lambda backbone: load_backbone("zsp-tiny"),
+    "effnet-lite0": lambda backbone: load_backbone("effnet-lite0"),
     "rootsift": lambda backbone: RootSift(),
     "sift": lambda backbone: Sift(),
     "swav": lambda backbone: load_swav(),

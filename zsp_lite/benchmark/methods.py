@@ -122,6 +122,10 @@ METHODS: dict[str, Method] = {
     "posecontrast-tiny": Method("posecontrast-tiny", solve=baseline_rows.posecontrast_tiny),
     # Table 2 and supplement, "Number of target views".
     **_numbers_of_views(),
+    # What photographs add: the embedded transformer alone, and a network supervised by ImageNet's class labels alone.
+    "tiny": Method("zsp-tiny"),
+    "tiny-mask": Method("zsp-tiny", settings=_MASK),
+    "effnet-mask": Method("effnet-lite0", settings=_MASK),
     # Beyond the paper.
     "ours-adaptive": Method(settings={"adaptive_threshold": True}),
     **_verified_rows(),
@@ -141,6 +145,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
+    "photographs": ("tiny", "ours", "effnet-mask", "tiny-mask", "ours-mask"),
     "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
     "verified-ablations": ("ours", "verified", *(f"verified-{name}" for name in (
         "mask", "n1", "nosilhouette", "nofreespace", "noview", "simonly", "forward", "nofeatures", "noicp",
