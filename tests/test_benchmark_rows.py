@@ -150,7 +150,7 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features(monkeypatch):
 def test_rows_of_the_embedded_networks_use_their_own_features():
     """Whatever the backbone of the run: the small transformer, and a convolutional network with the true mask."""
     rows = resolve("photographs")
-    made = extractors.make_extractors(None, {row.features for row in rows.values()} - {"backbone"})
+    made = extractors.make_extractors(lambda images: [], {row.features for row in rows.values()} - {"backbone"})
     names = {name: made[row.features].name for name, row in rows.items() if row.features != "backbone"}
     assert names == {"tiny": "zsp-tiny", "effnet-mask": "effnet-lite0", "tiny-mask": "zsp-tiny"}
     assert rows["effnet-mask"].settings["foreground"] == rows["tiny-mask"].settings["foreground"] == "mask"
