@@ -132,7 +132,7 @@ def estimate_pose(
     targets: int = 5,
     mask: str | None = None,
     intrinsics: tuple[float, ...] | None = None,
-    backbone: str | BackboneConfig | FeatureExtractor = "zsp-tiny",
+    backbone: str | BackboneConfig | FeatureExtractor = "zsp-tiny-photo",
     out: str | Path | None = None,
 ) -> OwnPair:
     """Estimate the pose between two objects of one category, each named by a path.

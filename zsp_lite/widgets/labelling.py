@@ -30,7 +30,7 @@ def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> "VB
 
     Args:
         labelling: Session to continue.
-        backbone: Backbone of the button "guess"; zsp-tiny by default, loaded when needed.
+        backbone: Backbone of the button "guess"; the default of `load_backbone`, loaded when needed.
 
     Returns:
         Widget with the attributes `controls`, `buttons`, `views` (two canvases), `tables`, `message`, and `name` (the
@@ -121,7 +121,7 @@ class _LabellingWidget:
         from zsp_lite.backbones.load import load_backbone
         from zsp_lite.labelling.guess import guess_alignment
 
-        self.backbone = self.backbone or load_backbone("zsp-tiny")
+        self.backbone = self.backbone or load_backbone()
         sim3, confidence = guess_alignment(
             labelling.dataset, self.backbone, labelling.category, labelling.reference, sequence
         )
