@@ -109,7 +109,9 @@ def camera_from_pose(
     left, _, right = np.linalg.svd(rotation)
     rotation = left @ right
     try:
-        return Camera(rotation.T, -rotation.T @ pose[:3, 3], np.array(focal_length), np.array(principal_point), size)
+        return Camera(
+            rotation.T, -rotation.T @ pose[:3, 3], np.array(focal_length, float), np.array(principal_point, float), size
+        )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
