@@ -61,6 +61,7 @@ html_math_renderer = "mathml"
 html_copy_source = False  # the sources of the exercises hold their solutions
 html_show_sourcelink = False
 html_domain_indices = False
+html_context = {"default_mode": "auto"}  # light or dark as in the system
 html_theme_options = {
     "repository_url": course_repository,
     "use_repository_button": bool(course_repository),

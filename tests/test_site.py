@@ -1,0 +1,193 @@
+"""The course site (`make site`): every link leads somewhere, notebooks are complete, solutions stay out."""
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import nbformat
+import pytest
+
+import zsp_lite
+
+REPOSITORY = Path(__file__).parents[1]
+NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
+EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
+URLS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"].get("urls", {})
+
+
+class Page(HTMLParser):
+    """Links, loaded files, anchors and pictures of an HTML page."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.links, self.loaded, self.anchors, self.pictures, self.text = [], [], set(), [], ""
+        self.html = path.read_text(encoding="utf-8")
+        self.feed(self.html)
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.anchors |= {attributes[key] for key in ("id", "name") if attributes.get(key)}
+        if tag == "a" and "href" in attributes:
+            self.links.append(attributes["href"])
+        elif tag in ("img", "script", "iframe") and "src" in attributes:
+            self.loaded.append(attributes["src"])
+        elif tag == "link" and attributes.get("rel") not in ("next", "prev", "canonical", "search", "index"):
+            self.loaded.append(attributes["href"])
+        if tag == "img":
+            self.pictures.append(attributes)
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Folder with the built site. A warning of Sphinx, such as an unknown link in a source, is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
+    command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
+    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return folder / "html"
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    """All pages by their path in the site; the theme keeps templates of its own in _static/."""
+    paths = [path for path in sorted(site.rglob("*.html")) if "_static" not in path.parts]
+    return {str(path.relative_to(site)): Page(path) for path in paths}
+
+
+@pytest.fixture(scope="module")
+def course():
+    """The site's extension of Sphinx, as a module."""
+    spec = importlib.util.spec_from_file_location("course", REPOSITORY / "docs" / "site" / "course.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def page_of(notebook: Path) -> str:
+    return str(notebook.relative_to(REPOSITORY).with_suffix(".html"))
+
+
+pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
+
+
+def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_every_anchor_to_an_element(site, pages):
+    broken = []
+    for name, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            path = ((site / name).parent / unquote(parts.path)).resolve() if parts.path else site / name
+            target = pages.get(str(path.relative_to(site.resolve()))) if path.suffix == ".html" else None
+            anchor = unquote(parts.fragment)
+            if not path.is_file() or (anchor and target and anchor not in target.anchors):
+                broken.append(f"{name}: {link}")
+    assert not broken, "\n".join(broken)
+
+
+def test_no_page_loads_anything_from_elsewhere(site, pages):
+    for name, page in pages.items():
+        for source in page.loaded:
+            path = urlsplit(source)
+            assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_shows_its_stored_pictures_with_their_texts_and_what_it_printed(pages, path):
+    page = pages[page_of(path)]
+    outputs = [output for cell in nbformat.read(path, 4).cells for output in cell.get("outputs", [])]
+    texts = [output.metadata[form]["alt"] for output in outputs for form in output.get("data", {}) if "image/" in form]
+    shown = [picture["alt"] for picture in page.pictures]
+    assert [text for text in shown if text in texts] == texts
+    widgets = [output for output in outputs if "application/vnd.jupyter.widget-view+json" in output.get("data", {})]
+    assert page.html.count("Interactive in a running notebook") == len(widgets)
+    assert len(shown) <= len(texts) + len(widgets) and all(len(text) > 20 for text in shown)
+    for output in outputs:
+        if output.output_type == "stream" and output.text.strip():
+            assert output.text.strip().splitlines()[0].strip() in page.text
+
+
+def test_figures_of_plotly_are_drawn_and_only_their_pages_load_its_script(pages):
+    stored = {page_of(path) for path in NOTEBOOKS if "application/vnd.plotly.v1+json" in path.read_text()}
+    drawn = {name for name, page in pages.items() if "Plotly.newPlot" in page.html}
+    loading = {name for name, page in pages.items() if any("plotly.min.js" in source for source in page.loaded)}
+    assert stored and stored == drawn == loading
+
+
+def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guides_for_marking(site, pages):
+    for path in EXERCISES:
+        source = "\n".join(cell.source for cell in nbformat.read(path, 4).cells)
+        hidden = re.compile(r"### BEGIN (?:SOLUTION|HIDDEN TESTS)\n(.*?)### END", re.DOTALL)
+        shown = hidden.sub("", source)
+        lines = {line.strip() for part in hidden.findall(source) for line in part.splitlines()}
+        secrets = {line for line in lines if len(line) > 25 and line not in shown}
+        copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
+        for text in (pages[page_of(path)].text, "\n".join(cell.source for cell in copy.cells)):
+            assert "raise NotImplementedError" in text and len(secrets) > 10
+            assert not [secret for secret in secrets if secret in text], path.name
+    for path in site.rglob("*"):
+        if path.suffix in (".html", ".ipynb", ".js", ".txt"):
+            assert not re.search("BEGIN (SOLUTION|HIDDEN TESTS)|Guide for marking", path.read_text(encoding="utf-8")), (
+                path.name
+            )
+
+
+def test_previous_and_next_follow_the_reading_path(pages):
+    for before, path, after in zip(NOTEBOOKS, NOTEBOOKS[1:], NOTEBOOKS[2:]):
+        page = pages[page_of(path)].html
+        assert re.search(rf'rel="prev" title="[^"]*" href="{before.stem}.html"', page), path.stem
+        assert re.search(rf'rel="next" title="[^"]*" href="{after.stem}.html"', page), path.stem
+
+
+def test_the_reading_path_names_every_notebook_and_exercise(pages):
+    links = set(pages["docs/index.html"].links)
+    for path in (*NOTEBOOKS, *EXERCISES):
+        assert f"../{page_of(path)}" in links, path.name
+
+
+def test_the_reference_describes_every_public_class_and_function(pages):
+    anchors = set().union(*(page.anchors for name, page in pages.items() if name.startswith("docs/api/")))
+    for name in zsp_lite.__all__:
+        thing = getattr(zsp_lite, name)
+        if hasattr(thing, "__qualname__"):
+            assert f"{thing.__module__}.{thing.__qualname__}" in anchors, name
+
+
+def test_every_notebook_can_be_downloaded_and_opens_in_colab_only_if_the_repository_has_an_address(site, pages):
+    for path in (*NOTEBOOKS, *EXERCISES):
+        page = pages[page_of(path)]
+        assert any(link.endswith(f"run/{path.relative_to(REPOSITORY)}") for link in page.links), path.name
+        assert ("colab.research.google.com" in page.html) == ("Repository" in URLS), path.name
+        copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
+        assert ("google.colab" in copy.cells[0].source) == ("Repository" in URLS), path.name
+
+
+def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(course):
+    address = "https://github.com/someone/zsp"
+    links = course.run_links("notebooks/00_quickstart", address)
+    branch = f"https://colab.research.google.com/github/someone/zsp/blob/{course.BRANCH}"
+    assert f'href="{branch}/run/notebooks/00_quickstart.ipynb"' in links
+    assert 'href="https://codespaces.new/someone/zsp"' in links
+    stored = nbformat.read(NOTEBOOKS[0], 4)
+    first, *others = course.runnable(stored, address).cells
+    assert others == stored.cells
+    assert f"git clone --quiet --depth 1 {address} /content/zsp\n" in first.source
+    assert "%cd /content/zsp/notebooks\n" in first.source
+    # Outside Colab the cell does nothing: its commands are lines of IPython, indented below the condition.
+    assert re.match(r'# .*\nimport sys\n\nif "google.colab" in sys.modules:\n(( {4}.*)?\n)+$', first.source)
+
+
+def test_the_dev_container_installs_the_pinned_environment():
+    container = json.loads((REPOSITORY / ".devcontainer" / "devcontainer.json").read_text())
+    assert container["postCreateCommand"] == "make .venv/.installed"
+    assert "STAMP := $(VENV)/.installed\n" in (REPOSITORY / "Makefile").read_text()
