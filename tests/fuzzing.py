@@ -17,7 +17,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))  # the helpers of the tests
+if "--atheris" in sys.argv:  # it instruments modules when they are imported
+    import atheris
+
+    with atheris.instrument_imports(include=["zsp_lite", "trimesh"]):
+        import trimesh.exchange.ply  # noqa: F401
+
+        import zsp_lite.backbones.checkpoints
+        import zsp_lite.benchmark.results
+        import zsp_lite.importers  # noqa: F401
 
 import cv2
 import numpy as np
@@ -270,13 +278,14 @@ def main() -> None:
     parser.add_argument("--atheris", choices=list(TARGETS), metavar="TARGET", help=", ".join(TARGETS))
     arguments = parser.parse_args()
     if arguments.atheris:
-        import atheris
 
         def test_one(data: bytes) -> None:
             check(arguments.atheris, data)
 
-        atheris.instrument_all()
-        atheris.Setup([sys.argv[0], f"-max_total_time={arguments.seconds:.0f}"], test_one)
+        corpus = ROOT / "corpus"
+        corpus.mkdir()
+        (corpus / "seed").write_bytes(TARGETS[arguments.atheris].seed)
+        atheris.Setup([sys.argv[0], f"-max_total_time={arguments.seconds:.0f}", str(corpus)], test_one)
         return atheris.Fuzz()
     end, rounds = time.monotonic() + arguments.seconds, 0
     while time.monotonic() < end:
