@@ -53,7 +53,7 @@ def site(tmp_path_factory):
     options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
     command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
     result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+    assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"
     return folder / "html"
 
 

@@ -29,7 +29,7 @@ include_patterns = [
     "notebooks/exercises/source/*/*.ipynb",
     "notebooks/results/*/README.md",
     "data_samples/ATTRIBUTION.md",
-    "zsp_lite/weights/MODEL_CARD.md",
+    "zsp_lite/**.md",
 ]
 # Sphinx walks through every folder that is not excluded.
 _sources = {"docs", "notebooks", "data_samples", "zsp_lite"}
