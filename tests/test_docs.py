@@ -120,7 +120,7 @@ def test_the_page_on_installation_lists_every_extra():
     listed = re.findall(
         r"^\| `pip install 'zsp-lite\[(\w+)\]'`", markdown(REPOSITORY / "docs" / "install.md"), re.MULTILINE
     )
-    assert {*listed} == {*extras} - {"test", "dev"}
+    assert {*listed} == {*extras} - {"test", "dev", "fuzz"}
 
 
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
@@ -128,13 +128,19 @@ def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
     runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
     (publish,), (install,) = runs.pop("publish"), runs.pop("install")
     assert 'pip" install .' in install and install.strip().endswith('zsp-lite" demo')
-    assert runs == {"test": ["make test"], "avx2": ["make test"], "site": ["make site"], "browser": ["make browser"]}
+    assert runs == {
+        "test": ["make test"],
+        "avx2": ["make test"],
+        "site": ["make site"],
+        "browser": ["make browser"],
+        "hostile": ["make fuzz", "make hostile"],
+    }
     assert "gh-pages" in publish and jobs["publish"]["needs"] == ["test", "site"]
     assert (
         jobs["publish"]["if"] == "github.event_name == 'push'" and jobs["publish"]["permissions"]["contents"] == "write"
     )
     assert jobs["avx2"]["env"] == {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
-    assert {"test", "site", "browser"} <= set(
+    assert {"test", "site", "browser", "fuzz", "hostile"} <= set(
         re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
     )
     assert (REPOSITORY / ".ci" / "run").read_text().endswith("exec make test\n")

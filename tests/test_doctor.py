@@ -124,7 +124,7 @@ def test_the_doctor_knows_every_extra_but_those_of_developers():
     import tomllib
 
     project = tomllib.loads((samples.REPOSITORY / "pyproject.toml").read_text())["project"]
-    assert set(doctor.EXTRAS) == set(project["optional-dependencies"]) - {"test", "dev", "site"}
+    assert set(doctor.EXTRAS) == set(project["optional-dependencies"]) - {"test", "dev", "site", "fuzz"}
 
 
 def test_open3d_prints_nothing_in_a_notebook():
