@@ -14,6 +14,7 @@ import pytest
 
 from zsp_lite.data import samples
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.demo import example_pair
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.export import RENDERER
 
@@ -86,20 +87,23 @@ def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     calls = []
 
-    def export(preset, out, progress):
-        calls.append((preset, sorted(path.name for path in out.iterdir() if not path.name.startswith("."))))
+    def synth(command, check):
+        out = command[-1]
+        out.mkdir(parents=True, exist_ok=True)
+        calls.append((command[1:-1], sorted(path.name for path in out.iterdir())))
         (out / f"made {len(calls)}").touch()
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsp_lite.synthetic.export.export_preset", export)
+    monkeypatch.setattr(samples.subprocess, "run", synth)
     with pytest.raises(KeyboardInterrupt):
         samples.sample_data()
     made = tmp_path / "cache" / f"samples-{RENDERER}"
     assert samples.find_sample_data() == made and not made.exists()
     assert samples.sample_data() == made
     assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
-    assert samples.sample_data() == made and calls == [("demo", []), ("demo", ["made 1"])]
+    command = ["-m", "zsp_lite", "synth", "--preset", "demo", "--out"]
+    assert samples.sample_data() == made and calls == [(command, []), (command, ["made 1"])]
 
 
 def test_a_missing_data_folder_names_the_command_that_makes_one(tmp_path):
@@ -117,5 +121,5 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
 
 
 def test_the_example_pair_of_other_data_is_the_first(ellipsoids):
-    pair = samples.example_pair(ellipsoids)
+    pair = example_pair(ellipsoids)
     assert pair.category == "ellipsoid" and len(pair.target_frames) == 5

@@ -24,7 +24,7 @@ _TWICE = "May be given twice: for REFERENCE, then for TARGET."
 
 @click.command(
     epilog=examples(
-        "estimate data_samples/bicycle/bmx data_samples/bicycle/tricycle",
+        "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
         "estimate my_cup.jpg other_cup.jpg --intrinsics 600,600,320,240 --solver both",
         "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",

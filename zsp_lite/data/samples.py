@@ -5,15 +5,15 @@
 
 import logging
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zsp_lite.errors import InputError
 
 if TYPE_CHECKING:
-    from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.frames import Frame
-    from zsp_lite.data.pairs import Pair
 
 logger = logging.getLogger(__name__)
 
@@ -67,43 +67,19 @@ def sample_data() -> Path:
     folder = find_sample_data()
     if folder.is_dir():
         return folder
-    from tqdm import tqdm
-
-    from zsp_lite.io.locks import writing
-    from zsp_lite.synthetic.export import export_preset
-
     part = folder.with_name(folder.name + ".part")
     # A warning, because a program without logging settings shows nothing else.
-    logger.warning(
-        "No data_samples/ here: making synthetic samples in %s, once, as `zsp-lite synth --preset demo` does", folder
-    )
+    logger.warning("No data_samples/ here: making synthetic samples in %s, once", folder)
     try:
-        with writing(part):
-            export_preset("demo", part, progress=lambda jobs: tqdm(jobs, "making samples", disable=None))
+        # A process of its own, because this package is below the one that makes data.
+        subprocess.run([sys.executable, "-m", "zsp_lite", "synth", "--preset", "demo", "--out", part], check=True)
         part.rename(folder)
-    except OSError as error:
+    except (OSError, subprocess.CalledProcessError) as error:
         raise InputError(
             f"samples cannot be made in {folder} ({error}); set ZSP_LITE_CACHE to a folder that can be written, or "
             f"{DATA_VARIABLE} to a data folder"
         ) from error
     return folder
-
-
-def example_pair(dataset: "Co3D") -> "Pair":
-    """Return a pair of the sample data for a first try.
-
-    Of `data_samples/`, this is a pair of bicycles that is chosen by its result: the first of the stored pairs with five
-    targets whose error with zsp-tiny is below 15 degrees. Of other data, it is the first pair of the first category.
-
-    Raises:
-        InputError: The data has no pose labels.
-    """
-    from zsp_lite.data.pairs import Pair
-    from zsp_lite.demo import demo_pairs
-
-    chosen = Pair("bicycle", "bmx", 9, "tricycle", (5, 9, 14, 19, 0))
-    folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))
-    return chosen if all(folder.is_dir() for folder in folders) else demo_pairs(dataset)[0]
 
 
 def motorcycle_photograph() -> "Frame":
