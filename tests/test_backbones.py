@@ -268,7 +268,7 @@ def test_metadata_that_is_not_a_number_is_refused(vit, tmp_path):
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones():
-    with pytest.raises(InputError, match="'resnet'.*zsp-tiny, dino_vits8"):
+    with pytest.raises(InputError, match="'resnet'.*zsp-tiny-photo, zsp-tiny, .*dino_vits8"):
         load_backbone("resnet")
 
 

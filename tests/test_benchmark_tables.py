@@ -26,7 +26,7 @@ from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, i
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
-from zsp_lite.benchmark.summary import category_of, objects_of, weights_of_pairs
+from zsp_lite.benchmark.summary import category_of, objects_of, summarise_run, weights_of_pairs
 from zsp_lite.benchmark.tables import (
     PUBLISHED,
     THIS_RUN,
@@ -334,7 +334,8 @@ def test_exports_of_the_stored_run_can_be_pooled(tmp_path):
     paths = []
     for part in (0, 1):
         rows = {"ours": dict(list(stored.rows["ours"].items())[part:200:2])}
-        paths.append(export_results(replace(stored, rows=rows), tmp_path / f"{part}.json.gz"))
+        summary = summarise_run(rows, {}, stored.summary["data"], stored.summary["backbone"])
+        paths.append(export_results(replace(stored, rows=rows, summary=summary), tmp_path / f"{part}.json.gz"))
     row = read_runs(paths).summary["methods"]["ours"]
     errors = list(stored.errors("ours").values())[:200]
     assert row["n"] == 200 and row["acc30"] == pytest.approx(100 * np.mean(np.array(errors) < 30))
@@ -418,9 +419,14 @@ def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     rng = np.random.default_rng(0)
     sure = rng.random(200)
     right = rng.random(200) < sure
-    rows = {f"chair/{i}": {"error": 5.0 if ok else 90.0, "confidence": c} for i, (c, ok) in enumerate(zip(sure, right))}
-    both = {"ours": {"chair/0": {"error": 1.0}}, "verified": rows}
-    results = read_results(export_results(Results({}, {}, [], both), tmp_path / "results.json.gz"))
+    rows = {
+        f"chair/a:{i}/b:0,1": {"error": 5.0 if ok else 90.0, "confidence": c}
+        for i, (c, ok) in enumerate(zip(sure, right, strict=True))
+    }
+    both = {"ours": {"chair/a:0/b:0,1": {"error": 1.0}}, "verified": rows}
+    data = {"root": "", "categories": ["chair"], "pairs": 200, "targets": 2}
+    written = Results(summarise_run(both, {}, data, "none"), {}, [], both)
+    results = read_results(export_results(written, tmp_path / "results.json.gz"))
     assert results.confidences("ours") == {}
     np.testing.assert_allclose(list(results.confidences("verified").values()), sure, atol=1e-4)
     figure = reliability_diagram(results)

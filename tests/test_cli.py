@@ -194,7 +194,7 @@ def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypat
     monkeypatch.setenv("COLUMNS", "200")
     ask = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "1", "--targets", "1", "--methods", "ours-bv"]
     ask += ["--out", str(tmp_path)]
-    chosen = ["--layer", "-1", "--facet", "token", "--image-size", "60"]
+    chosen = ["--backbone", "zsp-tiny", "--layer", "-1", "--facet", "token", "--image-size", "60"]
     assert cli.main([*ask, *chosen, "--workers", "2"]) == 0
     assert "zsp-tiny (block11, token, 60 px)" in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text())["backbone"] == "zsp-tiny (block11, token, 60 px)"
@@ -218,7 +218,7 @@ def test_layer_facet_and_size_reach_the_backbone_of_the_demo(ellipsoids, tmp_pat
     demo = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
     assert cli.main([*demo, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
     assert cli.main([*demo, "--backbone", "dino_vits8"]) == 0
-    assert loaded == [BackboneConfig("zsp-tiny", "block3", "value", 96), "dino_vits8"]
+    assert loaded == [BackboneConfig("zsp-tiny-photo", "block3", "value", 96), "dino_vits8"]
 
 
 def test_synth_writes_a_co3d_folder(tmp_path):

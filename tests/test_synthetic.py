@@ -377,7 +377,7 @@ def test_presets_consist_of_evaluation_categories():
     ("arguments", "named"),
     [
         ((["sofa"], 1, 1, 0), "sofa"),
-        ((["chair"], 0, 1, 0), "expected at least 1"),
+        ((["chair"], 0, 1, 0), "sequences is 0, expected an integer from 1"),
         ((["chair"], 1, 1, 0, 64, "v3"), "v3"),
     ],
 )

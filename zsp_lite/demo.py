@@ -50,7 +50,8 @@ def example_pair(dataset: Co3D) -> Pair:
     """Return a pair of the sample data for a first try.
 
     Of `data_samples/`, this is a pair of motorcycles that is chosen by its result: the first of the stored pairs with
-    five targets whose error with zsp-tiny-photo is below 15 degrees. Of other data, it is the first pair of the first category.
+    five targets whose error with zsp-tiny-photo is below 15 degrees. Of other data, it is the first pair of the first
+    category.
 
     Raises:
         InputError: The data has no pose labels.
