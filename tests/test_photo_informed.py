@@ -1,14 +1,18 @@
 """The transformer that receives the features of a photo network: its input, its training, export and loading."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
+from zsp_lite.backbones import pretrained
 from zsp_lite.backbones.backbone import normalize
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.photo_informed import DETAIL, PhotoInformedViT
+from zsp_lite.backbones.pretrained import EMBEDDED, SUMS, TINY, WEIGHTS
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import MEAN, STD, sample_batch
@@ -88,6 +92,27 @@ def test_a_photo_input_without_its_transformer_is_refused(exported, tmp_path):
     save_file(weights, exported.with_name("other.safetensors"), metadata={"transformer": "zsp-tiny.safetensors"})
     with pytest.raises(InputError, match="other.safetensors: 1 weights do not fit .* key_mean: expected .2, 48."):
         load_backbone(exported.with_name("other.safetensors"), "cpu")
+
+
+def test_image_sizes_are_those_of_both_networks():
+    """Multiples of 32, which EfficientNet needs, not of the patches of 16 pixels."""
+    backbone = load_backbone("zsp-tiny-photo", "cpu", image_size=240)
+    assert backbone.image_size == 256
+    assert backbone([np.zeros((60, 60, 3), np.uint8)])[0].grid == (16, 16)
+
+
+def test_the_shipped_transformer_behind_a_photo_input_is_checked(monkeypatch, tmp_path):
+    for path in [EMBEDDED["zsp-tiny-photo"], TINY, WEIGHTS / SUMS]:
+        shutil.copy(path, tmp_path)
+    monkeypatch.setattr(pretrained, "WEIGHTS", tmp_path)
+    for name in ("zsp-tiny-photo", "zsp-tiny"):
+        monkeypatch.setitem(EMBEDDED, name, tmp_path / EMBEDDED[name].name)
+    load_backbone("zsp-tiny-photo", "cpu")
+    data = bytearray(EMBEDDED["zsp-tiny"].read_bytes())
+    data[-1000] ^= 1
+    EMBEDDED["zsp-tiny"].write_bytes(data)
+    with pytest.raises(InputError, match="^[^\n]*zsp-tiny.safetensors is damaged: its SHA-256 is [^\n]*$"):
+        load_backbone("zsp-tiny-photo", "cpu")
 
 
 def test_training_moves_the_photo_input_and_leaves_the_photo_network(renders):

@@ -24,7 +24,10 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 @runtime_checkable
 class TransformerNetwork(Protocol):
-    """A `torch.nn.Module` with these members, such as `vit.VisionTransformer`, which documents them."""
+    """A `torch.nn.Module` with these members, such as `vit.VisionTransformer`, which documents them.
+
+    A network whose images must have sides that are multiples of more than the patch size has an attribute `multiple`.
+    """
 
     image_size: int
     patch_size: int
@@ -52,8 +55,8 @@ class Backbone:
             float32 is used and a warning is logged.
         batch_size: Number of images in one forward pass.
         facet: Activation of the block used as descriptor; the paper's is "key".
-        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default: the
-            model's.
+        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size, or of the
+            model's `multiple`. Default: the model's.
         mean, std: Normalisation of RGB values in [0, 1].
 
     Attributes:
@@ -95,7 +98,8 @@ class Backbone:
         self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
         self.batch_size = batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
-        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
+        multiple = getattr(model, "multiple", model.patch_size)
+        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, multiple)
         self.device = choose_device(device)
         self.precision = supported_precision(precision, self.device.type)
         self.model = model.to(self.device).eval().requires_grad_(False)

