@@ -1,6 +1,7 @@
 """One's own pair: from paths to poses, report, point clouds, table and JSON, by the command and by the Python call."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,6 +77,22 @@ def test_the_report_has_the_answers_the_sources_and_the_errors(own):
         assert f"{solver} solver: rotation error {error:.1f}°" in text.replace("\n", "")
     assert "reference given with the images, target given with the images" in text
     assert "There is no label to compare with" not in text
+
+
+def test_a_path_that_is_not_utf8_is_written_and_the_clouds_come_before_the_report(own, tmp_path, monkeypatch):
+    found, _ = own
+    named = replace(found, result=replace(found.result, reference="capture \udcff"))
+    paths = named.write(tmp_path / "named")
+    assert [path.name for path in paths][:2] == ["report.html", "target.ply"]
+    assert "capture ?" in paths[0].read_text(encoding="utf-8")
+
+    def fail(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("zsp_lite.viz.report.write_pair_report", fail)
+    with pytest.raises(OSError, match="No space"):
+        found.write(tmp_path / "full")
+    assert len(list((tmp_path / "full").glob("*.ply"))) == 3
 
 
 def test_json_has_every_number_of_the_estimates(own):

@@ -17,7 +17,15 @@ from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pair_result import SOLVER_CHOICES, alternatives
 from zsp_lite.points import object_cloud
-from zsp_lite.viz.report import COLUMNS, _views_figure, render_page, table_rows, write_overview, write_report
+from zsp_lite.viz.report import (
+    COLUMNS,
+    _notebook_link,
+    _views_figure,
+    render_page,
+    table_rows,
+    write_overview,
+    write_report,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -37,6 +45,16 @@ def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
     assert list(results[0].errors) == ["paper", "verified"] and max(results[0].errors.values()) < 12
     assert results[0].error < 6 and results[0].disagreement < 15
     assert results[0].estimate.inliers.sum() > 20
+
+
+def test_a_notebook_on_another_drive_is_named_without_a_link(monkeypatch):
+    def fail(*arguments):
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    monkeypatch.setattr("zsp_lite.viz.report._project_url", lambda label: None)
+    assert 'href="notebooks/01_features.ipynb"' in _notebook_link("01_features", REPOSITORY)
+    monkeypatch.setattr("zsp_lite.viz.report.os.path.relpath", fail)
+    assert _notebook_link("01_features", REPOSITORY) == "notebook 01"
 
 
 def test_demo_pairs_are_deterministic(ellipsoids):

@@ -101,6 +101,11 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
         source.position(7)
 
 
+def test_a_source_named_by_a_dot_has_the_name_of_its_folder(ellipsoids, monkeypatch):
+    monkeypatch.chdir(ellipsoids.root / "ellipsoid/b")
+    assert open_source(".").name == "b"
+
+
 def test_an_image_is_read_with_the_files_beside_it(image, frames):
     source = open_source(image, INTRINSICS)
     assert (source.kind, source.mask, len(source)) == ("image", "given", 1)

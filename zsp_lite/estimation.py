@@ -109,19 +109,18 @@ class OwnPair:
         from zsp_lite.viz.report import write_pair_report
 
         out = Path(out)
-        report = write_pair_report(out / "report.html", self.result, self.backbone, self.masks)
         parts = [_coloured_points(frame) for frame in self.targets if not frame_defect(frame)]
         cloud = np.concatenate([frame_points for frame_points, _ in parts])
         colours = np.concatenate([frame_colours for _, frame_colours in parts])
         write_ply(out / "target.ply", cloud, colours)
-        paths = [report, out / "target.ply"]
+        paths = [out / "target.ply"]
         points, colours = _coloured_points(self.reference)
         points = self.reference.camera.to_camera(points)
         for solver, estimate in self.estimates.items():
             moved = self.targets[estimate.view].camera.to_world(estimate.sim3.apply(points))
             paths.append(out / f"aligned_{solver}.ply")
             write_ply(paths[-1], moved, colours)
-        return paths
+        return [write_pair_report(out / "report.html", self.result, self.backbone, self.masks), *paths]
 
 
 def estimate_pose(
@@ -181,7 +180,7 @@ def estimate_pose(
     estimates = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVER_CHOICES[solver])
     estimates = {name: _in_units(estimate, *scales) for name, estimate in estimates.items()}
     result = PairResult(
-        f"{first.path.name} to {second.path.name}", first.describe([position]), second.describe(positions), estimates,
+        f"{first.name} to {second.name}", first.describe([position]), second.describe(positions), estimates,
         _errors(first, second, frame, frames, estimates), tuple(loaded[k] for k in shown),
     )  # fmt: skip
     pair = OwnPair(result, frame, tuple(frames), (first.mask, second.mask), getattr(model, "name", str(backbone)))

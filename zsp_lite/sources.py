@@ -46,6 +46,11 @@ class Source:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    @property
+    def name(self) -> str:
+        """Name of the sequence, the capture or the image; that of the folder itself where the path is "."."""
+        return Path(os.path.abspath(self.path)).name
+
     def describe(self, positions: Sequence[int]) -> str:
         """Name the source and its frames at some positions."""
         if self.kind == "image":

@@ -3,6 +3,9 @@
 import gzip
 import json
 
+import cv2
+import numpy as np
+
 from tests.hostile.cases_runs import _results, _write
 from tests.hostile.harness import Wrong, case, command
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown
@@ -42,6 +45,24 @@ def _reports(folder, name):
                 raise Wrong(f"script in {text[:200]}")
     return "written"
 
+
+def _pictures(folder):
+    """Two pictures of a disc with depth and mask, in a folder whose name is not UTF-8."""
+    (folder / "\udcff").mkdir()
+    y, x = np.mgrid[:64, :64]
+    disc = (y - 32) ** 2 + (x - 32) ** 2 < 24**2
+    depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
+    for name in ("a", "b"):
+        picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
+        for end, image in (("", picture), ("_depth", depth), ("_mask", 255 * disc.astype(np.uint8))):
+            write_bytes = (folder / "\udcff" / f"{name}{end}.png").write_bytes
+            write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+command(
+    "text", "estimate of pictures in a folder that is not UTF-8", "estimate", "ROOT/\udcff/a.png", "ROOT/\udcff/b.png",
+    "--intrinsics", "60,60,32,32", "--solver", "paper", "--out", "ROOT/\udcff/out", codes=(0,), change=_pictures,
+)  # fmt: skip
 
 for name in NAMES:
     case("text", f"reports of a run with {name[:20]!r}", lambda folder, name=name: _reports(folder, name), answers=True)

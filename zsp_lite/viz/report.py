@@ -137,7 +137,7 @@ def write_pair_report(path: str | Path, result: PairResult, backbone: str, masks
     names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found from the depth"}
     note = f"reference {names[masks[0]]}, target {names[masks[1]]}"
     page = _render([result], path.parent, backbone, data="", data_note=note, own=True, photograph=None)
-    write_atomic(path, page.encode())
+    write_atomic(path, page.encode(errors="replace"))
     return path
 
 
@@ -192,7 +192,10 @@ def _notebook_link(name: str, folder: Path) -> Markup:
     if site := _project_url("Documentation"):
         address = f"{site.rstrip('/')}/notebooks/{name}.html"
     elif local.is_file():
-        address = Path(os.path.relpath(local, folder)).as_posix()
+        try:
+            address = Path(os.path.relpath(local, folder)).as_posix()
+        except ValueError:  # on Windows, between drives
+            return label
     elif repository := _project_url("Repository"):
         address = f"{repository.rstrip('/')}/blob/main/notebooks/{name}.ipynb"
     else:
