@@ -13,6 +13,7 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite import errors
 from zsp_lite.backbones.load import BackboneConfig
+from zsp_lite.backbones.pretrained import EMBEDDED
 from zsp_lite.cli import doctor
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
@@ -100,7 +101,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--preset", "samples", "--frames", "3", "--out", "x"], "--category"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["train", "--start-from", "lost.pt", "--out", "x"], "lost.pt: no such file"),
+        (["train", "--start-from", "lost.pt", "--out", "x"], "or the name of an embedded transformer"),
         (["train", "--start-from", ".", "--out", "x"], ".: is a folder, expected a checkpoint of `train`"),
         (["train", "--shorten", "1e308", "--out", "x"], "1e+308"),
         (["train", "--self-distillation", "--start-from", "a", "--out", "x"], "--start-from"),
@@ -233,6 +234,19 @@ def test_weights_list_has_every_backbone(capsys):
     assert cli.main(["weights", "list"]) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
+
+
+def test_weights_that_are_not_in_the_wheel_are_said_to_be_in_the_repository(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(EMBEDDED, "zsp-tiny-primitives", tmp_path / "earlier" / "zsp-tiny-primitives.safetensors")
+    monkeypatch.setitem(EMBEDDED, "zsp-tiny", tmp_path / "zsp-tiny.safetensors")
+    assert cli.main(["weights", "list"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines["zsp-tiny-primitives"] == "only in the repository"
+    assert lines["zsp-tiny"] == "missing: reinstall zsp-lite"
+    assert cli.main(["weights", "fetch", "zsp-tiny-primitives"]) == 2
+    assert "zsp-tiny-primitives.safetensors is missing; these weights are only in the repository" in assert_one_line(
+        capsys
+    )
 
 
 def assert_one_line(capsys) -> str:

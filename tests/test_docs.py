@@ -120,7 +120,7 @@ def test_the_page_on_installation_lists_every_extra():
     listed = re.findall(
         r"^\| `pip install 'zsp-lite\[(\w+)\]'`", markdown(REPOSITORY / "docs" / "install.md"), re.MULTILINE
     )
-    assert {*listed} == {*extras} - {"test", "dev", "fuzz"}
+    assert {*listed} == {*extras} - {"test", "dev"}
 
 
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():

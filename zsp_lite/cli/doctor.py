@@ -131,14 +131,14 @@ def _open3d() -> Check:
 
 def _backbones() -> Iterator[Check]:
     try:
-        from zsp_lite.backbones.pretrained import EMBEDDED, available_backbones
+        from zsp_lite.backbones.pretrained import EMBEDDED, available_backbones, only_in_repository
     except (ImportError, OSError) as error:
         yield _not_importable("backbones", error, "fix the problems above first")
         return
     for name, path in available_backbones().items():
         if path is not None:
             yield Check(f"backbone {name}", OK, f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
-        elif name in EMBEDDED and "earlier" in EMBEDDED[name].parts:
+        elif only_in_repository(name):
             yield Check(f"backbone {name}", NOTE, "not part of the package", "it is in the repository")
         elif name in EMBEDDED:
             yield Check(f"backbone {name}", BAD, "its weights are missing in the package", "reinstall zsp-lite")

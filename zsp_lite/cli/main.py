@@ -267,11 +267,11 @@ def weights() -> None:
 
 @weights.command("list", epilog=examples("weights list"))
 def list_weights() -> None:
-    """List every backbone with its file, or the command that downloads it."""
-    from zsp_lite.backbones.pretrained import available_backbones
+    """List every backbone with its file, or where to get it."""
+    from zsp_lite.backbones.pretrained import available_backbones, obtained_by
 
     for name, path in available_backbones().items():
-        print(f"{name:19} {path or f'not downloaded: zsp-lite weights fetch {name}'}")
+        print(f"{name:19} {path or obtained_by(name)}")
 
 
 @weights.command(epilog=examples("weights fetch dino_vits8", "weights fetch hf:facebook/dinov2-small"))
@@ -308,7 +308,8 @@ def verify(name: str) -> None:
 @click.option("--renders", type=PATH, metavar="DIR", show_default="OUT/renders", help="Folder of the training renders.")
 @click.option(
     "--start-from", metavar="WEIGHTS",
-    help="Continue with the second part of the recipe from a run's checkpoint.pt, exported .safetensors, or zsp-tiny.",
+    help="Continue with the second part of the recipe from a run's checkpoint.pt, exported .safetensors, or the name "
+    "of an embedded transformer, such as zsp-tiny.",
 )  # fmt: skip
 @click.option(
     "--photo", is_flag=True,

@@ -97,7 +97,8 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
     path = weights_file(source)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{source}: {what}, expected a checkpoint of `train`, exported .safetensors, or zsp-tiny")
+        kinds = "a checkpoint of `train`, exported .safetensors, or the name of an embedded transformer"
+        raise InputError(f"{source}: {what}, expected {kinds}")
     trainee = Trainee(config)
     if path.suffix != ".safetensors":
         prefix, state = "average.", read_checkpoint(path)["task"]
