@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from model_files import write_quad
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -147,7 +148,10 @@ def test_weights_that_no_run_can_start_from_are_refused_before_a_folder_is_made(
         save_file(load_file(SHIPPED), heads, metadata=file.metadata() | dict(num_heads="3", saliency_heads="0"))
     damaged.write_bytes(b"cut off")
     for source, problem in (
-        ("zsp-tinny", "zsp-tinny: no such file, expected a checkpoint of `train`, exported .safetensors, or zsp-tiny"),
+        (
+            "zsp-tinny",
+            "zsp-tinny: no such file, expected a checkpoint of `train`, exported .safetensors, or the name",
+        ),
         (tmp_path, "is a folder, expected a checkpoint"),
         (heads, "heads.safetensors: a network of another shape, .*'num_heads': 3.* expected .*'num_heads': 6"),
         (damaged, "damaged.safetensors: damaged"),
@@ -216,6 +220,33 @@ def test_a_folder_with_another_configuration_is_refused(render_folder, renders, 
     (tmp_path / "config.json").write_text('{"seed": 5}')
     with pytest.raises(InputError, match="another configuration"):
         train(TINY, tmp_path, render_folder)
+
+
+@pytest.mark.parametrize(
+    "images", [np.zeros((2, 8, 8, 3)), np.zeros((2, 8, 8), np.uint8), np.zeros((0, 8, 8, 3), np.uint8)]
+)
+def test_other_arrays_than_photographs_are_refused_before_a_folder_is_made(images, tmp_path):
+    np.savez(tmp_path / "backgrounds.npz", images=images)
+    with pytest.raises(InputError, match=r"^backgrounds [^\n]* of shape [^\n]*expected uint8 of \(m, H, W, 3\)[^\n]*$"):
+        train(TINY, tmp_path / "run", backgrounds=tmp_path / "backgrounds.npz")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_resumed_with_its_own_backgrounds_and_models_only(renders, tmp_path, monkeypatch):
+    monkeypatch.setattr("zsp_lite.training.train.training_and_held_out", lambda *_: (renders, renders))
+    model = write_quad(tmp_path / "models" / "sign" / "square.obj")
+    for name, value in (("ours", 100), ("others", 101)):
+        np.savez(tmp_path / name, images=np.full((2, 24, 36, 3), value, np.uint8))
+    run, files = tmp_path / "run", {"models": tmp_path / "models", "backgrounds": tmp_path / "ours.npz"}
+    train(TINY, run, **files)
+    train(TINY, run, **files)
+    for changed in ({"backgrounds": tmp_path / "others.npz"}, {"backgrounds": None}, {"models": None}):
+        (name,) = changed
+        with pytest.raises(InputError, match=f"run with another configuration, {name} is "):
+            train(TINY, run, **files | changed)
+    model.write_text(model.read_text().replace("v -1 -1 0", "v -1 -2 0"))  # as many bytes
+    with pytest.raises(InputError, match="run with another configuration, models is "):
+        train(TINY, run, **files)
 
 
 def test_a_run_that_diverges_says_so(render_folder, renders, tmp_path):

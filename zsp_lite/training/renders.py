@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_arrays
+from zsp_lite.io.files import read_arrays, sha256
 from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.training.instances import ModelInstances, ProceduralInstances
@@ -191,6 +191,18 @@ def training_and_held_out(
     training = render_set(folder, objects, seed, shard, proportions=proportions, deformation=deformation, models=models)
     held_out = render_set(folder, shard, seed, shard, first=HELD_OUT)
     return load_render_set(training), load_render_set(held_out)
+
+
+def models_digest(models: Path) -> str:
+    """Return a checksum of the names and contents of all files of a folder of models.
+
+    Raises:
+        InputError: If there are no models, or a file cannot be read.
+    """
+    list_models(models)
+    files = sorted(path for path in Path(models).rglob("*") if path.is_file())
+    listed = [f"{path.relative_to(models).as_posix()} {sha256(path, 'model')}" for path in files]
+    return hashlib.sha256("\n".join(listed).encode()).hexdigest()
 
 
 def _digest(models: Path) -> str:

@@ -19,13 +19,14 @@ from torch import Tensor
 
 from zsp_lite.backbones.photo_informed import DETAIL
 from zsp_lite.backbones.precision import choose_precision
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_arrays
 from zsp_lite.training.batches import Batch, sample_batch
 from zsp_lite.training.export import export_checkpoint, export_photo_input, starting_weights, weights_file
 from zsp_lite.training.loop import Task, claim_folder, run
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, view_loss
 from zsp_lite.training.recipe import Stage, TrainingConfig
-from zsp_lite.training.renders import VIEWS, RenderSet, training_and_held_out
+from zsp_lite.training.renders import VIEWS, RenderSet, models_digest, training_and_held_out
 from zsp_lite.training.trainee import Trainee, fit_heads, initialise
 
 logger = logging.getLogger(__name__)
@@ -219,8 +220,9 @@ def train(
         Path of the exported weights; those of the photo input are beside it, if the run trained it.
 
     Raises:
-        InputError: If `folder` has a run with another configuration or other initial weights or a damaged checkpoint;
-            if `start_from` does not fit; if the training diverges.
+        InputError: If `folder` has a run with another configuration, other models, backgrounds or initial weights, or a
+            damaged checkpoint; if `start_from` does not fit; if `backgrounds` is not such a file; if the training
+            diverges.
     """
     folder = Path(folder)
     start, origin = None, None
@@ -228,11 +230,16 @@ def train(
     if start_from is not None and not (resumed and not weights_file(start_from).exists()):
         start = starting_weights(config, start_from)
         origin = hashlib.sha256(b"".join(start[name].numpy().tobytes() for name in sorted(start))).hexdigest()
-    claim_folder(folder, asdict(config))
+    photographs = None if backgrounds is None else read_backgrounds(backgrounds)
+    sources = {}
+    if photographs is not None:
+        sources["backgrounds"] = hashlib.sha256(str(photographs.shape).encode() + photographs.tobytes()).hexdigest()
+    if models is not None:
+        sources["models"] = models_digest(models)
+    claim_folder(folder, asdict(config) | sources)
     training, held_out = training_and_held_out(
         renders or folder / "renders", config.objects, config.seed, config.proportions, config.deformation, models
     )
-    photographs = None if backgrounds is None else read_arrays(backgrounds, ("images",), "backgrounds")[0]
     task = BackboneTraining(config, training, held_out, start, photographs)
     task.origin = origin
     run(task, folder, log, log_every, 10 * log_every, checkpoint_every)
@@ -241,3 +248,18 @@ def train(
     if config.photo_share:
         export_photo_input(model, held_out, written, folder / "zsp-tiny-photo.safetensors")
     return written
+
+
+def read_backgrounds(path: Path) -> UInt8[np.ndarray, "m height width 3"]:
+    """Return the photographs of a file that `tools/backgrounds.py` made.
+
+    Raises:
+        InputError: The file is damaged, or its images are not uint8 of shape (m, H, W, 3) with at least one image.
+    """
+    (images,) = read_arrays(path, ("images",), "backgrounds")
+    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3 or images.size == 0:
+        raise InputError(
+            f"backgrounds {path}: images are {images.dtype} of shape {images.shape}, expected uint8 of (m, H, W, 3) "
+            "with at least one image"
+        )
+    return images
