@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from co3d_folders import edit_json, sequence_data
+from co3d_folders import edit_json, random_camera, sequence_data
 
 from zsp_lite.backbones.checkpoints import build_vit, read_checkpoint
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.frames import read_image
+from zsp_lite.data.frames import Frame, read_image, resize_frame
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
@@ -97,6 +97,22 @@ def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, 
         read_image(path)
     monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", "14400")
     assert read_image(path).shape == (90, 160, 3)
+
+
+def test_the_limit_on_pixels_holds_for_resizing(monkeypatch):
+    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", "99")
+    whole = Frame(np.zeros((8, 8, 3), np.uint8), None, None, random_camera(0, (8, 8)))
+    assert resize_frame(whole, (9, 11)).camera.size == (9, 11)
+    with pytest.raises(InputError, match=r"\(10, 10\), expected at most 99 pixels"):
+        resize_frame(whole, (10, 10))
+
+
+@pytest.mark.parametrize("text", ["abc", "0", "-1", "1.5", " ", "\u0663", "9" * 5000])
+def test_a_limit_on_pixels_that_is_no_positive_whole_number_is_refused(tmp_path, monkeypatch, text):
+    (tmp_path / "x.png").write_bytes(cv2.imencode(".png", PICTURE)[1].tobytes())
+    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", text)
+    with pytest.raises(InputError, match="ZSP_LITE_MAX_PIXELS is .*, expected a positive whole number"):
+        read_image(tmp_path / "x.png")
 
 
 def test_a_frame_listed_twice_is_refused(tmp_path):

@@ -10,10 +10,23 @@ from jaxtyping import UInt8, UInt16
 
 from zsp_lite.errors import InputError
 
-MAX_PIXELS = 1 << 26  # the environment variable ZSP_LITE_MAX_PIXELS overrides it
+MAX_PIXELS = 1 << 26  # the environment variable overrides it
+PIXELS_VARIABLE = "ZSP_LITE_MAX_PIXELS"
 _NO_SIZE = (0xC4, 0xC8, 0xCC)  # the JPEG markers from 0xC0 to 0xCF that do not start a frame
 _DAMAGE = b"Corrupt JPEG data", b"Premature end of JPEG", b"Inconsistent progression"  # warnings of libjpeg
 _capturing = threading.Lock()
+
+
+def max_pixels() -> int:
+    """Return the largest number of pixels of an image: $ZSP_LITE_MAX_PIXELS, or `MAX_PIXELS`.
+
+    Raises:
+        InputError: The variable is not a positive whole number.
+    """
+    text = os.environ.get(PIXELS_VARIABLE) or str(MAX_PIXELS)
+    if not (text.isascii() and text.isdigit() and len(text) < 19 and int(text) > 0):
+        raise InputError(f"environment variable {PIXELS_VARIABLE} is {text!r}, expected a positive whole number")
+    return int(text)
 
 
 def decode_image(data: bytes, flags: int) -> UInt8[np.ndarray, "..."] | UInt16[np.ndarray, "..."]:
@@ -27,12 +40,12 @@ def decode_image(data: bytes, flags: int) -> UInt8[np.ndarray, "..."] | UInt16[n
         The image as OpenCV returns it.
 
     Raises:
-        InputError: The file is of another format, incomplete or damaged, or has more than `MAX_PIXELS` pixels.
+        InputError: The file is of another format, incomplete or damaged, or has more than `max_pixels()` pixels.
     """
     height, width = _size(data)
-    most = int(os.environ.get("ZSP_LITE_MAX_PIXELS", MAX_PIXELS))
+    most = max_pixels()
     if not 0 < height * width <= most:
-        raise InputError(f"{height} x {width} pixels, expected 1 to {most} pixels (ZSP_LITE_MAX_PIXELS)")
+        raise InputError(f"{height} x {width} pixels, expected 1 to {most} pixels ({PIXELS_VARIABLE})")
     # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
     # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
     is_jpeg = data[:2] == b"\xff\xd8"
