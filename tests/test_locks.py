@@ -12,7 +12,7 @@ from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.files import write_atomic
-from zsp_lite.io.locks import writing
+from zsp_lite.io.locks import LOCK, writing
 
 _HOLD = "import sys; from zsp_lite.io.locks import writing\nwith writing(sys.argv[1]): print(1, flush=True); input()"
 _STOP = (
@@ -64,6 +64,22 @@ def test_a_folder_in_which_nothing_was_written_is_removed(tmp_path):
 def test_a_folder_is_free_after_an_error(tmp_path):
     with pytest.raises(ZeroDivisionError), writing(tmp_path):
         raise ZeroDivisionError
+    with writing(tmp_path), pytest.raises(InputError, match="another process"), writing(tmp_path):
+        pass
+
+
+def test_a_lock_whose_file_was_removed_before_it_was_locked_does_not_count(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl", reason="Windows does not remove an open file")
+    lock = fcntl.flock
+
+    def remove_first(*options):  # as another writer that ends between the opening and the locking of the file
+        (tmp_path / LOCK).unlink()
+        monkeypatch.setattr(fcntl, "flock", lock)
+        return lock(*options)
+
+    monkeypatch.setattr(fcntl, "flock", remove_first)
+    with pytest.raises(InputError, match="another process"), writing(tmp_path):
+        pass
     with writing(tmp_path), pytest.raises(InputError, match="another process"), writing(tmp_path):
         pass
 

@@ -1,9 +1,10 @@
 """One writer per folder."""
 
-import sqlite3
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import make_folder
@@ -15,25 +16,26 @@ LOCK = ".writing.lock"
 def writing(folder: str | Path) -> Iterator[None]:
     """Be the only writer of a folder, which is made if it does not exist.
 
-    The lock is SQLite's, which works on every operating system and is released when the process ends, however it ends.
+    The lock is one of the operating system, which is released when the process ends, however it ends. Its file is
+    removed while it is locked. A lock on a file that another writer removed just before counts for nothing; the folder
+    is then taken as one that is written to.
 
     Raises:
         InputError: Another process writes to the folder, or the folder cannot be written.
     """
     new = not Path(folder).exists()
     folder = make_folder(folder, "folder")
-    try:
-        lock = sqlite3.connect(folder / LOCK, timeout=0)
-    except sqlite3.Error as error:
-        raise InputError(f"{folder / LOCK} cannot be opened for writing ({error}); choose another folder") from error
     with ExitStack() as opened:
         if new:
             opened.callback(_remove_if_empty, folder)  # after an error, before which nothing was written
-        opened.enter_context(closing(lock))
         try:
-            lock.execute("BEGIN EXCLUSIVE")
-        except sqlite3.Error as error:
-            raise InputError(f"{folder}: another process is writing to it, or it is not writable ({error})") from error
+            opened.enter_context(FileLock(folder / LOCK, timeout=0))
+        except Timeout as error:
+            raise InputError(f"{folder}: another process is writing to it") from error
+        except OSError as error:
+            raise InputError(
+                f"{folder / LOCK} cannot be opened for writing ({error}); choose another folder"
+            ) from error
         try:
             yield
         finally:
