@@ -108,6 +108,22 @@ def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_
     assert samples.sample_data() == made and calls == [(command, []), (command, ["made 1"])]
 
 
+@pytest.mark.parametrize("refused", [True, False])
+def test_samples_that_another_process_completed_meanwhile_are_taken(tmp_path, monkeypatch, refused):
+    monkeypatch.setattr(samples, "REPOSITORY", tmp_path / "nowhere")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    made = tmp_path / "cache" / f"samples-{RENDERER}"
+
+    def synth(command, check):
+        (made / "chair").mkdir(parents=True)
+        if refused:
+            raise subprocess.CalledProcessError(2, command)
+
+    monkeypatch.setattr(samples.subprocess, "run", synth)
+    assert samples.sample_data() == made and [path.name for path in made.iterdir()] == ["chair"]
+
+
 def test_a_missing_data_folder_names_the_command_that_makes_one(tmp_path):
     with pytest.raises(InputError, match="zsp-lite synth --preset demo --out"):
         Co3D(tmp_path / "nowhere")

@@ -62,7 +62,7 @@ def sample_data() -> Path:
     "demo" of `zsp-lite synth`). An interrupted call is completed by the next one.
 
     Raises:
-        InputError: Another process is making the samples, or the cache cannot be written.
+        InputError: Another process is still making the samples, or the cache cannot be written.
     """
     folder = find_sample_data()
     if folder.is_dir():
@@ -75,6 +75,8 @@ def sample_data() -> Path:
         subprocess.run([sys.executable, "-m", "zsp_lite", "synth", "--preset", "demo", "--out", part], check=True)
         part.rename(folder)
     except (OSError, subprocess.CalledProcessError) as error:
+        if folder.is_dir():  # another process has made them meanwhile
+            return folder
         raise InputError(
             f"samples cannot be made in {folder} ({error}); set ZSP_LITE_CACHE to a folder that can be written, or "
             f"{DATA_VARIABLE} to a data folder"
