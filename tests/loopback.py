@@ -16,12 +16,13 @@ class Server:
         knows_ranges: Whether Range headers are honoured.
         knows_head: Whether HEAD requests are answered.
         chunked: Whether the length is not sent.
+        surplus: Sent after the content.
     """
 
     def __init__(self, files: dict[str, bytes]):
         self.files, self.ranges, self.break_after, self.stall_after = files, [], None, None
         self.knows_ranges = self.knows_head = True
-        self.chunked = False
+        self.chunked, self.surplus = False, b""
         self.closed = threading.Event()
         outer = self
 
@@ -60,7 +61,7 @@ class Server:
                 limits = [one for one in (outer.break_after, outer.stall_after) if one is not None]
                 self.close_connection = True
                 try:
-                    self.wfile.write(content[start : min([end, *(start + one for one in limits)])])
+                    self.wfile.write(content[start : min([end, *(start + one for one in limits)])] + outer.surplus)
                     if outer.stall_after is not None:
                         outer.closed.wait()
                 except ConnectionError:  # the client closed the connection before the end

@@ -23,7 +23,7 @@ from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import Pair, write_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.io.remote import remote_size
+from zsp_lite.io.remote import RemoteFile, remote_size
 
 SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"
 LONG = 1 << 20  # bytes
@@ -222,6 +222,33 @@ def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, 
     assert "cannot be read: the connection was closed" in capsys.readouterr().err
     assert download(tmp_path / "v1", "--labelled-only", dataset="co3d-v1") == 2
     assert "--labelled-only goes with --labels" in capsys.readouterr().err
+
+
+def test_a_server_that_sends_more_than_was_asked_for_is_read_up_to_the_end_of_the_part(server):
+    server.chunked, server.surplus = True, bytes(1_000)
+    content = server.files["/toaster.zip"]
+    with RemoteFile(server.url + "/toaster.zip") as file:
+        assert (file.read(10), file.read(20)) == (content[:10], content[10:30])
+
+
+def test_a_category_without_published_labels_is_named(server, source, tmp_path, capsys):
+    for folder in ("class_labels", "determ_eval"):
+        shutil.copytree(source / folder, tmp_path / "clone" / folder)
+    (tmp_path / "clone/class_labels/toaster").rename(tmp_path / "clone/class_labels/chair")
+    options = ("--labels", str(tmp_path / "clone"), "--labelled-only")
+    assert download(tmp_path / "v1", *options, dataset="co3d-v1") == 2
+    assert "category 'toaster' has no labels in" in capsys.readouterr().err and not (tmp_path / "v1").exists()
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_an_archive_that_is_longer_than_expected_is_not_kept(server, tmp_path, capsys, monkeypatch, told):
+    server.chunked, server.surplus = True, bytes(1_000_000)
+    if not told:
+        monkeypatch.setattr(archives, "remote_size", lambda url: None)
+        monkeypatch.setattr(archives, "_LARGEST", {"co3d": len(server.files[CHUNKS[0]])})
+    assert download(tmp_path / "v2", "--chunks", "1") == 2
+    assert f"has more than {len(server.files[CHUNKS[0]])} bytes" in capsys.readouterr().err
+    assert files_of(tmp_path / "v2") == []
 
 
 def test_a_labelled_sequence_that_the_archive_lacks_is_named(server, source, tmp_path, capsys):

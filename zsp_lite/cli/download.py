@@ -72,6 +72,9 @@ def download(
         from zsp_lite.data.label_import import published_sequences
 
         labelled = published_sequences(labels, sha256, categories)
+        for name in categories:
+            if not labelled.get(name):
+                raise InputError(f"category {name!r} has no labels in {labels}, expected class_labels/{name}/SEQ.json")
         wanted = {one: co3d.missing_sequences(root, one, labelled.get(one.category, ())) for one in archives}
         missing = [one for one in archives if wanted[one]]
         sizes = [co3d.sequence_size(one, wanted[one]) for one in missing]

@@ -23,11 +23,14 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.download import fetch
 from zsp_lite.io.files import ARCHIVE_ERRORS, path_inside, read_bytes, write_atomic
 from zsp_lite.io.locks import writing
-from zsp_lite.io.remote import RemoteFile
+from zsp_lite.io.remote import RemoteFile, remote_size
 
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
+# Largest archive, bytes, where the server does not tell its size. A chunk of v2 has up to 20 GB; an archive of v1 has 28 GB
+# on average.
+_LARGEST = {"co3d": 22 * 10**9, "co3d-v1": 280 * 10**9}
 _PART = 1 << 22  # bytes of a request for a part of an archive
 _WORK = ".download"  # in the data folder: archives in progress, and the list of what is unpacked
 
@@ -191,7 +194,7 @@ def download_archives(
         missing = missing_archives(root, archives)
         # The chunk with the annotations comes last.
         for archive in sorted(missing, key=lambda one: (one.category, one.number == 0, one.number)):
-            path = fetch(archive.url, _archive_path(root, archive), digest=archive.sha256)
+            path = _fetch(root, archive)
             with _recorded(root, archive) as category, open(path, "rb") as file, _zip(file, str(path)) as zipped:
                 unpack(zipped, root, archive.category, str(path), progress=progress)
                 category.archives.append(archive.name)
@@ -274,6 +277,14 @@ def _members(
     if absent := sorted(set(sequences) - found):
         raise InputError(f"archive {where} has no sequence {absent[0]!r}, expected {len(sequences)} sequences")
     return [one for one in members if _is_annotation(one.filename) or one.filename.split("/")[1] in sequences]
+
+
+def _fetch(root: Path, archive: Archive) -> Path:
+    """Download an archive unless it is there, up to the size that the server tells."""
+    if (path := _archive_path(root, archive)).exists():
+        return path
+    size = remote_size(archive.url)
+    return fetch(archive.url, path, size, digest=archive.sha256, most=_LARGEST[archive.dataset])
 
 
 @contextmanager

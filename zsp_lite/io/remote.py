@@ -100,7 +100,7 @@ class RemoteFile(io.RawIOBase):
             if response.status != 206 or not response.headers.get("Content-Range", "").startswith(wanted):
                 raise InputError(f"{self.url}: the server does not send parts of files, expected range requests")
             try:
-                return response.read()
+                return response.read(end - self._position)  # a server may send more than was asked for
             except http.client.IncompleteRead as error:
                 return error.partial  # the next call reads on from there
 
