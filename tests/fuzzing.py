@@ -7,6 +7,7 @@ tests/test_fuzzing.py runs the same targets for some seconds with the same input
 """
 
 import argparse
+import atexit
 import gzip
 import json
 import struct
@@ -43,7 +44,9 @@ from zsp_lite.errors import InputError
 from zsp_lite.importers import READERS
 from zsp_lite.io.ply import read_ply
 
-ROOT = Path(tempfile.mkdtemp(prefix="fuzzing-"))  # every target overwrites its own files
+_FOLDER = tempfile.TemporaryDirectory(prefix="fuzzing-")
+atexit.register(_FOLDER.cleanup)
+ROOT = Path(_FOLDER.name)  # every target overwrites its own files
 
 
 @dataclass(frozen=True)
