@@ -28,8 +28,8 @@ from zsp_lite.io.remote import RemoteFile, remote_size
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
-# Largest archive, bytes, where the server does not tell its size. A chunk of v2 has up to 20 GB; an archive of v1 has 28 GB
-# on average.
+# Largest archive, bytes, where the server does not tell its size. A chunk of v2 has up to 20 GB; an archive of v1 has
+# 28 GB on average.
 _LARGEST = {"co3d": 22 * 10**9, "co3d-v1": 280 * 10**9}
 _PART = 1 << 22  # bytes of a request for a part of an archive
 _WORK = ".download"  # in the data folder: archives in progress, and the list of what is unpacked
