@@ -9,7 +9,7 @@ import pytest
 from model_files import write_quad
 from PIL import Image
 
-from tools import backgrounds
+from tools import backgrounds, credits
 from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from zsp_lite.errors import InputError
@@ -176,6 +176,20 @@ def test_every_background_may_be_shipped_and_names_its_author():
     free = {"CC0 1.0", "CC BY 2.0", "CC BY 3.0", "CC BY 4.0"}
     assert {picture.licence for picture in pictures} <= free
     assert all(picture.author and picture.licence_file for picture in pictures)
+
+
+def test_the_weights_name_every_work_that_they_were_trained_on():
+    """After a change of a catalogue: python tools/credits.py."""
+    page = credits.PAGE.read_text(encoding="utf-8")
+    assert page == credits.page()
+    text = " ".join(page.split())
+    models = [(name, entry) for models in read_catalogue(TRAINED).models.values() for name, entry in models.items()]
+    pictures = list(backgrounds.read_catalogue().pictures.items())
+    assert len(models) == 320 and pictures
+    for name, work in models + pictures:
+        assert f"**{work.author}**: " in text and " ".join((work.title or name.replace("_", " ")).split()) in text
+        assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
+    assert f"]({credits.PAGE.name})" in (credits.PAGE.parent / "MODEL_CARD.md").read_text(encoding="utf-8")
 
 
 def test_backgrounds_are_cut_from_the_files_of_the_catalogue_only(tmp_path):

@@ -31,8 +31,10 @@ except ModuleNotFoundError:  # run as a script
 
 LICENCES = {
     "CC0 1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
+    "CC BY 2.0": "https://creativecommons.org/licenses/by/2.0/",
     "CC BY 3.0": "https://creativecommons.org/licenses/by/3.0/",
     "CC BY 3.0 US": "https://creativecommons.org/licenses/by/3.0/us/",
+    "CC BY 4.0": "https://creativecommons.org/licenses/by/4.0/",
     "Public Domain Mark 1.0": "https://creativecommons.org/publicdomain/mark/1.0/",
 }
 
