@@ -1,5 +1,6 @@
 """Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their sliders."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -44,6 +45,12 @@ def chromium(playwright) -> str | None:
     return found or (own if Path(own).exists() else None)
 
 
+def without_chromium() -> None:
+    """Skip the test, or let it fail on a machine for continuous integration, where it must not pass unseen."""
+    refuse = pytest.fail if os.environ.get("CI") else pytest.skip
+    refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
+
+
 @pytest.fixture(scope="module")
 def browser():
     from playwright.sync_api import sync_playwright
@@ -51,9 +58,7 @@ def browser():
     with sync_playwright() as playwright:
         program = chromium(playwright)
         if program is None:
-            pytest.skip(
-                "no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one"
-            )
+            without_chromium()
         options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
         options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
         running = playwright.chromium.launch(executable_path=program, args=options)
@@ -88,6 +93,13 @@ def page(browser, lab):
     yield context.new_page()
     context.close()
     lab.stop_kernels()
+
+
+@pytest.mark.parametrize(("ci", "outcome"), [("true", pytest.fail.Exception), ("", pytest.skip.Exception)])
+def test_without_chromium_tests_fail_in_continuous_integration_and_are_skipped_elsewhere(monkeypatch, ci, outcome):
+    monkeypatch.setenv("CI", ci)
+    with pytest.raises(outcome, match="no Chromium here"):
+        without_chromium()
 
 
 def test_errors_of_a_broken_notebook_are_found(page, lab):
