@@ -132,7 +132,11 @@ def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
         "test": ["make test"],
         "avx2": ["make test"],
         "site": ["make site"],
-        "browser": ["make browser"],
+        "browser": [
+            "make .venv/.installed",
+            ".venv/bin/python -m playwright install --with-deps chromium",
+            "make browser",
+        ],
         "hostile": ["make fuzz", "make hostile"],
     }
     assert "gh-pages" in publish and jobs["publish"]["needs"] == ["test", "site"]
