@@ -28,6 +28,8 @@ from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 SPEC = "zsp-tiny+0.5*effnet-lite0"
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from fuzzing import TARGETS, check, run
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = 300  # of each target; `python -m tests.fuzzing` tries more
 
 

@@ -21,6 +21,8 @@ from zsp_lite.training.recipe import Stage, TrainingConfig
 from zsp_lite.training.train import BackboneTraining
 from zsp_lite.training.trainee import Trainee
 
+pytestmark = pytest.mark.slow
+
 SMALL = TrainingConfig(
     embed_dim=48, depth=2, num_heads=2, layer=1, photo_share=0.5, stages=(Stage(4, 64, 1, 8, (0.6, 1.0), view=1.0),)
 )  # fmt: skip

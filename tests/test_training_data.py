@@ -18,6 +18,8 @@ from zsp_lite.training.objectives import attention_loss, correspondence_loss, ge
 from zsp_lite.training.renders import ARRAYS, GRID, SIZE, VIEWS, load_render_set, render_object, render_set
 from zsp_lite.training.views import render_view
 
+pytestmark = pytest.mark.slow
+
 
 def fourier(surface, seed=0):
     """Descriptors that know the surface point exactly; background patches get noise."""
@@ -29,7 +31,6 @@ def fourier(surface, seed=0):
     return torch.where(surface[..., :1].isnan(), noise, known)
 
 
-@pytest.mark.slow
 def test_an_object_is_rendered_the_same_in_every_process_and_differs_from_the_next(renders):
     for array, rows in zip(render_object(1), (getattr(renders, name) for name in ARRAYS), strict=True):
         np.testing.assert_array_equal(array, rows[1])
@@ -49,7 +50,6 @@ def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypat
     assert (apart.min(1) >= 45).all()
 
 
-@pytest.mark.slow
 def test_render_set_continues_where_it_stopped(render_folder, renders):
     paths = render_set(render_folder, 4, shard=1)
     kept = {path: path.stat().st_mtime_ns for path in paths[1:]}
@@ -273,7 +273,6 @@ def test_instances_of_a_model_differ_in_colour_and_shape(model_folder):
     assert not np.allclose(one.materials[0].colour, other.materials[0].colour)
 
 
-@pytest.mark.slow
 def test_a_share_of_the_objects_are_models_and_their_shards_are_named_apart(model_folder, tmp_path):
     paths = render_set(tmp_path, 1, models=model_folder, share=1.0), render_set(tmp_path, 1, workers=1)
     models, procedural = map(load_render_set, paths)
