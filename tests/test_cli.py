@@ -169,6 +169,35 @@ def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, mon
     assert (tmp_path / "report.html").stat().st_size > 1_000_000  # plotly's script and the pictures
 
 
+def test_the_demo_prints_no_result_before_its_report_is_written(ellipsoids, tmp_path, monkeypatch, capsys):
+    def fail(*arguments):
+        raise OSError(28, "No space left on device", "report.html")
+
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
+    monkeypatch.setattr("zsp_lite.viz.report.write_report", fail)
+    assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path / "a/b")]) == 2
+    assert "No space left" in assert_one_line(capsys)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("inside", ["", "deeper"])
+@pytest.mark.parametrize("command", ["demo", "estimate"])
+def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
+    command, inside, ellipsoids, tmp_path, monkeypatch, capsys
+):
+    def fail(*arguments):
+        raise AssertionError("loaded")
+
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", fail)
+    (tmp_path / "file").write_text("mine")
+    folder = ellipsoids.root
+    words = ["--data", str(folder)] if command == "demo" else [str(folder / "ellipsoid/a"), str(folder / "ellipsoid/b")]
+    assert cli.main([command, *words, "--out", str(tmp_path / "file" / inside)]) == 2
+    assert "expected a folder" in assert_one_line(capsys)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_the_demo_runs_the_solvers_that_it_is_told(ellipsoids, tmp_path, monkeypatch, capsys):
     given = []
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())

@@ -166,6 +166,15 @@ def test_wrong_settings_are_refused(pictures):
         estimate_pose(cup, mug, reference_frame=4, intrinsics=INTRINSICS)
 
 
+def test_an_output_that_is_no_folder_is_refused_before_the_computation(pictures, tmp_path):
+    def fail(images):
+        raise AssertionError("computed")
+
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="expected a folder"):
+        estimate_pose(*pictures[:2], intrinsics=INTRINSICS, backbone=fail, out=tmp_path / "file")
+
+
 def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, tmp_path, capsys):
     folder = ellipsoids.root / "ellipsoid"
     words = [str(folder / "a"), str(folder / "b"), "--targets", "3", "--out", str(tmp_path)]

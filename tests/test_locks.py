@@ -55,7 +55,7 @@ def test_a_folder_in_which_nothing_was_written_is_removed(tmp_path):
     with writing(tmp_path / "new"):
         pass
     assert not (tmp_path / "new").exists()
-    with pytest.raises(InputError, match="folder .*file/new cannot be made: not a directory"):
+    with pytest.raises(InputError, match="folder .*file/new is a file or lies in one, expected a folder"):
         (tmp_path / "file").touch()
         with writing(tmp_path / "file/new"):
             pass

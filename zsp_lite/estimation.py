@@ -17,6 +17,7 @@ from zsp_lite.errors import InputError, check_integer
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.importers.fusion import scale_frame, unit_scale
+from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pair_result import (
     SEQUENCE_FRAMES,
@@ -152,11 +153,17 @@ def estimate_pose(
         out: Folder for the report and the point clouds (see `OwnPair.write`); None writes nothing.
 
     Raises:
-        InputError: An input cannot be read, an option is missing, or the pose cannot be estimated.
+        InputError: An input cannot be read, an option is missing, `out` cannot be written, or the pose cannot be
+            estimated.
     """
     if solver not in SOLVER_CHOICES:
         raise InputError(f"solver is {solver!r}, expected one of {', '.join(SOLVER_CHOICES)}")
     check_integer("targets", targets, 1)
+    if out is not None:
+        with writing(out):  # before the computation: a folder that cannot be written is an error at once
+            pair = estimate_pose(reference, target, solver, reference_frame, targets, mask, intrinsics, backbone)
+            pair.write(out)
+        return pair
     options = {"mask": mask, "intrinsics": intrinsics}
     options = {name: value for name, value in options.items() if value is not None}
     if isinstance(reference, Source) or isinstance(target, Source):
@@ -183,10 +190,7 @@ def estimate_pose(
         f"{first.name} to {second.name}", first.describe([position]), second.describe(positions), estimates,
         _errors(first, second, frame, frames, estimates), tuple(loaded[k] for k in shown),
     )  # fmt: skip
-    pair = OwnPair(result, frame, tuple(frames), (first.mask, second.mask), getattr(model, "name", str(backbone)))
-    if out is not None:
-        pair.write(out)
-    return pair
+    return OwnPair(result, frame, tuple(frames), (first.mask, second.mask), getattr(model, "name", str(backbone)))
 
 
 def _errors(

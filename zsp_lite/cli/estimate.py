@@ -86,13 +86,15 @@ def estimate(
 
     from zsp_lite.backbones.load import load_backbone
     from zsp_lite.estimation import estimate_pose
+    from zsp_lite.io.locks import writing
     from zsp_lite.sources import open_pair
 
     options = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
-    sources = open_pair(reference, target, options)
-    model = load_backbone(backbone_config(**backbone))
-    found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model)
-    files = found.write(out)
+    with writing(out):
+        sources = open_pair(reference, target, options)
+        model = load_backbone(backbone_config(**backbone))
+        found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model)
+        files = found.write(out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
     else:

@@ -114,6 +114,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo, run_photograph
+    from zsp_lite.io.locks import writing
     from zsp_lite.pair_result import SOLVER_CHOICES
     from zsp_lite.synthetic.export import SETTINGS_FILE
     from zsp_lite.synthetic.model_export import RENDERED_FILE
@@ -124,10 +125,16 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     folder = data or sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
-    dataset, model = Co3D(folder), load_backbone(backbone_config(**backbone))
-    name = getattr(model, "name", backbone["backbone"])
-    with console.status("estimating the pose of the photographed motorcycle"):
-        photograph = list(run_photograph(dataset, model))
+    with writing(out):
+        dataset, model = Co3D(folder), load_backbone(backbone_config(**backbone))
+        name = getattr(model, "name", backbone["backbone"])
+        with console.status("estimating the pose of the photographed motorcycle"):
+            photograph = list(run_photograph(dataset, model))
+        with console.status("estimating"):
+            results = list(run_demo(dataset, model, SOLVER_CHOICES[solver]))
+        with console.status("writing the report"):
+            path = write_report(out / "report.html", results, str(folder), note, name, photograph)
+            write_overview(out / "overview.jpg", results)
     if photograph:
         table = Table(
             title=f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"
@@ -140,17 +147,10 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     table = Table(title=f"One pair per category in {folder}, backbone {name}")
     for column in COLUMNS:
         table.add_column(column, justify="left" if column in COLUMNS[:2] else "right")
-    results = []
-    with console.status("estimating"):
-        for result in run_demo(dataset, model, SOLVER_CHOICES[solver]):
-            results.append(result)
-            for row in table_rows(result):
-                table.add_row(*row)
+    for result in results:
+        for row in table_rows(result):
+            table.add_row(*row)
     console.print(table)
-    out.mkdir(parents=True, exist_ok=True)
-    with console.status("writing the report"):
-        path = write_report(out / "report.html", results, str(folder), note, name, photograph)
-        write_overview(out / "overview.jpg", results)
     console.print(f"Data: {note}", highlight=False)
     console.print(f"Report with pictures of every stage: {path}", soft_wrap=True)
 

@@ -64,6 +64,8 @@ def make_folder(path: str | Path, what: str) -> Path:
     """Make a folder unless it exists, with those above it. Raises InputError if that is not possible."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{what} {_shown(path)} is a file or lies in one, expected a folder") from error
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{what} {_shown(path)} cannot be made: {reason.lower()}") from error

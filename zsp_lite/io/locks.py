@@ -1,5 +1,6 @@
 """One writer per folder."""
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -20,14 +21,16 @@ def writing(folder: str | Path) -> Iterator[None]:
     removed while it is locked. A lock on a file that another writer removed just before counts for nothing; the folder
     is then taken as one that is written to.
 
+    The folders that were made and are still empty at the end are removed.
+
     Raises:
         InputError: Another process writes to the folder, or the folder cannot be written.
     """
-    new = not Path(folder).exists()
+    new = [one for one in (Path(folder), *Path(folder).parents) if not os.path.exists(one)]
     folder = make_folder(folder, "folder")
     with ExitStack() as opened:
-        if new:
-            opened.callback(_remove_if_empty, folder)  # after an error, before which nothing was written
+        for one in reversed(new):
+            opened.callback(_remove_if_empty, one)  # after an error, before which nothing was written
         try:
             opened.enter_context(FileLock(folder / LOCK, timeout=0))
         except Timeout as error:
