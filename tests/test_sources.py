@@ -8,11 +8,13 @@ import pytest
 from synthetic_views import AT_HOME, look_at, render
 from test_importers import write_lists, write_nerfstudio, write_tum
 
+from zsp_lite.cli.estimate import MASKS, SOLVERS
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import READERS, capture_format
 from zsp_lite.importers.geometry_masks import masks_from_depth
-from zsp_lite.sources import open_pair, open_source
+from zsp_lite.pair_result import SOLVER_CHOICES
+from zsp_lite.sources import MASK_CHOICES, open_pair, open_source
 
 RADIUS, INTRINSICS = 0.3, (190.0, 190.0, 89.5, 69.5)
 
@@ -96,7 +98,7 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
     expected = ellipsoids.load(ellipsoids.frame("ellipsoid", "b", 5))
     np.testing.assert_array_equal(frame.rgb, expected.rgb)
     np.testing.assert_array_equal(frame.mask, expected.mask)
-    assert source.describe([0, 2]).endswith("ellipsoid/b, frames 0, 2") and source.first_usable() == 0
+    assert source.describe([0, 2]).endswith("ellipsoid/b, frames 0, 2") and source.first_usable()[0] == 0
     with pytest.raises(InputError, match="no frame 7, expected one of 7 from 0 to 6"):
         source.position(7)
 
@@ -104,6 +106,10 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
 def test_a_source_named_by_a_dot_has_the_name_of_its_folder(ellipsoids, monkeypatch):
     monkeypatch.chdir(ellipsoids.root / "ellipsoid/b")
     assert open_source(".").name == "b"
+
+
+def test_the_command_line_offers_the_choices_of_the_library():
+    assert SOLVERS == tuple(SOLVER_CHOICES) and MASKS == MASK_CHOICES
 
 
 def test_an_image_is_read_with_the_files_beside_it(image, frames):

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.arguments import checked
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
@@ -96,6 +97,7 @@ class OwnPair:
             "degrees_between_solvers": self.result.disagreement,
         }  # fmt: skip
 
+    @checked
     def write(self, out: str | Path) -> list[Path]:
         """Write the report and the point clouds.
 
@@ -124,6 +126,7 @@ class OwnPair:
         return [write_pair_report(out / "report.html", self.result, self.backbone, self.masks), *paths]
 
 
+@checked
 def estimate_pose(
     reference: str | Path | Source,
     target: str | Path | Source,
@@ -131,7 +134,7 @@ def estimate_pose(
     reference_frame: int | None = None,
     targets: int = 5,
     mask: str | None = None,
-    intrinsics: tuple[float, ...] | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
     backbone: str | BackboneConfig | FeatureExtractor = "zsp-tiny-photo",
     out: str | Path | None = None,
 ) -> OwnPair:
@@ -170,8 +173,11 @@ def estimate_pose(
         first, second = (one if isinstance(one, Source) else open_source(one, **options) for one in (reference, target))
     else:
         first, second = open_pair(reference, target, {name: (value,) for name, value in options.items()})
-    position = first.first_usable() if reference_frame is None else first.position(reference_frame)
-    (frame,) = first.load([position])
+    if reference_frame is None:
+        position, frame = first.first_usable()
+    else:
+        position = first.position(reference_frame)
+        (frame,) = first.load([position])
     positions, shown = second.spread(targets), second.spread(SEQUENCE_FRAMES)
     wanted = sorted({*positions, *shown})
     loaded = dict(zip(wanted, second.load(wanted)))

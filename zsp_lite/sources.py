@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zsp_lite.arguments import checked
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import Co3D
@@ -58,12 +59,15 @@ class Source:
         frames = ", ".join(str(self.numbers[position]) for position in positions)
         return f"{self.kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
+    @checked
     def load(self, positions: Sequence[int]) -> list[Frame]:
         """Load frames with masks of the object.
 
         Raises:
-            InputError: A file cannot be read, or the object is not found.
+            InputError: There is no such position, a file cannot be read, or the object is not found.
         """
+        for position in positions:
+            check_integer(f"{self.path}: position of a frame", position, 0, len(self) - 1)
         if self.mask == "given":
             return [self._with_mask(position) for position in positions]
         if self.mask == "box":
@@ -76,6 +80,7 @@ class Source:
         found = dict(zip(ordered, masked))
         return [found[position] for position in positions]
 
+    @checked
     def position(self, number: int) -> int:
         """Return the position of a frame number.
 
@@ -92,8 +97,8 @@ class Source:
         check_integer("targets", count, 1)
         return sorted(set((np.arange(count) * len(self) // count).tolist()))
 
-    def first_usable(self) -> int:
-        """Return the position of the first frame with an object mask and known depth, among evenly spaced ones.
+    def first_usable(self) -> tuple[int, Frame]:
+        """Return the first frame with an object mask and known depth, among evenly spaced ones, and its position.
 
         Raises:
             InputError: There is none.
@@ -101,7 +106,7 @@ class Source:
         for position in self.spread(_CONTEXT):
             (frame,) = self.load([position])
             if not (defect := frame_defect(frame)):
-                return position
+                return position, frame
         raise InputError(f"{self.path}: no usable reference frame: {defect}")
 
     def _with_mask(self, position: int) -> Frame:
@@ -114,9 +119,10 @@ class Source:
         return frame
 
 
+@checked
 def open_source(
     path: str | Path,
-    intrinsics: tuple[float, ...] | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
     depth: str | Path | None = None,
     depth_unit: float | None = None,
     mask: str | None = None,
@@ -165,6 +171,7 @@ def open_source(
     return Source(path, kind, numbers, read, mask, box)
 
 
+@checked
 def open_pair(reference: str | Path, target: str | Path, options: Mapping[str, Sequence]) -> tuple[Source, Source]:
     """Open two sources with the options of a command line.
 

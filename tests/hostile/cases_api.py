@@ -151,3 +151,24 @@ for points in (POINTS[:, :2], POINTS * math.nan, POINTS.astype(complex), POINTS.
         f"write_ply {getattr(points, 'dtype', None)} {np.shape(points)}",
         lambda folder, p=points: write_ply(folder / "x.ply", p, np.zeros((20, 3), np.uint8)),
     )
+
+for options in ({"solver": ["paper"]}, {"out": 3}, {"intrinsics": (1, 2, 3)}, {"intrinsics": "abcd"}, {"intrinsics": 5},
+                {"reference_frame": "a"}, {"targets": "3"}, {"mask": ["auto"]}, {"backbone": 3}):  # fmt: skip
+    case("API", f"estimate_pose with {options}",
+         lambda folder, o=options: zsp_lite.estimation.estimate_pose(folder / "data/cup/a", folder / "data/cup/b", **o),
+         says=next(iter(options)))  # fmt: skip
+case("API", "estimate_pose of numbers", lambda _: zsp_lite.estimation.estimate_pose(3, 4), says="reference is 3")
+for options in (
+    {"box": (1, 2)},
+    {"box": "abc"},
+    {"depth": 3},
+    {"intrinsics": "abcd"},
+    {"mask": 1},
+    {"depth_unit": "m"},
+):
+    case("API", f"open_source with {options}",
+         lambda folder, o=options: zsp_lite.sources.open_source(folder / "data/cup/a", **o),
+         says=next(iter(options)))  # fmt: skip
+for positions in ([99], [-1], ["a"], 3, None):
+    case("API", f"load of frames {positions!r}",
+         lambda folder, p=positions: zsp_lite.sources.open_source(folder / "data/cup/a").load(p))  # fmt: skip
