@@ -157,10 +157,11 @@ def test_the_reading_path_names_every_notebook_and_exercise(pages):
 
 def test_the_reference_describes_every_public_class_and_function(pages):
     anchors = set().union(*(page.anchors for name, page in pages.items() if name.startswith("docs/api/")))
-    for name in zsp_lite.__all__:
-        thing = getattr(zsp_lite, name)
-        if hasattr(thing, "__qualname__"):
-            assert f"{thing.__module__}.{thing.__qualname__}" in anchors, name
+    homes = zsp_lite._HOME_OF  # without importing them, which takes seconds
+    public = [name for name in homes if name[0].isupper() or name in zsp_lite._FUNCTIONS]
+    assert len(public) > 10
+    for name in public:
+        assert f"zsp_lite.{homes[name]}.{name}" in anchors, name
 
 
 def test_every_notebook_can_be_downloaded_and_opens_in_colab_only_if_the_repository_has_an_address(site, pages):
