@@ -72,7 +72,8 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     (example, *_) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n{example}\nassert len(targets) == 5\n"
-        "from zsp_lite.cli.main import main; raise SystemExit(main(['demo']))"
+        "from zsp_lite.cli.main import main\n"
+        "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny', '--solver', 'paper']))"
     )
     environment = os.environ | {"PYTHONPATH": str(site), "ZSP_LITE_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
     environment.pop("ZSP_LITE_DATA", None)
