@@ -1,6 +1,7 @@
 """The transformer that receives the features of a photo network: its input, its training, export and loading."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from zsp_lite.backbones.pretrained import EMBEDDED, SUMS, TINY, WEIGHTS
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.training.batches import MEAN, STD, sample_batch
-from zsp_lite.training.export import export_checkpoint, export_photo_input
+from zsp_lite.training.export import export_checkpoint, export_photo_input, starting_weights
 from zsp_lite.training.recipe import Stage, TrainingConfig
 from zsp_lite.training.train import BackboneTraining
 from zsp_lite.training.trainee import Trainee
@@ -75,6 +76,19 @@ def test_the_exported_files_give_the_features_of_training(exported, renders):
     torch.testing.assert_close(found.saliency.flatten(), attention, atol=0.02, rtol=0)
     centred = (x - x.mean(0) for x in (found.keys.flatten(0, 1), out.keys[0]))
     assert F.cosine_similarity(*centred).mean() > 0.999
+
+
+def test_a_further_run_starts_from_the_exported_photo_input(exported, renders):
+    model = Trainee(SMALL)
+    missing = model.load_state_dict(starting_weights(SMALL, exported), strict=False).missing_keys
+    assert missing and all(name.startswith("geometry") for name in missing)
+    images = torch.rand(2, 3, 448, 448)
+    with torch.no_grad():
+        found = model.centred(model.eval()((images - MEAN) / STD, photo=True).keys, photo=True)
+        expected = load_backbone(exported, "cpu").model.extract(images, SMALL.layer).keys
+    torch.testing.assert_close(found, expected, atol=5e-3, rtol=1e-2)  # float16 in the file
+    with pytest.raises(InputError, match="zsp-tiny-photo.safetensors: has a photo input, expected a transformer alone"):
+        starting_weights(replace(SMALL, photo_share=0.0), exported)
 
 
 def test_the_mean_key_of_every_block_is_subtracted(exported, renders):

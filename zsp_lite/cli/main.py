@@ -15,6 +15,7 @@ from zsp_lite.cli.benchmark import benchmark, compare, profile, tables
 from zsp_lite.cli.common import (
     COUNT,
     PATH,
+    SEED,
     backbone_config,
     backbone_options,
     examples,
@@ -298,8 +299,8 @@ def verify(name: str) -> None:
         "train --out outputs/first",
         "train --out outputs/second --start-from outputs/first/checkpoint.pt",
         "train --out outputs/further --start-from zsp-tiny --seed 1 --objects 2400",
-        "train --out outputs/photo --start-from zsp-tiny --photo --models outputs/training_models "
-        "--backgrounds outputs/backgrounds.npz",
+        "train --out outputs/photo --start-from zsp-tiny-photo --photo --batch-seed 2 "
+        "--models outputs/training_models --backgrounds outputs/backgrounds.npz",
         "train --out outputs/try --shorten 0.02 --objects 60",
         "train --self-distillation --out outputs/dino --renders outputs/first/renders",
     )
@@ -309,7 +310,7 @@ def verify(name: str) -> None:
 @click.option(
     "--start-from", metavar="WEIGHTS",
     help="Continue with the second part of the recipe from a run's checkpoint.pt, exported .safetensors, or the name "
-    "of an embedded transformer, such as zsp-tiny.",
+    "of embedded weights, such as zsp-tiny.",
 )  # fmt: skip
 @click.option(
     "--photo", is_flag=True,
@@ -332,10 +333,17 @@ def verify(name: str) -> None:
     help="Training objects; each takes 1.4 MB on disk and in memory.",
 )  # fmt: skip
 @click.option("--shorten", type=positive, metavar="F", default=1.0, help="Multiply the steps of every stage by F.")
+@click.option(
+    "--batch-seed",
+    type=SEED,
+    metavar="N",
+    default=0,
+    help="Second seed of the batches, to go on with the same objects.",
+)
 @seed_option
 def train(
     out: Path, renders: Path | None, start_from: str | None, photo: bool, models: Path | None,
-    backgrounds: Path | None, self_distillation: bool, objects: int | None, shorten: float, seed: int,
+    backgrounds: Path | None, self_distillation: bool, objects: int | None, shorten: float, batch_seed: int, seed: int,
 ) -> None:  # fmt: skip
     """Train the embedded backbone or resume its training; takes hours on a CPU."""
     if self_distillation and (start_from or photo or models or backgrounds):
@@ -352,7 +360,7 @@ def train(
     from zsp_lite.training.train import train as train_backbone
 
     recipe = PHOTO_INFORMED if photo else TrainingConfig() if start_from is None else CONTINUATION
-    config = replace(recipe, seed=seed).shortened(shorten)
+    config = replace(recipe, seed=seed, batch_seed=batch_seed).shortened(shorten)
     if objects:
         config = replace(config, objects=objects)
     keep_freed_memory()

@@ -89,7 +89,8 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
     Args:
         config: Configuration of the run.
         source: The checkpoint.pt of a run of `train`, whose averaged weights are taken; an exported .safetensors file;
-            or the name of an embedded transformer, such as "zsp-tiny". Exported weights have no heads.
+            or the name of embedded weights, such as "zsp-tiny". Exported weights have no heads. Those of a photo input
+            come with its transformer's.
 
     Raises:
         InputError: If the file does not exist, is damaged, or has a network of another size.
@@ -97,7 +98,7 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
     path = weights_file(source)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
-        kinds = "a checkpoint of `train`, exported .safetensors, or the name of an embedded transformer"
+        kinds = "a checkpoint of `train`, exported .safetensors, or the name of embedded weights"
         raise InputError(f"{source}: {what}, expected {kinds}")
     trainee = Trainee(config)
     if path.suffix != ".safetensors":
@@ -110,6 +111,14 @@ def starting_weights(config: TrainingConfig, source: str | Path) -> dict[str, Te
             raise InputError(f"{path}: a network of another shape, expected {size}") from error
         return weights
     backbone = load_backbone(path, "cpu").model
+    if isinstance(backbone, PhotoInformedViT):
+        if not config.photo_share:
+            raise InputError(
+                f"{source}: has a photo input, expected a transformer alone for a run without photo features"
+            )
+        photo_input, backbone = backbone.photo_input, backbone.vit
+        trainee.photo_projection.load_state_dict(photo_input.projection.state_dict())
+        trainee.photo_key_mean.copy_(photo_input.key_mean[config.layer])
     sizes = ("depth", "embed_dim", "num_heads", "patch_size", "image_size")
     found, expected = ({name: getattr(model, name) for name in sizes} for model in (backbone, trainee.backbone))
     if found != expected:

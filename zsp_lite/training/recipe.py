@@ -46,6 +46,7 @@ class TrainingConfig:
 
     Attributes:
         seed: Seed of objects, crops and random weights.
+        batch_seed: Second seed of the batches. A run that continues another one with the same objects takes another.
         objects: Number of training objects; others are held out.
         proportions, deformation: How much the views of an object differ (see `render_object`).
         embed_dim, depth, num_heads: Size of the transformer.
@@ -66,6 +67,7 @@ class TrainingConfig:
     """
 
     seed: int = 0
+    batch_seed: int = 0
     objects: int = 5600
     proportions: float = PROPORTIONS
     deformation: float = DEFORMATION
@@ -141,15 +143,15 @@ CONTINUATION = TrainingConfig(
     ),
 )
 
-# From the weights of `CONTINUATION`, with models from files and photographs as backgrounds.
+# With models from files and photographs as backgrounds; run twice, from the weights of `CONTINUATION` and from its own.
 PHOTO_INFORMED = TrainingConfig(
     objects=2400,
     learning_rate=3e-4,
     average=0.995,
     photo_share=0.65,
     stages=(
-        Stage(900, 128, 3, 8, (0.6, 1.0), helpers=0.6, view=2.0),
-        Stage(170, 192, 2, 8, (0.75, 1.0), helpers=0.6, radius=0.12, view=2.0),
-        Stage(80, 224, 2, 8, (0.85, 1.0), helpers=0.6, radius=0.12, view=2.0),
+        Stage(700, 128, 3, 8, (0.6, 1.0), helpers=0.6, view=2.0),
+        Stage(300, 192, 2, 8, (0.75, 1.0), helpers=0.6, radius=0.12, view=2.0),
+        Stage(140, 224, 2, 8, (0.85, 1.0), helpers=0.6, radius=0.12, view=2.0),
     ),
 )

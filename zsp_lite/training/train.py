@@ -161,7 +161,7 @@ class BackboneTraining(Task):
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         stage, _ = self.config.stage_at(step)
-        rng = np.random.default_rng([self.config.seed, 2, step])
+        rng = np.random.default_rng([self.config.seed, 2, step, self.config.batch_seed])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         photo = bool(rng.random() < self.config.photo_share)
         batch = sample_batch(
