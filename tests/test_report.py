@@ -161,7 +161,8 @@ def test_the_page_shows_both_answers_with_confidence_and_hypotheses(results, tex
 def test_terms_are_explained_and_stages_lead_to_their_notebooks(text):
     for term in ("eq. 2", "eq. 3", "CLS token", "nats"):
         assert re.search(rf'<abbr tabindex="0" title="[^"]{{40,}}">{re.escape(term)}</abbr>', text), term
-    for name in ("01_features", "02_cyclical_maps", "03_best_view", "04_umeyama_ransac", "11_beyond_the_paper"):
+    verified = ("11_hypotheses_and_evidence", "12_score_and_calibration")
+    for name in ("01_features", "02_cyclical_maps", "03_best_view", "04_umeyama_ransac", *verified):
         assert f'href="notebooks/{name}.ipynb"' in text
 
 

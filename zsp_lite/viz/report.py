@@ -304,7 +304,7 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
         StageFigure(
             "Reference and target views",
             f"All views are cropped to the object. {scores}",
-            "03_best_view" if paper else "11_beyond_the_paper",
+            "03_best_view" if paper else "11_hypotheses_and_evidence",
             _data_uri(_views_figure(result)),
             f"The reference and the target views of {title}; {chosen} is framed.",
             wide=True,
@@ -348,7 +348,7 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
                 "The estimate, propagated to other frames through the known cameras (sec. 5.6). Points: the reference "
                 "object, coloured along its longest axis. Arrows: the axes of the reference camera (x right, y down, "
                 "z forward).",
-                "06_end_to_end_demo" if solver == "paper" else "11_beyond_the_paper",
+                "06_end_to_end_demo" if solver == "paper" else "11_hypotheses_and_evidence",
                 _data_uri(_sequence_figure(result, one)),
                 f"The aligned reference cloud of the {solver} solver, drawn over {len(result.sequence)} frames of the "
                 "target sequence.",
