@@ -36,7 +36,7 @@ import sys
 
 if "google.colab" in sys.modules:
     !git clone --quiet --depth 1 {repository} /content/{folder}
-    %pip install --quiet /content/{folder} anywidget
+    %pip install --quiet /content/{folder} anywidget jupyterquiz
     %cd /content/{folder}/notebooks
     !ln -sfn ../data_samples data_samples
     from google.colab import output

@@ -20,7 +20,7 @@ EXTRAS = {
     "transformers": "backbones hf:NAME, vision transformers in Hugging Face's format (DINOv2, DINOv3, CLIP, ...)",
     "meshes": "your own 3D models in COLLADA files (zsp-lite synth --models)",
     "cluster": "the benchmark on a Dask cluster (--executor dask://HOST:PORT)",
-    "course": "handing out and grading the exercises",
+    "course": "handing out and grading the exercises, and the self-checks of the notebooks",
     "browser": "the notebooks in a real browser (make browser)",
 }
 _PIP = f"{sys.executable} -m pip"  # `pip` on the path may belong to another interpreter

@@ -1,0 +1,62 @@
+"""Self-checks: questions with instant feedback in a notebook, from the files `questions/NN.json`, by jupyterquiz.
+
+A file has the questions of one notebook: a list of self-checks, each a list of questions in jupyterquiz's format (the
+types "multiple_choice", "many_choice" and "numeric"). Texts are HTML: `<i>K</i>`, `<sub>`, `&lt;`; LaTeX is not shown.
+"""
+
+import json
+from pathlib import Path
+
+from zsp_lite.errors import InputError, check_integer
+from zsp_lite.viz.plots import BLUE
+from zsp_lite.widgets.common import load_package
+
+QUESTIONS = Path(__file__).parent / "questions"
+# Also legible on dark pages; blue-green and orange differ for colour-blind readers too.
+_COLOURS = {
+    **{f"--jq-{kind}-bg": BLUE for kind in ("multiple-choice", "many-choice", "numeric")},
+    "--jq-correct-color": "#007A5A",
+    "--jq-incorrect-color": "#C24E00",
+    "--jq-numeric-input-bg": "#333333",
+    "--jq-numeric-input-label": "currentColor",
+}
+
+
+def read_questions(notebook: str) -> list[list[dict]]:
+    """Return the self-checks of a notebook, in their order.
+
+    Args:
+        notebook: Number of the notebook with two digits, "00".
+
+    Raises:
+        InputError: The notebook has no self-checks.
+    """
+    known = {path.stem: path for path in sorted(QUESTIONS.glob("*.json"))}
+    if notebook not in known:
+        raise InputError(f"notebook is {notebook!r}, expected one with self-checks: {', '.join(known)}")
+    return json.loads(known[notebook].read_text(encoding="utf-8"))
+
+
+def self_check(notebook: str, number: int) -> None:
+    """Show the questions of a self-check below the cell; the answers get feedback at once, without a kernel.
+
+    Args:
+        notebook: Number of the notebook with two digits, "00".
+        number: Number of the self-check in the notebook, counted from 1.
+
+    Raises:
+        InputError: There is no such self-check, or jupyterquiz is not installed, or no notebook is running.
+    """
+    checks = read_questions(notebook)
+    check_integer("number", number, 1, len(checks))
+    jupyterquiz = load_package("jupyterquiz")
+    ipython = load_package("IPython")
+    if ipython.get_ipython() is None:
+        raise InputError("self_check was called outside IPython, expected a notebook, which can show the questions")
+    with ipython.utils.capture.capture_output() as captured:
+        jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
+    form, script = (output.data for output in captured.outputs)
+    ipython.display.display(ipython.display.HTML(form["text/html"] + "</div>"))  # jupyterquiz leaves it open
+    # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from the script.
+    hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
+    ipython.display.display(ipython.display.Javascript(hidden))
