@@ -1,0 +1,845 @@
+"""The drawings of the course: `python -m tools.drawings` writes them as SVG to notebooks/figures/.
+
+One picture of the whole method (`method.svg`), a strip of its stages for the top of each notebook (`here_NN.svg`), and
+small drawings of single ideas. Two chairs made of boxes play the reference (blue) and the target (orange). The colours
+are those of the figures (Okabe and Ito), and a white ground makes the drawings legible on dark pages.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.path import Path as Polygon
+
+from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
+
+FOLDER = Path(__file__).parents[1] / "notebooks" / "figures"
+INK, GREY, PALE, LINE = "#1A1A1A", "#595959", "#F4F4F1", "#B8B8B0"
+SKY, PINK = "#56B4E9", "#CC79A7"
+WIDTH = 940  # of the two large drawings, in pixels
+MARGIN = 14
+PICTOGRAM = 204, 110  # size of a stage's picture in `method.svg`
+
+# Parts of a chair as boxes, centre and size: x to the right of who sits on it, y forward, z up.
+Chair = dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
+
+
+def _chair(width: float, depth: float, seat: float, back: float, leg: float) -> Chair:
+    x, y = (width - leg) / 2, (depth - leg) / 2
+    legs = {
+        f"leg {side}{end}": ((i * x, j * y, seat / 2), (leg, leg, seat))
+        for side, i in (("left", -1), ("right", 1))
+        for end, j in (("", -1), (" front", 1))
+    }
+    return {
+        **legs,
+        "seat": ((0, 0, seat + 0.07), (width, depth, 0.14)),
+        "back": ((0, -(depth - 0.14) / 2, seat + 0.14 + back / 2), (width, 0.14, back)),
+    }
+
+
+REFERENCE = _chair(0.95, 0.95, 0.8, 1.0, 0.13)
+TARGET = _chair(1.35, 1.05, 0.62, 0.8, 0.2)
+# Places that both chairs have: a part and a corner of its box.
+PLACES = {
+    "top left": ("back", (-1, 1, 1)),
+    "top right": ("back", (1, 1, 1)),
+    "front left": ("seat", (-1, 1, 1)),
+    "front right": ("seat", (1, 1, 1)),
+    "foot left": ("leg left front", (-1, 1, -1)),
+    "foot right": ("leg right front", (1, 1, -1)),
+}
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A chair in a square picture.
+
+    Attributes:
+        chair: Its parts.
+        azimuth: Direction from which it is seen, in degrees; 0 is its front.
+        x, y: Upper left corner of the picture in the drawing.
+        size: Side of the picture.
+    """
+
+    chair: Chair
+    azimuth: float
+    x: float
+    y: float
+    size: float
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the places (N, 2) of points (N, 3) in the drawing, and their distances (N,) from the camera."""
+        angle, tilt = np.radians(self.azimuth), np.radians(20)
+        right = np.array([-np.cos(angle), np.sin(angle), 0])
+        to_camera = np.array([np.sin(angle) * np.cos(tilt), np.cos(angle) * np.cos(tilt), np.sin(tilt)])
+        up = np.cross(to_camera, right)
+        centred = np.asarray(points, float) - [0, 0, 0.92]
+        scale = self.size / 2.45
+        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + [
+            self.x + self.size / 2,
+            self.y + self.size / 2,
+        ]
+        return places, -(centred @ to_camera)
+
+    @cached_property
+    def faces(self) -> list[tuple[str, np.ndarray, np.ndarray, float]]:
+        """Return the visible faces, far ones first: part, corners (4, 2), normal (3,), distance of the centre."""
+        found = []
+        for part, (centre, size) in self.chair.items():
+            for axis in range(3):
+                for sign in (-1, 1):
+                    normal = sign * np.eye(3)[axis]
+                    ends = [0.0, 0.0, 0.0], normal
+                    if np.diff(self.project(np.array(ends))[1])[0] >= -1e-9:
+                        continue  # turned away
+                    others = [other for other in range(3) if other != axis]
+                    corners = np.tile(normal, (4, 1))
+                    corners[:, others] = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+                    places, distances = self.project(np.array(centre) + corners * np.array(size) / 2)
+                    found.append((part, places, normal, distances.mean()))
+        return sorted(found, key=lambda face: -face[3])
+
+    def place(self, name: str) -> np.ndarray:
+        """Return where a place of `PLACES` is in the drawing, (2,)."""
+        part, signs = PLACES[name]
+        centre, size = self.chair[part]
+        return self.project(np.array([np.array(centre) + np.array(signs) * np.array(size) / 2]))[0][0]
+
+    def parts_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the parts (N,) that the picture shows at points (N, 2) of the drawing; "" on the background."""
+        found = np.full(len(points), "", dtype=object)
+        for part, corners, _, _ in self.faces:
+            found[Polygon(corners).contains_points(points)] = part
+        return found
+
+    def dots(self, step: float) -> np.ndarray:
+        """Return places (N, 2) about `step` pixels apart on what the picture shows of the chair, far ones first."""
+        found = []
+        for part, (a, b, c, d), _, _ in self.faces:
+            along, across = (max(2, round(np.linalg.norm(end - a) / step)) for end in (b, d))
+            i, j = np.meshgrid((np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across)
+            i, j = i.reshape(-1, 1), j.reshape(-1, 1)
+            places = a * (1 - i) * (1 - j) + b * i * (1 - j) + c * i * j + d * (1 - i) * j
+            found.append(places[self.parts_at(places) == part])
+        return np.concatenate(found)
+
+    def draw(self, colour: str, frame: str = LINE, thick: float = 1) -> str:
+        """Draw the picture in shades of a colour."""
+        shades = {0: 0.78, 1: 0.9, 2: 1.0}
+        polygons = [
+            polygon(corners, mix(colour, INK, shades[int(np.abs(normal).argmax())]))
+            for _, corners, normal, _ in self.faces
+        ]
+        return self.ground(frame, thick) + "".join(polygons)
+
+    def draw_depth(self) -> str:
+        """Draw its depth map: near is dark."""
+        faces = self.faces
+        near, far = min(face[3] for face in faces), max(face[3] for face in faces)
+        grey = [mix("#3A3A3A", "#C9C9C9", 1 - (face[3] - near) / (far - near)) for face in faces]
+        return self.ground() + "".join(polygon(face[1], fill, fill) for face, fill in zip(faces, grey, strict=True))
+
+    def ground(self, frame: str = LINE, thick: float = 1) -> str:
+        return rect(self.x, self.y, self.size, self.size, PALE, frame, thick, corner=3)
+
+
+def mix(first: str, second: str, share: float) -> str:
+    """Return the colour with `share` of the first and the rest of the second."""
+    return to_hex(share * np.array(to_rgb(first)) + (1 - share) * np.array(to_rgb(second)))
+
+
+# Elements of SVG
+
+
+def number(value: float) -> str:
+    return (
+        f"{value:.1f}".removesuffix(".0").replace("-0", "0") if abs(value) < 0.05 else f"{value:.1f}".removesuffix(".0")
+    )
+
+
+def attributes(**values: object) -> str:
+    pairs = ((key.rstrip("_").replace("_", "-"), value) for key, value in values.items() if value is not None)
+    return "".join(f' {key}="{number(value) if isinstance(value, int | float) else value}"' for key, value in pairs)
+
+
+def element(tag: str, content: str | None = None, **values: object) -> str:
+    return f"<{tag}{attributes(**values)}" + ("/>" if content is None else f">{content}</{tag}>") + "\n"
+
+
+def rect(
+    x: float,
+    y: float,
+    width: float,
+    height: float,
+    fill: str,
+    stroke: str | None = None,
+    thick: float = 1,
+    corner: float = 0,
+) -> str:
+    line = {} if stroke is None else {"stroke": stroke, "stroke_width": thick}
+    return element("rect", x=x, y=y, width=width, height=height, rx=corner or None, fill=fill, **line)
+
+
+def polygon(corners: np.ndarray, fill: str, stroke: str | None = None) -> str:
+    points = " ".join(f"{number(x)},{number(y)}" for x, y in corners)
+    stroke = stroke or mix(fill, INK, 0.7)
+    return element("polygon", points=points, fill=fill, stroke=stroke, stroke_width=0.6, stroke_linejoin="round")
+
+
+def dot(place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", thick: float = 1.2) -> str:
+    return element("circle", cx=place[0], cy=place[1], r=radius, fill=fill, stroke=stroke, stroke_width=thick)
+
+
+def ring(place: np.ndarray, stroke: str, radius: float = 6.5, thick: float = 2, dash: str | None = None) -> str:
+    return element(
+        "circle",
+        cx=place[0],
+        cy=place[1],
+        r=radius,
+        fill="none",
+        stroke=stroke,
+        stroke_width=thick,
+        stroke_dasharray=dash,
+    )
+
+
+def curve(path: str, stroke: str = INK, thick: float = 1.6, dash: str | None = None, head: bool = False) -> str:
+    """Draw a path; with a head it is an arrow."""
+    marker = f"url(#{_HEADS[stroke]})" if head else None
+    return element(
+        "path", d=path, fill="none", stroke=stroke, stroke_width=thick, stroke_dasharray=dash, marker_end=marker,
+        stroke_linecap="round",
+    )  # fmt: skip
+
+
+def straight(start: np.ndarray, end: np.ndarray, gap: float = 0) -> str:
+    """Return the path from start to end, shorter by `gap` at both ends."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    step = (end - start) / np.linalg.norm(end - start) * gap
+    (a, b), (c, d) = start + step, end - step
+    return f"M{number(a)} {number(b)}L{number(c)} {number(d)}"
+
+
+def arc(start: np.ndarray, end: np.ndarray, bend: float, gap: float = 6) -> str:
+    """Return a bent path from start to end; a positive bend lies to its left."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    along = end - start
+    middle = (start + end) / 2 + bend * np.array([along[1], -along[0]])
+
+    def shorter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a + (b - a) / np.linalg.norm(b - a) * gap
+
+    (a, b), (c, d) = shorter(start, middle), shorter(end, middle)
+    return f"M{number(a)} {number(b)}Q{number(middle[0])} {number(middle[1])} {number(c)} {number(d)}"
+
+
+_HEADS = {INK: "ink", GREY: "grey", BLUE: "blue", ORANGE: "orange", GREEN: "green", VERMILLION: "red"}
+_TOKEN = re.compile(r"\*(.+?)\*|_\{(.+?)\}|\^\{(.+?)\}")
+
+
+def text(
+    content: str, x: float, y: float, size: float = 13, fill: str = INK, anchor: str = "start", bold: bool = False
+) -> str:
+    """Draw a line of text; `*x*` is italic, `_{a}` a subscript, `^{b}` a superscript."""
+    parts, end, back = [], 0, 0.0
+    for found in [*_TOKEN.finditer(content), None]:
+        plain = content[end : found.start() if found else None]
+        if plain:
+            parts.append(f"<tspan{attributes(dy=back or None)}>{escape(plain)}</tspan>" if back else escape(plain))
+            back = 0.0
+        if found:
+            italic, low, high = found.groups()
+            if italic:
+                parts.append(f'<tspan font-style="italic"{attributes(dy=back or None)}>{escape(italic)}</tspan>')
+                back = 0.0
+            else:
+                shift = size * (0.28 if low else -0.38)
+                parts.append(
+                    f"<tspan{attributes(dy=shift + back, font_size=0.72 * size)}>{escape(low or high)}</tspan>"
+                )
+                back = -shift
+            end = found.end()
+    weight = "bold" if bold else None
+    return element(
+        "text", "".join(parts), x=x, y=y, font_size=size, fill=fill, text_anchor=None if anchor == "start" else anchor,
+        font_weight=weight,
+    )  # fmt: skip
+
+
+def group(content: str, x: float = 0, y: float = 0, scale: float = 1, opacity: float | None = None) -> str:
+    transform = f"translate({number(x)} {number(y)})" + (f" scale({scale:g})" if scale != 1 else "")
+    return f"<g{attributes(transform=transform, opacity=None if opacity is None else f'{opacity:g}')}>\n{content}</g>\n"
+
+
+def svg(content: str, width: float, height: float, title: str, description: str) -> str:
+    """Put a drawing on white ground, with a title and a description for those who cannot see it."""
+    heads = "".join(
+        element(
+            "marker", element("path", d="M0 0L9 4.5L0 9Z", fill=colour).strip(), id=name, markerUnits="userSpaceOnUse",
+            markerWidth=9, markerHeight=9, refX=7, refY=4.5, orient="auto",
+        )
+        for colour, name in _HEADS.items()
+        if f"url(#{name})" in content
+    )  # fmt: skip
+    defs = f"<defs>\n{heads}</defs>\n" if heads else ""
+    size = f'width="{number(width)}" height="{number(height)}" viewBox="0 0 {number(width)} {number(height)}"'
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" role="img" '
+        'aria-labelledby="title desc">\n'
+        f'<title id="title">{escape(title)}</title>\n<desc id="desc">{escape(description)}</desc>\n{defs}'
+        f"{rect(0.5, 0.5, width - 1, height - 1, 'white', '#D9D9D4', 1, corner=10)}{content}</svg>\n"
+    )
+
+
+# The pictures of the stages, each in a field of PICTOGRAM; `words` are left out in the small strip
+
+
+@cache
+def draw_images(words: bool = True) -> str:
+    width, _ = PICTOGRAM
+    reference = Photo(REFERENCE, 35, 2, 18, 76)
+    targets = [
+        Photo(TARGET, azimuth, width - 76 - 12 * i, 30 - 12 * i, 76) for i, azimuth in ((2, 100), (1, 60), (0, 25))
+    ]
+    return reference.draw(BLUE) + "".join(target.draw(ORANGE) for target in targets)
+
+
+def draw_grid(x: float, y: float, size: float, cells: int, stroke: str = "white", thick: float = 0.8) -> str:
+    steps = [size * i / cells for i in range(1, cells)]
+    path = "".join(
+        f"M{number(x + s)} {number(y)}v{number(size)}M{number(x)} {number(y + s)}h{number(size)}" for s in steps
+    )
+    return curve(path, stroke, thick)
+
+
+@cache
+def draw_features(words: bool = True) -> str:
+    photo, grid, cells = Photo(REFERENCE, 35, 4, 13, 84), Photo(REFERENCE, 35, 116, 13, 84), 9
+    side = grid.size / cells
+    found = grid.ground()
+    for row, column in np.ndindex(cells, cells):
+        corner = np.array([grid.x + column * side, grid.y + row * side])
+        inside = corner + side * (np.indices((3, 3)).reshape(2, -1).T * 0.3 + 0.2)
+        shown = [part for part in grid.parts_at(inside) if part]
+        if len(shown) > 2:
+            colour = {"back": PINK, "seat": SKY}.get(max(set(shown), key=shown.count), GREEN)
+            found += rect(*corner, side, side, mix(colour, "white", 0.7 + 0.1 * ((3 * row + 5 * column) % 4)))
+    arrow = curve("M92 55H111", INK, 1.8, head=True)
+    return photo.draw(BLUE) + draw_grid(4, 13, 84, cells) + arrow + found + draw_grid(116, 13, 84, cells)
+
+
+def cycle_photos(size: float = 84) -> tuple[Photo, Photo]:
+    return Photo(REFERENCE, 35, 4, 13, size), Photo(TARGET, 30, 116, 13, size)
+
+
+@cache
+def draw_cycle(words: bool = True) -> str:
+    first, second = cycle_photos()
+    u, v = first.place("front left"), second.place("front left")
+    drawn = first.draw(BLUE) + second.draw(ORANGE) + draw_walk(u, v, u + [9, 11])
+    if words:
+        drawn += text("*u*", u[0] - 1, u[1] - 8, 14) + text("*v*", v[0] + 9, v[1] + 4, 14)
+        drawn += text("*u*′", u[0] + 2, u[1] + 31, 14)
+    return drawn
+
+
+def draw_walk(u: np.ndarray, v: np.ndarray, end: np.ndarray, size: float = 5, bend: float = 0.42) -> str:
+    """Draw a cycle: from u to v (solid), from v to its end (dashed)."""
+    there = curve(arc(u, v, bend, size + 3), INK, 2, head=True)
+    back = curve(arc(v, end, 0.7 * bend, size + 4), INK, 2, "5 4", head=True)
+    return there + back + dot(u, BLUE, size) + dot(v, ORANGE, size) + dot(end, "white", size, BLUE, 2.2)
+
+
+@cache
+def draw_best_view(words: bool = True) -> str:
+    drawn = ""
+    for i, (azimuth, score) in enumerate(((110, 0.35), (30, 0.95), (-50, 0.6))):
+        x, chosen = 4 + 68 * i, i == 1
+        drawn += Photo(TARGET, azimuth, x, 6, 60).draw(ORANGE, INK if chosen else LINE, 3 if chosen else 1)
+        drawn += rect(x, 106 - 32 * score, 60, 32 * score, GREY if chosen else LINE, corner=2)
+    return drawn
+
+
+@cache
+def draw_depth(words: bool = True) -> str:
+    photo = Photo(REFERENCE, 35, 4, 13, 84)
+    drawn = photo.draw_depth()
+    # Beside it, a camera: rays from its centre through the image plane to points.
+    eye, plane = np.array([112, 58]), 136
+    drawn += curve(f"M{plane} 26V90", GREY, 2)
+    for place in (np.array([186, 14]), np.array([200, 52]), np.array([180, 98])):
+        drawn += curve(straight(eye, place), LINE, 1.4)
+        crossing = eye + (place - eye) * (plane - eye[0]) / (place[0] - eye[0])
+        drawn += dot(crossing, BLUE, 3.2) + dot(place, BLUE, 5)
+    return drawn + polygon(np.array([[100, 51], [100, 65], [114, 58]]), INK)
+
+
+def _matched() -> tuple[np.ndarray, np.ndarray]:
+    """Five points and their partners after a rotation; the last is a wrong match."""
+    first = np.array([[20, 24], [66, 18], [18, 70], [62, 66], [40, 94]], float)
+    angle = np.radians(18)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    second = (first - first.mean(0)) @ turn.T * 0.95 + [158, 56]
+    second[4] = [196, 18]
+    return first, second
+
+
+@cache
+def draw_fit(words: bool = True) -> str:
+    drawn = ""
+    for i, (a, b) in enumerate(zip(*_matched(), strict=True)):
+        wrong = i == 4
+        drawn += curve(straight(a, b, 6), VERMILLION if wrong else GREEN, 1.8, "4 4" if wrong else None)
+        if wrong:
+            x, y = a + (b - a) * 0.72
+            drawn += curve(f"M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10", VERMILLION, 2.4)
+        drawn += dot(a, BLUE, 5) + dot(b, ORANGE, 5)
+    return drawn
+
+
+@cache
+def draw_pose(words: bool = True) -> str:
+    photo = Photo(TARGET, 25, 52, 4, 102)
+    moved = Photo(_chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102)  # the reference, scaled as a whole
+    drawn = photo.draw(mix(ORANGE, "white", 0.7)) + "".join(
+        dot(place, BLUE, 1.8, "white", 0.4) for place in moved.dots(5.5)
+    )
+    ends, _ = photo.project(np.array([[0, 0, 0.75], [0, 1.5, 0.75], [0, 0, 2.1]]))
+    for end in ends[1:]:
+        drawn += curve(straight(ends[0], end), INK, 2.4, head=True)
+    if words:
+        drawn += text("front", 48, 106, 13, anchor="end") + text("up", 158, 18, 13)
+    return drawn
+
+
+STAGES: dict[str, tuple[str, Callable[..., str]]] = {
+    "images": ("images", draw_images),
+    "features": ("01 features", draw_features),
+    "cycle": ("02 cycle", draw_cycle),
+    "best view": ("03 best view", draw_best_view),
+    "fit": ("04 depth, RANSAC", draw_fit),
+    "pose": ("pose", draw_pose),
+}
+
+
+# The whole method
+
+
+def draw_method() -> str:
+    left, panel, gap, row = 190, 216, 24, 208
+    column = [MARGIN + left + gap + i * (panel + gap) for i in range(3)]
+    below = MARGIN + row + 30
+
+    def draw_panel(x: float, y: float, title: str, notebook: str, lines: tuple[str, str], picture: str) -> str:
+        drawn = rect(x, y, panel, row, "#FBFBF9", LINE, 1.2, corner=8) + text(title, x + 12, y + 24, 15, bold=True)
+        drawn += text(notebook, x + panel - 12, y + 24, 13, GREY, "end")
+        drawn += group(picture, x + (panel - PICTOGRAM[0]) / 2, y + 40)
+        return drawn + "".join(text(line, x + 12, y + 174 + 19 * i) for i, line in enumerate(lines))
+
+    stages = [
+        ("Features", "01", ("A network describes each", "patch by a vector Φ."), draw_features()),
+        ("Cycle", "02", ("A match is kept if *u*′, two", "nearest steps on, is near *u*."), draw_cycle()),
+        ("Best view", "03", ("The view is chosen whose", "matches score highest."), draw_best_view()),
+        ("Depth", "04", ("Depth turns the patches of a", "match into two 3D points."), draw_depth()),
+        ("Umeyama, RANSAC", "04", ("The similarity is fitted that", "most matches agree with."), draw_fit()),
+        ("Pose", "05", ("*y* = *λRx* + *t* lays the", "reference on the target."), draw_pose()),
+    ]
+    drawn = ""
+    for i, (title, notebook, lines, picture) in enumerate(stages):
+        drawn += draw_panel(column[i % 3], MARGIN if i < 3 else below, title, notebook, lines, picture)
+    for y in (MARGIN + 95, below + 95):
+        for x in column[1:]:
+            drawn += curve(f"M{x - gap + 3} {y}h{gap - 8}", INK, 2.2, head=True)
+    drawn += curve(f"M{column[0] - gap + 3} {MARGIN + 95}h{gap - 8}", INK, 2.2, head=True)
+    middle, corner = below - 15, 8
+    start, end = column[2] + panel / 2, column[0] + panel / 2
+    drawn += curve(
+        f"M{start} {MARGIN + row + 3}V{middle - corner}q0 {corner} -{corner} {corner}H{end + corner}"
+        f"q-{corner} 0 -{corner} {corner}V{below - 5}",
+        INK, 2.2, head=True,
+    )  # fmt: skip
+
+    height = below + row - MARGIN
+    x = MARGIN
+    drawn += rect(x, MARGIN, left, height, "#FBFBF9", LINE, 1.2, corner=8)
+    drawn += text("Reference", x + 12, MARGIN + 24, 15, BLUE, bold=True)
+    drawn += Photo(REFERENCE, 35, x + 12, MARGIN + 38, 104).draw(BLUE)
+    drawn += Photo(REFERENCE, 35, x + 122, MARGIN + 86, 56).draw_depth()
+    drawn += text("depth", x + 150, MARGIN + 78, 13, GREY, "middle")
+    drawn += text("one image of an object,", x + 12, MARGIN + 164) + text("with depth", x + 12, MARGIN + 183)
+    y = MARGIN + 214
+    drawn += curve(f"M{x + 12} {y - 12}h{left - 24}", LINE, 1.2)
+    drawn += text("Target", x + 12, y + 14, 15, mix(ORANGE, INK, 0.68), bold=True)
+    for i, azimuth in enumerate((110, 30, -50, 170)):
+        drawn += Photo(TARGET, azimuth, x + 12 + 86 * (i % 2), y + 24 + 75 * (i // 2), 68).draw(ORANGE)
+    for i, line in enumerate(("several images of another", "object, with depth and", "known cameras")):
+        drawn += text(line, x + 12, y + 187 + 18 * i)
+    return svg(
+        drawn, WIDTH, below + row + MARGIN, "The method",
+        "From one image of a reference object and several images of a target object, both with depth, to the pose: "
+        "features of patches, cycles of nearest neighbours, choice of the best view, depth of the matched patches, a "
+        "fit by "
+        "Umeyama's method in RANSAC, and the pose that lays the reference on the target. The numbers are those of the "
+        "notebooks.",
+    )  # fmt: skip
+
+
+# Where a notebook stands
+
+# Below the stages: number and name of a notebook, its left end and its width.
+AROUND = {
+    "10": ("own objects", MARGIN, 136),
+    "09": ("training", 183.2, 108),
+    "11": ("hypotheses", 314, 120),
+    "12": ("calibration", 444, 120),
+    "08": ("labels", 594, 86),
+    "05": ("errors", 690, 88),
+    "07": ("benchmark", 788, 138),
+}
+WHOLE = tuple(STAGES)
+HERE: dict[str, tuple[str, ...]] = {
+    "00": WHOLE,
+    "01": ("features",),
+    "02": ("cycle",),
+    "03": ("best view",),
+    "04": ("fit",),
+    "06": WHOLE,
+    **{number: (number,) for number in AROUND},
+}
+
+
+def draw_here(notebook: str) -> str:
+    """Draw the strip of stages with those of a notebook highlighted."""
+    here, width, gap, height = HERE[notebook], 136, 19.2, 98
+    top = 34 if here[0] in STAGES else MARGIN  # room for the sign above or below
+    below = top + height + 20
+    spans = {name: (MARGIN + i * (width + gap), width) for i, name in enumerate(STAGES)}
+    drawn = ""
+    for name, (title, draw) in STAGES.items():
+        x, on = spans[name][0], name in here
+        drawn += rect(
+            x, top, width, height, mix(SKY, "white", 0.22) if on else "white", BLUE if on else LINE, 3 if on else 1.2, 8
+        )
+        picture = group(draw(words=False), x + (width - 0.58 * PICTOGRAM[0]) / 2, top + 8, 0.58)
+        drawn += picture if on else f'<g opacity="0.55">\n{picture}</g>\n'
+        drawn += text(title, x + width / 2, top + height - 10, 13, INK if on else GREY, "middle", bold=on)
+        if name != "images":
+            drawn += curve(f"M{number(x - gap + 2)} {top + height / 2:g}h{gap - 6:g}", GREY, 2, head=True)
+    line, centre = top + height + 10, {name: x + w / 2 for name, (x, w) in spans.items()}
+    for names, stage in (
+        (("10",), "images"),
+        (("09",), "features"),
+        (("11", "12"), "best view"),
+        (("08", "05", "07"), "pose"),
+    ):
+        stops = [AROUND[name][1] + AROUND[name][2] / 2 for name in names]
+        path = f"M{number(centre[stage])} {top + height + 2}V{line}"
+        path += f"M{number(min([centre[stage], *stops]))} {line}H{number(max([centre[stage], *stops]))}"
+        path += "".join(f"M{number(stop)} {line}V{below}" for stop in stops)
+        drawn += curve(path, LINE, 1.4)
+    for name, (title, x, pill) in AROUND.items():
+        on = name in here
+        spans[name] = x, pill
+        drawn += rect(x, below, pill, 28, BLUE if on else "white", BLUE if on else LINE, 1.2, 14)
+        drawn += text(f"{name} {title}", x + pill / 2, below + 18.5, 13, "white" if on else GREY, "middle", bold=on)
+    start, end = min(spans[name][0] for name in here), max(sum(spans[name]) for name in here)
+    middle = (start + end) / 2
+    if here[0] in STAGES:
+        if here == WHOLE:
+            drawn += curve(f"M{start} 27v-5H{end}v5", BLUE, 2)
+        label = "you are here: the whole method" if here == WHOLE else "you are here"
+        drawn += text(label, middle, 16, 13, BLUE, "middle", bold=True)
+        drawn += "" if here == WHOLE else polygon(np.array([[middle - 6, 21], [middle + 6, 21], [middle, 30]]), BLUE)
+    else:
+        foot = below + 28
+        drawn += polygon(np.array([[middle - 6, foot + 12], [middle + 6, foot + 12], [middle, foot + 3]]), BLUE)
+        drawn += text("you are here", middle, foot + 27, 13, BLUE, "middle", bold=True)
+    names = (
+        "the whole method"
+        if here == WHOLE
+        else ", ".join(dict(STAGES).get(name, AROUND.get(name, ("",)))[0] for name in here)
+    )
+    return svg(
+        drawn, WIDTH, below + 28 + (MARGIN if here[0] in STAGES else 36), f"Where notebook {notebook} stands",
+        f"The stages of the method in a row: images, features, cycle, best view, depth and RANSAC, pose. "
+        f"Highlighted: {names}.",
+    )  # fmt: skip
+
+
+# Single ideas
+
+
+def draw_vector(x: float, y: float, colour: str, shades: tuple[float, ...], side: float = 15) -> str:
+    """Draw a vector as a row of cells."""
+    cells = (rect(x + i * side, y, side, side, mix(colour, "white", share), "white") for i, share in enumerate(shades))
+    return "".join(cells)
+
+
+_SHADES = ((0.9, 0.35, 0.7, 0.2), (0.3, 0.8, 0.45, 0.95), (0.6, 0.25, 0.9, 0.5), (0.2, 0.6, 0.3, 0.8))
+
+
+def draw_query_key_value() -> str:
+    width, height = 860, 330
+    drawn = text("One patch, three vectors", 20, 32, 15, bold=True)
+    drawn += Photo(REFERENCE, 35, 20, 96, 112).draw(BLUE) + draw_grid(20, 96, 112, 4)
+    drawn += rect(76, 124, 28, 28, "none", INK, 2.6) + text("patch *i*", 76, 230, 13, anchor="middle")
+    drawn += curve("M106 138H152", INK, 2, head=True)
+    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text("token *x*_{i}", 188, 118, 13, anchor="middle")
+    rows = (
+        (56, BLUE, "q", "query *q*_{i}", "what the patch looks for"),
+        (138, VERMILLION, "k", "key *k*_{i}", "what the patch offers"),
+        (220, GREEN, "v", "value *v*_{i}", "what the patch hands on"),
+    )
+    for i, (y, colour, name, title, meaning) in enumerate(rows):
+        drawn += curve(f"M222 138L294 {y}", INK, 1.8, head=True)
+        drawn += text(f"*W*_{{{name}}}", 252, (88, 131, 202)[i], 13, anchor="end" if i != 1 else "start")
+        drawn += draw_vector(302, y - 8, colour, _SHADES[i])
+        drawn += text(title, 372, y - 3, 13, bold=True) + text(meaning, 372, y + 15, 13, GREY)
+    x = 570
+    drawn += curve(f"M{x - 24} 20V{height - 20}", LINE, 1.2)
+    drawn += text("What patch *i* receives", x, 32, 15, bold=True)
+    drawn += text("keys", x + 30, 62, 13, VERMILLION, "middle") + text("weights", x + 128, 62, 13, GREY, "middle")
+    drawn += text("values", x + 232, 62, 13, mix(GREEN, INK, 0.8), "middle")
+    for i, (weight, keys) in enumerate(zip((0.55, 0.25, 0.15, 0.05), np.roll(_SHADES, 1, 0), strict=True)):
+        y = 76 + 30 * i
+        drawn += draw_vector(x, y, VERMILLION, tuple(keys)) + rect(x + 84, y, 88 * weight / 0.55, 15, GREY)
+        drawn += draw_vector(x + 202, y, mix(GREEN, "white", 0.35 + weight), _SHADES[i])
+    drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True) + draw_vector(x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4))
+    drawn += text("weighted sum", x + 190, 242, 13, anchor="end")
+    drawn += text("*w*_{ij} = softmax_{j} ( *q*_{i} · *k*_{j} / √*d* )", x, 282, 14)
+    drawn += text("out_{i} = Σ_{j} *w*_{ij} *v*_{j}", x, 310, 14)
+    return svg(
+        drawn, width, height, "Query, key and value",
+        "Three matrices turn the token of a patch i into its query, its key and its value. The query is compared with "
+        "the "
+        "keys of all patches. The softmax of these products gives weights, and patch i receives the weighted sum of "
+        "the "
+        "values.",
+    )  # fmt: skip
+
+
+def draw_cycles() -> str:
+    width, height, size = 860, 280, 160
+
+    def case(
+        x: float, title: str, places: tuple[str, str, str], off: tuple[float, float], lines: tuple[str, str]
+    ) -> str:
+        first, second = Photo(REFERENCE, 35, x, 50, size), Photo(TARGET, 30, x + 230, 50, size)
+        u, v, end = first.place(places[0]), second.place(places[1]), first.place(places[2]) + off
+        drawn = text(title, x, 32, 15, bold=True) + first.draw(BLUE) + draw_grid(x, 50, size, 12, thick=0.6)
+        drawn += second.draw(ORANGE) + draw_grid(x + 230, 50, size, 12, thick=0.6)
+        closed = max(np.abs(off)) > 0
+        drawn += curve(straight(u, end), GREEN if closed else VERMILLION, 3.5) + draw_walk(u, v, end, 6, 0.26)
+        drawn += text("*v*", v[0] + 11, v[1] + 6, 16)
+        if closed:
+            drawn += text("*u*", u[0] + 2, u[1] - 11, 16) + text("*u*′", end[0] - 4, end[1] + 24, 16)
+        else:
+            drawn += text("*u*", u[0] - 12, u[1] + 18, 16, anchor="end") + text(
+                "*u*′", end[0] - 11, end[1] + 19, 16, anchor="end"
+            )
+        return drawn + "".join(text(line, x, 236 + 21 * i, 14) for i, line in enumerate(lines))
+
+    drawn = case(
+        20, "A cycle that closes", ("front left", "front left", "front left"), (12, 16),
+        ("*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
+         "*u*′ is next to *u*: the match (*u*, *v*) is kept."),
+    )  # fmt: skip
+    drawn += curve(f"M430 20V{height - 20}", LINE, 1.2)
+    drawn += case(
+        450, "A cycle that does not", ("foot left", "foot right", "top right"), (0, 0),
+        ("The way back leads to another part.", "*d*(*u*, *u*′) is large: the match (*u*, *v*) is dropped."),
+    )  # fmt: skip
+    return svg(
+        drawn, width, height, "The cycle",
+        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the target, a dashed arrow "
+        "leads back to u', close to u, and the match is kept. Right: the dashed arrow ends far from u, and the match "
+        "is "
+        "dropped.",
+    )  # fmt: skip
+
+
+def draw_axes(place: np.ndarray, turn: float, size: float = 30) -> str:
+    """Draw the three axes of a frame."""
+    drawn = ""
+    for angle, colour in ((0, VERMILLION), (90, GREEN), (215, BLUE)):
+        angle = np.radians(turn + angle)
+        drawn += curve(
+            straight(place, place + size * np.array([np.cos(angle), -np.sin(angle)])), colour, 2.4, head=True
+        )
+    return drawn + dot(place, INK, 3)
+
+
+def draw_camera(place: np.ndarray, colour: str, flip: int) -> str:
+    x, y = place
+    body = rect(x - 19, y - 13, 38, 26, colour, corner=4)
+    lens = np.array([[x + 19 * flip, y], [x + 33 * flip, y - 11], [x + 33 * flip, y + 11]])
+    return body + polygon(lens, colour)
+
+
+def draw_frames() -> str:
+    width, height, y = 860, 290, 118
+    x = [80, 255, 430, 605, 780]
+    names = (("camera of the", "reference image *i*"), ("world of the", "reference, *a*"),
+             ("frame of the", "category, 0"),
+             ("world of the", "target, *b*"), ("camera of the", "target view *j*"))  # fmt: skip
+    steps = ("(*T*^{cam}_{ai})^{−1}", "*T*_{0a}^{−1}", "*T*_{0b}", "*T*^{cam}_{bj}")
+    kinds = "camera", "label", "label", "camera"
+    drawn = text("From camera to camera, step by step", 20, 34, 15, bold=True)
+    drawn += draw_camera(np.array([x[0], y]), BLUE, 1) + draw_camera(np.array([x[4], y]), ORANGE, -1)
+    for place, turn in ((x[1], 12), (x[2], 0), (x[3], -20)):
+        drawn += draw_axes(np.array([place - 4, y + 10]), turn)
+    for i, (step, kind) in enumerate(zip(steps, kinds, strict=True)):
+        start, end = x[i] + 48, x[i + 1] - 48
+        drawn += curve(f"M{start} {y}H{end}", INK, 2.2, head=True)
+        drawn += text(step, (start + end) / 2, y - 14, 15, anchor="middle")
+        drawn += text(kind, (start + end) / 2, y + 22, 13, GREY, "middle")
+    for place, lines in zip(x, names, strict=True):
+        drawn += "".join(text(line, place, y + 62 + 18 * i, 13, anchor="middle") for i, line in enumerate(lines))
+    foot = y + 98
+    drawn += curve(f"M{x[0]} {foot}v12q0 10 10 10H{x[4] - 10}q10 0 10 -10V{foot + 4}", INK, 2.2, head=True)
+    drawn += text(
+        "the pose: *T* = *T*^{cam}_{bj} *T*_{0b} *T*_{0a}^{−1} (*T*^{cam}_{ai})^{−1}",
+        width / 2,
+        foot + 48,
+        15,
+        anchor="middle",
+    )
+    return svg(
+        drawn, width, height, "The chain of frames",
+        "Five frames in a row: the camera of the reference image, the world of the reference sequence, the frame of "
+        "the "
+        "category, the world of the target sequence, and the camera of the target view. Arrows between them are the "
+        "known "
+        "cameras and the labels; one arrow from the first to the last is the pose.",
+    )  # fmt: skip
+
+
+def move(points: np.ndarray, x: np.ndarray, y: np.ndarray, mirror: bool = False) -> np.ndarray:
+    """Move points (N, 2) by the best rotation and translation from x to y; with `mirror`, by the best that mirrors."""
+    a, b = x - x.mean(0), y - y.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, np.sign(np.linalg.det(u @ vt)) * (-1 if mirror else 1)])
+    return (points - x.mean(0)) @ (u * sign @ vt).T + y.mean(0)
+
+
+# A chair from its side: back, seat, legs.
+_PROFILE = np.array([[0, 96], [0, 0], [0, 52], [52, 52], [52, 96]], float)
+
+
+def draw_mirror() -> str:
+    width, height, panel = 860, 290, 280
+    shape = _PROFILE - _PROFILE.mean(0)
+    other = shape * [-1, 1]
+    tilt = np.radians(-14)
+    other = other @ np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]).T
+
+    def outline(points: np.ndarray, colour: str, dash: str | None = None) -> str:
+        path = "M" + "L".join(f"{number(a)} {number(b)}" for a, b in points)
+        return curve(path, colour, 5, dash) + "".join(dot(point, colour, 6) for point in points[[0, 1, 3, 4]])
+
+    def lines(first: np.ndarray, second: np.ndarray) -> str:
+        return "".join(curve(straight(a, b), GREY, 1.6, "3 3") for a, b in zip(first, second, strict=True))
+
+    centre = np.array([panel / 2, 128])
+    drawn = ""
+    panels = (
+        ("The points", ("The second object happens to", "be a mirror image of the first.")),
+        ("The best matrix: det = −1", ("Every point fits, but no motion", "of the object does this.")),
+        ("The best rotation: det = +1", ("The fit is worse. It is a motion,", "and so it is the answer.")),
+    )
+    for i, (title, words) in enumerate(panels):
+        x = 10 + panel * i
+        drawn += text(title, x + panel / 2, 34, 15, anchor="middle", bold=True)
+        if i == 0:
+            picture = outline(shape + centre - [64, 0], BLUE) + outline(other + centre + [64, 0], ORANGE)
+            a, b = shape + centre - [64, 0], other + centre + [64, 0]
+            picture = lines(a[[0, 1, 3, 4]], b[[0, 1, 3, 4]]) + picture
+        else:
+            moved = move(shape, shape, other, mirror=i == 1)
+            picture = outline(other + centre, ORANGE) + (lines(moved + centre, other + centre) if i == 2 else "")
+            picture += outline(moved + centre, BLUE, "7 9" if i == 1 else None)
+        drawn += group(picture, x, 0)
+        drawn += "".join(text(line, x + panel / 2, 236 + 20 * j, 14, anchor="middle") for j, line in enumerate(words))
+        if i:
+            drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2)
+    return svg(
+        drawn, width, height, "Mirror and rotation",
+        "A chair from its side and its mirror image. The best orthogonal matrix lays one exactly on the other, but it "
+        "is a "
+        "mirror. The best rotation leaves distances between the points, and is the answer.",
+    )  # fmt: skip
+
+
+def draw_ransac() -> str:
+    width, height, panel, radius = 860, 330, 280, 15
+    random = np.random.default_rng(3)
+    x = np.array(
+        [[-70, -60], [-22, -66], [34, -58], [72, -30], [60, 22], [24, 62], [-28, 58], [-72, 20], [-20, 0], [18, -8]],
+        float,
+    )
+    y = x @ np.array([[0.96, -0.2], [0.2, 0.96]]).T + random.normal(0, 3.5, x.shape)
+    y[[2, 6]] = [[74, 34], [-62, -22]]  # wrong matches, which agree by chance
+    samples = (2, 6, 8, 9), (0, 3, 5, 8)
+    drawn = ""
+    good = np.array([], int)
+    for i, title in enumerate(("A sample with wrong matches", "A sample of right matches", "Fitted to all inliers")):
+        left = 10 + panel * i
+        sample = np.array(samples[i]) if i < 2 else good
+        moved = move(x, x[sample], y[sample])
+        inside = np.linalg.norm(moved - y, axis=1) < radius
+        good = np.flatnonzero(inside)
+        picture = ""
+        for j, (a, b) in enumerate(zip(moved, y, strict=True)):
+            picture += ring(b, LINE, radius, 1.2)
+            picture += curve(straight(a, b), GREEN if inside[j] else VERMILLION, 2.4, None if inside[j] else "4 4")
+            picture += dot(b, ORANGE, 5) + dot(a, BLUE, 5)
+            if i < 2 and j in sample:
+                picture += ring(a, INK, 8, 2)
+        drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
+        drawn += group(picture, left + panel / 2, 148)
+        words = (f"{inside.sum()} inliers of {len(x)}: forgotten", f"{inside.sum()} inliers of {len(x)}: kept",
+                 f"{inside.sum()} inliers: the result")[i]  # fmt: skip
+        drawn += text(words, left + panel / 2, 262, 14, anchor="middle")
+        if i:
+            drawn += curve(f"M{left} 20V270", LINE, 1.2)
+    key = (
+        (dot(np.array([20, 300]), BLUE, 5), "reference point, moved", 32),
+        (dot(np.array([220, 300]), ORANGE, 5), "target point", 232),
+        (ring(np.array([350, 300]), LINE, 9, 1.6), "threshold", 366),
+        (curve("M462 300h22", GREEN, 2.4), "inlier", 490),
+        (curve("M556 300h22", VERMILLION, 2.4, "4 4"), "outlier", 584),
+        (ring(np.array([664, 300]), INK, 8, 2), "drawn in the sample", 678),
+    )
+    drawn += "".join(mark + text(word, at, 305, 13, GREY) for mark, word, at in key)
+    return svg(
+        drawn, width, height, "RANSAC",
+        "Three fits to the same matches, some of which are wrong. A sample with wrong matches has few inliers and is "
+        "forgotten, a sample of right matches has many and is kept, and the last fit uses all of its inliers.",
+    )  # fmt: skip
+
+
+DRAWINGS: dict[str, Callable[[], str]] = {
+    "method": draw_method,
+    "query_key_value": draw_query_key_value,
+    "cycle": draw_cycles,
+    "frames": draw_frames,
+    "mirror": draw_mirror,
+    "ransac": draw_ransac,
+    **{f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook)) for notebook in sorted(HERE)},
+}
+
+
+def main() -> None:
+    FOLDER.mkdir(exist_ok=True)
+    for name, draw in DRAWINGS.items():
+        (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
