@@ -63,14 +63,16 @@ format: $(STAMP)
 	$(RUN) -m ruff format .
 	$(RUN) -m ruff check --fix .
 
-# On a copy, so that the tracked notebooks stay as they are. Open3D brings dash along, whose JupyterLab extension would ask
-# for a build that nothing here needs; without an address for news, JupyterLab does not ask whether to fetch them.
+# On a copy, so that the tracked notebooks stay as they are. The root is this folder, as the notebooks link to docs/.
+# Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs; without an address
+# for news, JupyterLab does not ask whether to fetch them.
 lab: $(STAMP)
 	@[ -d $(LAB) ] || { cp -R notebooks $(LAB) && echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
 	@echo "Changes are saved in $(LAB)/. For a fresh copy, move that folder away and run make lab again."
 	@[ "$$(id -u)" != 0 ] || echo "You are root, as in most containers. JupyterLab refuses to run as root without --allow-root, so it is given."
 	$(RUN) -m jupyter lab $$([ "$$(id -u)" != 0 ] || echo --allow-root) --LabApp.news_url=None \
-	  --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" $(LAB)
+	  --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" \
+	  --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/$(LAB)
 
 notebooks: $(STAMP)
 	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
