@@ -111,7 +111,9 @@ def test_a_notebook_shows_its_stored_pictures_with_their_texts_and_what_it_print
     assert [text for text in shown if text in texts] == texts
     widgets = [output for output in outputs if "application/vnd.jupyter.widget-view+json" in output.get("data", {})]
     assert page.html.count("Interactive in a running notebook") == len(widgets)
-    assert len(shown) <= len(texts) + len(widgets) and all(len(text) > 20 for text in shown)
+    drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in nbformat.read(path, 4).cells))
+    assert all(" ".join(text.split()) in shown for text in drawings)
+    assert len(shown) <= len(texts) + len(widgets) + len(drawings) and all(len(text) > 20 for text in shown)
     for output in outputs:
         if output.output_type == "stream" and output.text.strip():
             assert output.text.strip().splitlines()[0].strip() in page.text
@@ -171,6 +173,8 @@ def test_every_notebook_can_be_downloaded_and_opens_in_colab_only_if_the_reposit
         assert ("colab.research.google.com" in page.html) == ("Repository" in URLS), path.name
         copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
         assert ("google.colab" in copy.cells[0].source) == ("Repository" in URLS), path.name
+        for drawing in re.findall(r"\]\((figures/[^)]+)\)", "\n".join(cell.source for cell in copy.cells)):
+            assert (site / "run" / path.relative_to(REPOSITORY).parent / drawing).is_file(), f"{path.name}: {drawing}"
 
 
 def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(course):

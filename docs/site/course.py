@@ -171,7 +171,7 @@ def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
 
 
 def write_files(app: Sphinx, error: Exception | None) -> None:
-    """Write the notebooks to run and plotly's script (Sphinx's event `build-finished`)."""
+    """Write the notebooks to run with their drawings, and plotly's script (Sphinx's event `build-finished`)."""
     if error or app.builder.format != "html":
         return
     for docname in app.env.found_docs:
@@ -182,6 +182,9 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
             copy = app.outdir / "run" / f"{docname}.ipynb"
             copy.parent.mkdir(parents=True, exist_ok=True)
             nbformat.write(runnable(notebook, app.config.course_repository), copy)
+    shutil.copytree(
+        app.srcdir / "notebooks" / "figures", app.outdir / "run" / "notebooks" / "figures", dirs_exist_ok=True
+    )
     script = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
     shutil.copy(script, app.outdir / "_static" / script.name)
 
