@@ -1,0 +1,563 @@
+"""Figures of the notebooks on the best view, the alignment of points, and metrics (03 to 05).
+
+Each function draws one complete figure from computed data; its name says what is shown.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Bool, Float, Real
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from zsp_lite.data.cameras import Camera
+from zsp_lite.viz.plots import BLUE, CHOSEN, GREEN, ORANGE, VERMILLION, draw_points, overlay_map, show_images
+
+_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
+_LINES = ("-", "--", "-.", ":")
+_MARKERS = ("o", "s", "^", "D")
+
+
+def view_ring(
+    reference: np.ndarray,
+    targets: Sequence[np.ndarray],
+    places: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
+    scores: Real[np.ndarray, " n"],
+    angles: Real[np.ndarray, " n"],
+) -> Figure:
+    """Show target views around their object as seen from above, each with its score and its angle to the reference.
+
+    The ring is turned so that the side of the reference is below. The view of highest score has a thick frame.
+
+    Args:
+        reference: Image (H, W, 3) of the reference.
+        targets: Images (H, W, 3) of the target views.
+        places: Directions of the target cameras and of the reference camera, from `viewpoints_from_above`.
+        scores: Score of each view.
+        angles: Angle of each view to the reference, in degrees.
+    """
+    side = places[1][0]
+    turned = places[0] @ np.stack([side[[1, 0]] * [-1, 1], -side], axis=1)
+    figure = plt.figure(figsize=(6.6, 6.4))
+    axis = figure.add_axes([0, 0, 1, 1], xlim=(-1.62, 1.62), ylim=(-1.56, 1.62))
+    axis.set_axis_off()
+    colours = plt.get_cmap("cividis")((scores - scores.min()) / max(np.ptp(scores), 1e-9))
+    axis.text(0, 0.05, "object", ha="center", va="center", color="0.3")
+    best = int(np.argmax(scores))
+    for i, (place, image) in enumerate(zip(turned, targets)):
+        axis.plot(*np.transpose([0.2 * place, place]), color=colours[i], linewidth=5, zorder=0)
+        picture = axis.inset_axes([*(1.22 * place - 0.26), 0.52, 0.52], transform=axis.transData)
+        title = f"{i + 1}: {scores[i]:.1f}, {angles[i]:.0f}°" + (" chosen" if i == best else "")
+        picture.set_title(title, fontsize=10, weight="bold" if i == best else "normal", pad=5)
+        _framed(picture, image, CHOSEN if i == best else colours[i], 6 if i == best else 4)
+    picture = axis.inset_axes([-0.2, -0.76, 0.4, 0.4], transform=axis.transData)
+    picture.set_title("reference", fontsize=10, pad=4)
+    _framed(picture, reference, BLUE, 3)
+    return figure
+
+
+def scores_over_angle(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
+    """Show each kind of score of the views over their angle to the reference, a panel each; the best view is ringed.
+
+    Args:
+        angles: Angle of each view to the reference, in degrees.
+        scores: Name of the score to its value for each view.
+    """
+    rows = -(-len(scores) // 2)
+    figure, axes = plt.subplots(rows, 2, figsize=(7.6, 3.5 * rows), layout="constrained", squeeze=False)
+    for axis, (name, values) in zip(axes.flat, scores.items()):
+        axis.scatter(angles, values, s=55, color=BLUE)
+        best = int(np.argmax(values))
+        axis.scatter(angles[best], values[best], s=220, facecolors="none", edgecolors=CHOSEN, linewidths=3)
+        axis.set(title=name, xlabel="angle to the reference (degrees)", ylabel="score")
+        axis.set(xlim=(-10, 190), xticks=range(0, 181, 45))
+        axis.margins(y=0.15)
+    return figure
+
+
+def accuracy_over_views(counts: Sequence[int], curves: Mapping[str, Sequence[Real[np.ndarray, " starts"]]]) -> Figure:
+    """Show the accuracy over the number of target views; bars span the choices of the first view.
+
+    Args:
+        counts: Numbers of target views.
+        curves: Name of a method to its accuracies in percent: for each number of views, one for each first view.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
+    shifts = np.geomspace(0.97, 1.03, len(curves))
+    for (name, values), colour, line, marker, shift in zip(curves.items(), _COLOURS, _LINES, _MARKERS, shifts):
+        at = shift * np.asarray(counts)
+        axis.plot(at, [np.mean(v) for v in values], line, marker=marker, color=colour, label=name, markersize=8)
+        axis.vlines(at, [np.min(v) for v in values], [np.max(v) for v in values], color=colour, alpha=0.5, linewidth=3)
+    axis.set(xscale="log", xlabel="number of target views N", ylabel="Acc30 (%)", ylim=(0, 100))
+    axis.set_xticks(counts, counts)
+    axis.minorticks_off()
+    figure.legend(fontsize=9, ncols=len(curves), loc="outside upper center")
+    return figure
+
+
+def choices_and_scores_over_angle(
+    categories: Sequence[str],
+    chosen: Real[np.ndarray, " pairs"],
+    angles: Real[np.ndarray, "pairs views"],
+    scores: Real[np.ndarray, "pairs views"],
+) -> Figure:
+    """Show for each category at which angles the chosen views lie, and the mean score of all views over the angle.
+
+    Args:
+        categories: Category of each pair.
+        chosen: Angle of the chosen view of each pair, in degrees.
+        angles: Angles of all views, in degrees.
+        scores: Scores of all views; the mean of each pair is subtracted.
+    """
+    categories, names = np.asarray(categories), list(dict.fromkeys(categories))
+    relative = scores - scores.mean(axis=1, keepdims=True)
+    part = (angles // 30).clip(max=5)
+    scatter = np.random.default_rng(0).uniform(-0.25, 0.25, len(categories))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for place, (name, colour, marker, line) in enumerate(zip(names, _COLOURS, _MARKERS, _LINES)):
+        here = categories == name
+        style = {"s": 40, "marker": marker, "color": colour, "edgecolors": "black", "linewidths": 0.3}
+        left.scatter(chosen[here], place + scatter[here], **style)
+        means = [relative[here][part[here] == k].mean() if (part[here] == k).any() else np.nan for k in range(6)]
+        right.plot(np.arange(15, 180, 30), means, line, marker=marker, color=colour, label=name)
+    left.set_yticks(range(len(names)), names)
+    left.set(
+        ylim=(-0.6, len(names) - 0.4), title="where the chosen view lies", xlim=(-5, 185), xticks=range(0, 181, 45)
+    )
+    right.set(xticks=range(0, 181, 45), ylabel="score minus the pair's mean", title="mean score of all views")
+    right.legend(fontsize=9)
+    for axis in (left, right):
+        axis.set_xlabel("angle to the reference (degrees)")
+    return figure
+
+
+def scores_of_views(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
+    """Show the scores of the same views, in the order of the camera's path, for several references.
+
+    Args:
+        angles: Angle of each view to the first reference, in degrees; labels of the ticks.
+        scores: Name of the reference to the scores of the views.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    views = np.arange(1, len(angles) + 1)
+    for (name, values), colour, line, marker in zip(scores.items(), _COLOURS, _LINES, _MARKERS):
+        axis.plot(views, values, line, marker=marker, color=colour, label=name)
+    axis.set_xticks(views, [f"{view}\n{angle:.0f}°" for view, angle in zip(views, angles)])
+    axis.set(xlabel=f"view, and its angle to the {next(iter(scores))}", ylabel="score")
+    figure.legend(ncols=len(scores), loc="outside upper center")
+    return figure
+
+
+def winning_scores(near: Real[np.ndarray, " n"], far: Real[np.ndarray, " m"]) -> Figure:
+    """Show histograms of the winning views' scores: of winners near the reference, and where only far views compete.
+
+    Args:
+        near: Scores of winning views that are near the reference.
+        far: Scores of winning views where all near views are withheld.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
+    both = np.concatenate([near, far])
+    bins = np.linspace(both.min() - 1, both.max() + 1, 19)
+    axis.hist(near, bins, color=BLUE, alpha=0.8, label="winner near the reference")
+    style = {"histtype": "step", "color": VERMILLION, "linewidth": 2, "hatch": "//"}
+    axis.hist(far, bins, label="winner when near views are withheld", **style)
+    axis.set(xlabel="score of the winning view", ylabel="pairs")
+    figure.legend(fontsize=9, ncols=2, loc="outside upper center")
+    return figure
+
+
+def depth_with_holes(
+    image: np.ndarray, depth: Real[np.ndarray, "h w"], filled: Real[np.ndarray, "h w"], limits: tuple[float, float]
+) -> Figure:
+    """Show an image, its depth map with the unknown pixels in white, and the depth map after filling.
+
+    Args:
+        image: Image (H, W, 3).
+        depth: Depth in scene units; 0 where unknown.
+        filled: Depth without holes.
+        limits: Depths at the ends of the colour map.
+    """
+    empty = np.ones_like(image)
+    figure, axes = show_images([image, empty, empty], ["crop", "depth, unknown pixels white", "filled"], size=3.1)
+    for axis, values in zip(axes[1:], (np.where(depth > 0, depth, np.nan), filled)):
+        axis.images[0].set_alpha(0)
+        overlay_map(axis, values, alpha=1, limits=limits, label="depth (scene units)")
+    return figure
+
+
+def filled_depth_errors(errors: Mapping[str, Real[np.ndarray, " n"]], tolerance: float) -> Figure:
+    """Show histograms of the errors of filled depths on a logarithmic axis, a panel for each part of the image.
+
+    Args:
+        errors: Name of the part to absolute errors in scene units.
+        tolerance: Error to mark by a line.
+    """
+    figure, axes = plt.subplots(1, len(errors), figsize=(9, 3.2), layout="constrained", sharex=True, squeeze=False)
+    for axis, (name, values), colour in zip(axes.flat, errors.items(), _COLOURS):
+        axis.hist(np.clip(values, 1e-3, None), np.geomspace(1e-3, 10, 40), color=colour, edgecolor="white")
+        axis.axvline(tolerance, color=VERMILLION, linestyle="--", label=f"{tolerance:g} scene units")
+        axis.set(xscale="log", title=name, xlabel="error of a filled depth (scene units)", ylabel="pixels")
+    axes[0, 0].legend(fontsize=9)
+    return figure
+
+
+def points_from_above(
+    panels: Mapping[str, Float[np.ndarray, "n 3"]], beside: Mapping[str, Bool[np.ndarray, " n"]], tolerance: float
+) -> Figure:
+    """Show camera-frame points from above, a panel for each way to compute them; points off the object are crosses.
+
+    Args:
+        panels: Title to points. The limits are set around the median of the last panel's points.
+        beside: Title to the points that are off the object's surface.
+        tolerance: Largest distance of a point on the object, in scene units; for the legend.
+    """
+    figure, axes = plt.subplots(1, len(panels), figsize=(9, 4.2), layout="constrained", sharex=True, sharey=True)
+    for axis, (title, points) in zip(axes, panels.items()):
+        off = beside[title]
+        axis.scatter(*points[~off][:, [0, 2]].T, s=10, color=BLUE, label="on the object")
+        crosses = {"s": 24, "marker": "x", "color": VERMILLION}
+        axis.scatter(*points[off][:, [0, 2]].T, label=f"off it by more than {tolerance:g}", **crosses)
+        axis.set_title(f"{title}\n{off.sum()} of {len(off)} points are off the object")
+        axis.set(xlabel="x, to the right (scene units)", ylabel="z, away (scene units)", aspect="equal")
+    middle = np.median(points, axis=0)
+    axes[0].set(xlim=middle[0] + np.array([-4, 4]), ylim=middle[2] + np.array([-2, 4]))
+    axes[0].legend(fontsize=9, loc="upper left")
+    return figure
+
+
+def fits_with_one_outlier(
+    fitted: Mapping[str, Float[np.ndarray, "n 3"]],
+    targets: Mapping[str, Float[np.ndarray, "n 3"]],
+    moves: Real[np.ndarray, " m"],
+    turned: Real[np.ndarray, " m"],
+) -> Figure:
+    """Show least-squares fits with one displaced target point, and the rotation error over its displacement.
+
+    Args:
+        fitted: Title to the source points after the fit.
+        targets: Title to the target points, of which the last is displaced.
+        moves: Displacements in scene units.
+        turned: Rotation error for each displacement, in degrees.
+    """
+    figure, axes = plt.subplots(1, len(fitted) + 1, figsize=(10.5, 3.4), layout="constrained")
+    for axis, (title, points) in zip(axes, fitted.items()):
+        target = targets[title]
+        axis.add_collection(LineCollection(np.stack([points, target], axis=1)[:, :, :2], colors="0.5", linewidths=0.8))
+        axis.scatter(*target[:, :2].T, s=70, facecolors="none", edgecolors=ORANGE, linewidths=1.8, label="target")
+        axis.scatter(*points[:, :2].T, s=25, marker="x", color=BLUE, label="source, fitted")
+        axis.set(title=title, aspect="equal", xlabel="x (scene units)", ylabel="y, down (scene units)")
+        axis.set(xlim=(-3, 8), ylim=(4, -4))
+    axes[0].legend(fontsize=9, loc="upper right")
+    axes[-1].plot(moves, turned, color=BLUE)
+    axes[-1].set(title="effect on the rotation", ylabel="rotation error (degrees)")
+    axes[-1].set_xlabel("last point moved by (scene units)")
+    return figure
+
+
+def trials_over_good_share(
+    shares: Real[np.ndarray, " n"],
+    needed: Mapping[str, Sequence[float]],
+    trials: int,
+    marks: Mapping[str, float],
+) -> Figure:
+    """Show how many trials are needed over the share of good matches, on a logarithmic axis.
+
+    Args:
+        shares: Shares of good matches, in [0, 1].
+        needed: Label of a curve to the number of trials for each share.
+        trials: Number of trials to mark by a horizontal line.
+        marks: Label to a share to mark by a vertical line.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    for (label, values), colour, style in zip(needed.items(), (GREEN, BLUE, ORANGE), (":", "-", "--")):
+        axis.plot(shares, values, style, color=colour, label=label, linewidth=2)
+    axis.axhline(trials, color="0.5", linewidth=1)
+    axis.text(0.98, 1.1 * trials, f"{trials:,} trials", ha="right", color="0.3")
+    for (label, share), style in zip(marks.items(), ("-.", (0, (1, 3)))):
+        axis.axvline(share, color=VERMILLION, linestyle=style, label=label)
+    axis.set(yscale="log", ylim=(1, 1e6), ylabel="trials for 99 %", xlabel="share w of good matches")
+    axis.legend(fontsize=9)
+    return figure
+
+
+def matched_points_after_fits(
+    fitted: Mapping[str, Float[np.ndarray, "n 3"]],
+    target: Float[np.ndarray, "n 3"],
+    inliers: Mapping[str, Bool[np.ndarray, " n"]],
+    surface: Float[np.ndarray, "m 3"],
+) -> Figure:
+    """Show matched points in the target camera's frame after several fits, a panel each, seen from the camera.
+
+    A line joins each moved reference point (cross) to its target point (circle): the residual. Residuals above the
+    threshold are thin and grey.
+
+    Args:
+        fitted: Title to the matched reference points after the fit.
+        target: Matched target points.
+        inliers: Title to the matches whose residual is below the threshold.
+        surface: Points of the target object, the background.
+    """
+    x, y, _ = np.median(surface, axis=0)
+    figure, axes = plt.subplots(1, len(fitted), figsize=(9.4, 4.9), layout="constrained", sharex=True, sharey=True)
+    for axis, (title, points) in zip(axes, fitted.items()):
+        good = inliers[title]
+        axis.scatter(*surface[:, :2].T, s=2, color="0.85", label="target object")
+        for where, colour, width, label in (
+            (~good, "0.55", 0.7, "residual above the threshold"), (good, BLUE, 2, "below it"),
+        ):  # fmt: skip
+            lines = np.stack([points[where], target[where]], axis=1)[:, :, :2]
+            axis.add_collection(LineCollection(lines, colors=colour, linewidths=width, label=label))
+        axis.scatter(*target[:, :2].T, s=36, facecolors="none", edgecolors=ORANGE, linewidths=1.6, label="target point")
+        axis.scatter(*points[:, :2].T, s=22, marker="x", color=BLUE, label="reference point, moved")
+        axis.set(title=f"{title}\n{good.sum()} of {len(good)} residuals below the threshold", aspect="equal")
+        axis.set(xlabel="x, to the right (scene units)", ylabel="y, down (scene units)")
+    axes[0].set(xlim=(x - 2.8, x + 2.8), ylim=(y + 2.8, y - 2.8))
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), fontsize=9, ncols=3, loc="outside lower center", markerscale=1.5
+    )
+    return figure
+
+
+def ransac_sweeps(
+    sweeps: Mapping[str, tuple[str, Mapping[float, tuple[Sequence[int], Sequence[float], int]]]], matches: int
+) -> Figure:
+    """Show inliers and rotation errors of several draws over a setting of RANSAC, a column for each sweep.
+
+    Args:
+        sweeps: Title to the name of the setting, and for each of its values the inliers and the rotation errors (in
+            degrees) of the draws, and the inliers for shuffled matches.
+        matches: Number of matches.
+    """
+    figure, axes = plt.subplots(2, len(sweeps), figsize=(10.4, 6.6), layout="constrained", sharex="col", sharey="row",
+                                squeeze=False)  # fmt: skip
+    for (above, below), (title, (setting, results)) in zip(axes.T, sweeps.items()):
+        for value, (counts, errors, chance) in results.items():
+            above.plot([value] * len(counts), counts, "o", color=BLUE, label="matches, one dot per draw")
+            above.plot(value, chance, "s", color="0.6", label="shuffled matches")
+            below.plot([value] * len(errors), errors, "o", color=VERMILLION)
+        above.set(title=title, ylim=(0, matches + 2))
+        below.set(xlabel=setting, xscale="log", ylim=(-5, 185))
+        below.set_xticks([*results], [f"{value:g}" for value in results])
+        below.minorticks_off()
+    axes[1, 0].set_yticks(range(0, 181, 45))
+    axes[0, 0].set_ylabel(f"inliers (of {matches})")
+    axes[1, 0].set_ylabel("rotation error (degrees)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles[:2], labels[:2], ncols=2, loc="outside upper center")
+    return figure
+
+
+def rotation_error_over_width(
+    widths: Real[np.ndarray, " n"], quartiles: Real[np.ndarray, "n 3"], noise: float
+) -> Figure:
+    """Show the rotation error of long thin point sets over their width: the median, and a band of the middle half.
+
+    Args:
+        widths: Widths of point sets of length 1, in scene units.
+        quartiles: The three quartiles of the rotation error for each width, in degrees.
+        noise: Standard deviation of the noise, marked by a line.
+    """
+    figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
+    low, middle, high = np.transpose(quartiles)
+    axis.fill_between(widths, low, high, color=BLUE, alpha=0.2, linewidth=0)
+    axis.plot(widths, middle, "o-", color=BLUE)
+    axis.axvline(noise, color="0.5", linestyle=":")
+    axis.text(1.05 * noise, 0.92 * np.max(high), "width = noise")
+    axis.set(xscale="log", xlabel="width of a set of length 1 (scene units)", ylabel="rotation error (degrees)")
+    return figure
+
+
+def angle_errors_of_formulas(
+    offsets: Real[np.ndarray, " n"], errors: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+) -> Figure:
+    """Show the largest error of formulas for the angle of a rotation near 0 and near 180 degrees, on logarithmic axes.
+
+    Args:
+        offsets: Distances from 0 and from 180 degrees, in degrees.
+        errors: Name of the formula and precision to its errors near 0 and near 180 degrees, for each distance; names
+            with "arccos" have one colour, and names with "single" have dashed lines.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharey=True)
+    for end, (panel, middle) in enumerate(zip(panels, (0, 180))):
+        for name, values in errors.items():
+            colour, line = VERMILLION if "arccos" in name else BLUE, "--" if "single" in name else "-"
+            panel.plot(offsets, values[end], line, color=colour, label=name)
+        panel.plot(offsets, offsets, ":", color="0.6", label="as large as the distance itself")
+        panel.set(xscale="log", yscale="log", ylim=(1e-17, 1), title=f"near {middle}°")
+        panel.set(xlabel=f"distance from {middle}° (degrees)", ylabel="largest error (degrees)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def pose_chain(
+    images: tuple[np.ndarray, np.ndarray],
+    cameras: tuple[Camera, Camera],
+    in_cameras: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
+    in_worlds: Mapping[str, tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]],
+    colours: Float[np.ndarray, "n 3"],
+) -> Figure:
+    """Show points on their way from one camera to the other: over two images, and in the worlds between them.
+
+    Args:
+        images: Images of the first and the last camera.
+        cameras: The first and the last camera.
+        in_cameras: The points in the frames of both cameras.
+        in_worlds: Name of a world to the points in it and the cloud of the object whose world it is.
+        colours: Colour of each point.
+    """
+    figure, axes = plt.subplots(2, 3, figsize=(10.2, 7), layout="constrained")
+    panels = list(axes.flat)
+    panels.pop(5).set_axis_off()
+    for number, panel, image, camera, points in zip((1, 5), (panels[0], panels[4]), images, cameras, in_cameras):
+        panel.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
+        draw_points(panel, camera, points, colours, size=2)
+        panel.set(title=f"{number}  camera of {'a' if number == 1 else 'b'}", xticks=[], yticks=[])
+    for number, panel, (name, (points, cloud)) in zip((2, 3, 4), panels[1:4], in_worlds.items()):
+        panel.scatter(*cloud[:, :2].T, s=2, color="0.8")
+        panel.scatter(*points[:, :2].T, s=3, c=colours)
+        panel.set(title=f"{number}  {name}", xlabel="x (scene units)", ylabel="y (scene units)", aspect="equal")
+        panel.invert_yaxis()
+    return figure
+
+
+def share_of_benchmarks(gains: Real[np.ndarray, " n"], curves: Mapping[str, Real[np.ndarray, "2 n"]]) -> Figure:
+    """Show how often a benchmark shows a true gain at all, and significantly, over the gain.
+
+    Args:
+        gains: True gains in points.
+        curves: Name of the benchmark to both shares in percent, for each gain.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained", sharey=True)
+    titles = "the better method comes out ahead", "... and significantly so"
+    for row, (panel, title) in enumerate(zip(panels, titles)):
+        for (name, shares), colour, line, marker in zip(curves.items(), _COLOURS, _LINES, _MARKERS):
+            panel.plot(gains, shares[row], line, marker=marker, color=colour, label=name)
+        panel.set(title=title, xlabel="true gain (points of Acc30)", ylabel="share of benchmarks (%)")
+    panels[0].legend(fontsize=9)
+    return figure
+
+
+def measured_accuracies(
+    distributions: Mapping[str, Sequence[tuple[Real[np.ndarray, " n"], Real[np.ndarray, " n"]]]], labels: Sequence[str]
+) -> Figure:
+    """Show the probability densities of the accuracies that benchmarks would measure, a panel each.
+
+    Args:
+        distributions: Title to the accuracies (percent) and densities of each method.
+        labels: Name of each method.
+    """
+    figure, axes = plt.subplots(1, len(distributions), figsize=(10.5, 3.5), layout="constrained")
+    for axis, (title, methods) in zip(np.atleast_1d(axes), distributions.items()):
+        for (values, density), label, colour, line in zip(methods, labels, _COLOURS, _LINES):
+            axis.plot(values, density, line, color=colour, label=label)
+        axis.set(xlim=(30, 66), title=title, xlabel="measured Acc30 (%)", ylabel="probability density (1/%)")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def accuracies_with_intervals(
+    accuracies: Mapping[str, float], intervals: Mapping[str, Mapping[str, tuple[float, float]]]
+) -> Figure:
+    """Show accuracies of methods, each with several kinds of intervals beside each other.
+
+    Args:
+        accuracies: Name of the method to its accuracy in percent.
+        intervals: Kind of interval to the interval of each method, in percent.
+    """
+    figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
+    shifts = np.linspace(-0.12, 0.12, len(intervals))
+    for (kind, found), colour, marker, shift in zip(intervals.items(), _COLOURS, _MARKERS, shifts):
+        at = np.arange(len(accuracies)) + shift
+        low, high = np.transpose([found[name] for name in accuracies])
+        axis.vlines(at, low, high, color=colour, linewidth=3)
+        axis.plot(at, [*accuracies.values()], marker, color=colour, markersize=8, label=kind)
+    axis.set_xticks(range(len(accuracies)), accuracies)
+    axis.set(ylabel="Acc30 (%)", ylim=(-2, 102))
+    figure.legend(fontsize=9, ncols=len(intervals), loc="outside upper center")
+    return figure
+
+
+def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str], limit: float = 30.0) -> Figure:
+    """Show all rotation errors, a row of dots for each category, with the median as a bar.
+
+    Args:
+        errors: Rotation errors in degrees.
+        categories: Category of each error.
+        limit: Error to mark by a line, in degrees.
+    """
+    categories, names = np.asarray(categories), list(dict.fromkeys(categories))
+    scatter = np.random.default_rng(0).uniform(-0.28, 0.28, len(errors))
+    figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
+    for row, (name, marker) in enumerate(zip(names, _MARKERS * len(names))):
+        here = categories == name
+        style = {"s": 40, "marker": marker, "color": BLUE, "edgecolors": "white", "linewidths": 0.4}
+        axis.scatter(errors[here], row + scatter[here], **style)
+        axis.plot([np.median(errors[here])] * 2, [row - 0.4, row + 0.4], color=VERMILLION, linewidth=2.5)
+    axis.axvline(limit, color="0.5", linestyle="--", linewidth=1)
+    axis.set_yticks(range(len(names)), names)
+    axis.set(xlim=(-3, 183), xticks=range(0, 181, 30))
+    axis.set_xlabel(f"rotation error (degrees); bar: median; dashed: {limit:.0f}°")
+    return figure
+
+
+def distances_over_turn(turns: Real[np.ndarray, " n"], distances: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
+    """Show closest-point distances of objects to themselves over the angle by which they are turned.
+
+    Args:
+        turns: Angles in degrees.
+        distances: Name of the object to its distance for each angle, in scene units.
+    """
+    figure, axis = plt.subplots(figsize=(7.5, 3.5), layout="constrained")
+    for (name, values), colour, line, marker in zip(distances.items(), _COLOURS, _LINES, _MARKERS):
+        axis.plot(turns, values, line, marker=marker, color=colour, label=name, markersize=5)
+    axis.set(xlabel="turned about the vertical by (degrees)", xticks=range(0, 181, 30))
+    axis.set_ylabel("closest-point distance (scene units)")
+    axis.legend(fontsize=9)
+    return figure
+
+
+def distances_between_instances(
+    angles: Real[np.ndarray, " n"], curves: Mapping[str, Real[np.ndarray, "pairs n"]]
+) -> Figure:
+    """Show closest-point distances between instances over the angle from the true pose; a triangle marks each minimum.
+
+    Args:
+        angles: Angles from the true pose, in degrees.
+        curves: Category to the distances of each pair, in scene units.
+    """
+    figure, panels = plt.subplots(1, len(curves), figsize=(11, 3.8), layout="constrained", sharey=True, squeeze=False)
+    for panel, (name, pairs) in zip(panels.flat, curves.items()):
+        for distances in pairs:
+            panel.plot(angles, distances, color="0.75", linewidth=1)
+            panel.plot(angles[distances.argmin()], distances.min(), "v", color=VERMILLION, markersize=7)
+        panel.axvline(0, color=BLUE)
+        panel.set(title=name, xticks=range(0, 361, 90), xlabel="angle from the truth (degrees)", ylim=(0, None))
+    panels[0, 0].set_ylabel("closest-point distance (scene units)")
+    return figure
+
+
+def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]], limit: float = 30.0) -> Figure:
+    """Show the rotation errors of two methods on the same pairs against each other.
+
+    Args:
+        errors: Names of the two methods to their errors in degrees.
+        limit: Error to mark by lines, in degrees.
+    """
+    (first, x), (second, y) = errors.items()
+    figure, axis = plt.subplots(figsize=(4.8, 4.6), layout="constrained")
+    axis.scatter(x, y, s=32, color=BLUE, alpha=0.7)
+    axis.plot([0, 180], [0, 180], color="0.8", zorder=0)
+    for draw in (axis.axvline, axis.axhline):
+        draw(limit, color="0.5", linestyle="--", linewidth=1)
+    ticks = range(0, 181, 30)
+    axis.set(xlabel=f"error, {first} (degrees)", ylabel=f"error, {second} (degrees)", xticks=ticks, yticks=ticks)
+    axis.set_aspect("equal")
+    return figure
+
+
+def _framed(axis: Axes, image: np.ndarray, colour: object, width: float) -> None:
+    axis.imshow(image)
+    axis.set(xticks=[], yticks=[])
+    axis.spines[:].set(color=colour, linewidth=width)
