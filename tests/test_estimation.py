@@ -105,7 +105,11 @@ def test_json_has_every_number_of_the_estimates(own):
         np.testing.assert_allclose(one["scale"] * np.array(one["rotation"]), np.array(one["matrix"])[:3, :3])
         assert one["view_name"] == found.targets[one["view"]].name and one["flags"] == list(estimate.flags)
         assert one["error_degrees"] == found.result.errors[solver] and one["confidence"] == estimate.confidence
-        assert len(one["alternatives"]) == max(len(estimate.hypotheses) - 1, 0)
+        assert one["one_of_two"] == estimate.one_of_two
+        for other, alternative in zip(one["alternatives"], estimate.alternatives, strict=True):
+            assert other["probability"] == alternative.probability > 0
+            np.testing.assert_array_equal(other["matrix"], alternative.sim3.matrix)
+        assert len(one["alternatives"]) > 0 or solver == "paper"
     assert content["degrees_between_solvers"] == found.result.disagreement < 20
 
 

@@ -15,7 +15,7 @@ from zsp_lite.data.frames import read_image
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pair_result import SOLVER_CHOICES, alternatives
+from zsp_lite.pair_result import SOLVER_CHOICES
 from zsp_lite.points import object_cloud
 from zsp_lite.viz.report import (
     COLUMNS,
@@ -90,18 +90,20 @@ def test_the_table_has_a_row_for_each_solver(results):
     assert len(COLUMNS) == 7
 
 
-def test_alternatives_are_the_hypotheses_below_the_best_with_angles_in_the_world(results):
+def test_alternatives_are_the_different_poses_below_the_best_with_angles_in_the_world(results):
     estimate = results[0].estimates["verified"]
-    found = alternatives(estimate)
-    assert alternatives(results[0].estimates["paper"]) == []
-    assert len(found) == len(estimate.hypotheses) - 1 > 0
+    found = estimate.alternatives
+    assert results[0].estimates["paper"].alternatives == ()
+    different = [one for index, one in enumerate(estimate.hypotheses) if one.mode == index]
+    assert len(different) == len(found) + 1 > 1
     assert [one.rank for one in found] == list(range(2, len(found) + 2))
     # The angle does not depend on the view in which the poses are expressed.
     target = estimate.target_camera
-    for one, hypothesis in zip(found, estimate.hypotheses[1:]):
+    for one, hypothesis in zip(found, different[1:]):
         own = estimate.target_views[hypothesis.view].frame.camera
         in_target = target.R @ own.R.T @ hypothesis.sim3.R
-        assert one.angle == pytest.approx(rotation_error(estimate.sim3.R, in_target)) and one.angle >= 14.9
+        assert one.angle == pytest.approx(rotation_error(estimate.sim3.R, in_target)) and one.angle >= 29.9
+        assert one.probability == hypothesis.confidence
         assert one.deficit == estimate.hypotheses[0].score - hypothesis.score >= 0
 
 
@@ -154,8 +156,9 @@ def test_the_page_shows_both_answers_with_confidence_and_hypotheses(results, tex
         assert f"<h3>{solver} solver: rotation error {error:.1f}°</h3>" in " ".join(text.split("\n"))
     assert f"Confidence {estimate.confidence:.2f}: the estimated probability" in text
     assert "This solver does not estimate its confidence." in text
-    for one in alternatives(estimate):
-        assert f"<td>{one.rank}</td><td>{one.angle:.0f}°</td><td>{one.deficit:.1f}</td>" in text
+    for one in estimate.alternatives:
+        cells = (f"{one.rank}", f"{one.angle:.0f}°", f"{one.deficit:.1f}", f"{one.probability:.2f}")
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in text
 
 
 def test_terms_are_explained_and_stages_lead_to_their_notebooks(text):

@@ -78,6 +78,7 @@ def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
         )
         assert 0 <= one.confidence <= 1
     assert max(one.confidence for one in found) == found[0].confidence
+    assert sum(one.confidence for index, one in enumerate(found) if one.mode == index) <= 1
     cameras = [view.frame.camera for view in estimate.target_views]
     rotations = [one.sim3.R.T @ cameras[one.view].R for one in found]  # all from the targets' world
     apart = rotation_error(np.stack(rotations)[:, None], np.stack(rotations)[None])
@@ -163,6 +164,7 @@ def test_the_papers_solver_is_the_default_and_has_no_hypotheses(method, views):
     default = ZeroShotPose(method.backbone).estimate_from_views(views[0], views[1:])
     assert (paper.sim3.matrix == default.sim3.matrix).all()
     assert default.hypotheses == () and default.confidence is None
+    assert default.alternatives == () and not default.one_of_two
 
 
 def test_a_given_mask_replaces_the_saliency(method, frames):
@@ -291,8 +293,13 @@ def test_a_symmetric_object_is_flagged_as_ambiguous(method, symmetry):
     paint, turns = SYMMETRIES[symmetry]
     frames = [egg(direction, paint, f"egg {i}") for i, direction in enumerate([(0.9, -0.5, 0.3), *ALL_AROUND])]
     found = method.estimate(frames[0], frames[1:])
-    assert "poses more than 30 degrees apart explain the views equally well" in found.note
     assert "the object may be symmetric" in found.note and not found.reliable
+    assert ("one of two: poses" in found.note) == found.one_of_two
+    assert ("poses more than 30 degrees apart explain the views equally well" in found.note) != found.one_of_two
+    assert sum(one.probability for one in found.alternatives) + found.confidence <= 1
+    if len(turns) == 1:
+        assert found.one_of_two and found.alternatives[0].angle > 150
+        assert found.confidence >= found.alternatives[0].probability > found.confidence / np.e
     assert found.confidence < 0.75
     # Both answers are among the hypotheses, the one as true as the other.
     first = frames[0].camera

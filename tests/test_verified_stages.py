@@ -19,6 +19,9 @@ from zsp_lite.verified.confidence import (
     Calibration,
     auroc,
     calibration_for,
+    hypothesis_probabilities,
+    is_one_of_two,
+    modes,
     reliability,
     score_margins,
 )
@@ -593,3 +596,68 @@ def test_a_score_margin_is_over_the_best_distinct_rival():
     apart = np.array([[0.0, 20, 90], [20, 0, 100], [90, 100, 0]])
     np.testing.assert_allclose(score_margins(score, apart), [2, 1.5, -2])
     np.testing.assert_allclose(score_margins(score[:1], apart[:1, :1]), [8])  # without a rival
+
+
+# Angles between five rotations about one axis, of 0, 20, 180, 190 and 90 degrees.
+TURNS = np.array([0.0, 20, 180, 190, 90])
+APART = np.abs((TURNS[:, None] - TURNS + 180) % 360 - 180)
+
+
+def test_hypotheses_within_30_degrees_of_a_better_one_are_the_same_pose():
+    np.testing.assert_array_equal(modes(APART), [0, 0, 2, 2, 4])
+    # The nearest of the better poses stands for it: 25 degrees from the first, 10 from the second.
+    line = np.array([0.0, 35, 25])
+    np.testing.assert_array_equal(modes(np.abs(line[:, None] - line)), [0, 1, 1])
+
+
+def test_probabilities_of_hypotheses_by_hand():
+    # The second pose is 0.5 nats below the first, the third 2. The first leaves enough for their odds.
+    score, calibration = np.array([5.0, 4.9, 4.5, 4.4, 3.0]), Calibration(-0.5, 1.0, 0.0)
+    best = 1 / (1 + np.exp(0.5 - 0.5))
+    second, third = best * np.exp(-0.5), best * np.exp(-2.0)
+    assert best + second + third <= 1
+    found = hypothesis_probabilities(score, APART, calibration, 0.03)
+    np.testing.assert_allclose(found, [best, best, second, second, third])
+
+
+def test_probabilities_are_divided_where_the_best_pose_leaves_less_than_the_odds_say():
+    score, calibration = np.array([5.0, 4.9, 4.5, 4.4, 3.0]), Calibration(1.0, 1.0, 0.0)
+    best = 1 / (1 + np.exp(-1.5))
+    none = np.exp(-9.0)  # odds of a wrong pose without a rival
+    odds = np.exp([-0.5, -2.0])
+    found = hypothesis_probabilities(score, APART, calibration, 0.0)[[0, 2, 4]]
+    np.testing.assert_allclose(found, [best, *((1 - best) * odds / (none + odds.sum()))])
+    assert 0 < 1 - found.sum() < 1e-4
+
+
+@given(
+    st.lists(st.floats(0, 40), min_size=0, max_size=5),
+    st.sampled_from([1, 2, 3, 4, 5, 10]),
+    st.floats(0, 0.3),
+)
+def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, n_views, view_std):
+    score = 10 - np.cumsum([0.0, *deficits])
+    turns = 60.0 * np.arange(len(score))
+    apart = np.abs((turns[:, None] - turns + 180) % 360 - 180)
+    calibration = calibration_for(n_views)
+    found = hypothesis_probabilities(score, apart, calibration, view_std)
+    assert found[0] == calibration.confidence(score_margins(score, apart), view_std)[0]
+    assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
+
+
+def test_with_one_view_most_of_the_mass_is_left_for_none_of_the_poses():
+    score = np.array([5.0, 4.0])
+    apart = np.array([[0.0, 180], [180, 0]])
+    assert hypothesis_probabilities(score, apart, calibration_for(1), 0.03).sum() < 0.5
+    assert hypothesis_probabilities(score, apart, calibration_for(5), 0.03).sum() > 0.7
+
+
+def test_an_answer_is_one_of_two_if_two_poses_far_apart_are_nearly_equally_probable():
+    probability = np.array([0.45, 0.45, 0.35, 0.35, 0.1])
+    assert is_one_of_two(probability, APART)
+    assert not is_one_of_two(np.array([0.6, 0.6, 0.2, 0.2, 0.1]), APART)  # the second is too improbable
+    assert not is_one_of_two(np.array([0.4, 0.4, 0.3, 0.3, 0.2]), APART)  # one of three
+    assert not is_one_of_two(np.array([0.25, 0.25, 0.2, 0.2, 0.05]), APART)  # probably none
+    assert not is_one_of_two(probability, APART / 3.01)  # 59.8 degrees apart: a third rotation may be near both
+    assert is_one_of_two(probability[[0, 2]], np.array([[0.0, 61], [61, 0]]))
+    assert not is_one_of_two(np.array([0.9]), np.zeros((1, 1)))

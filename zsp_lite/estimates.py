@@ -29,7 +29,10 @@ class Hypothesis:
         view: Index of the target view that is closest to the reference viewpoint under this pose.
         score: In nats, comparable between the hypotheses of one estimate.
         terms: The terms that the score is a weighted sum of, by name.
-        confidence: Probability that the rotation error is below 30 degrees.
+        confidence: Probability that the rotation error is below 30 degrees. Over different poses, those whose `mode` is
+            their own index, the probabilities sum to at most 1 (see `verified.confidence.hypothesis_probabilities`).
+        mode: Index of the hypothesis that stands for this pose: its own, or that of a better one that is the same pose
+            within 30 degrees.
     """
 
     sim3: Sim3
@@ -37,6 +40,29 @@ class Hypothesis:
     score: float
     terms: dict[str, float]
     confidence: float
+    mode: int
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another pose that explains the views, less well than the estimate.
+
+    Attributes:
+        rank: Rank among the different poses; the estimate has 1.
+        sim3: Reference-camera points to camera points of target view `view`.
+        view: Index of the target view that is closest to the reference viewpoint under this pose.
+        probability: Probability that its rotation error is below 30 degrees. Together with the estimate's confidence,
+            the probabilities of all alternatives sum to at most 1; the rest is that of none of these.
+        angle: Angle between its rotation and that of the estimate in degrees.
+        deficit: Score of the estimate minus its own, in nats.
+    """
+
+    rank: int
+    sim3: Sim3
+    view: int
+    probability: float
+    angle: float
+    deficit: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +80,8 @@ class PoseEstimate:
         timings: Seconds per stage.
         flags: One line per reason not to trust the estimate.
         hypotheses: Candidate poses of the solver, best first; empty for the paper's solver.
+        one_of_two: Whether the solver cannot decide between the estimate and its first alternative: both are nearly
+            equally probable and far apart, such as by a half turn (see `verified.confidence.is_one_of_two`).
     """
 
     sim3: Sim3
@@ -66,6 +94,7 @@ class PoseEstimate:
     timings: dict[str, float] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
+    one_of_two: bool = False
 
     @property
     def target_camera(self) -> Camera:
@@ -81,6 +110,28 @@ class PoseEstimate:
     def confidence(self) -> float | None:
         """Probability that the rotation error is below 30 degrees; None if the solver does not estimate it."""
         return self.hypotheses[0].confidence if self.hypotheses else None
+
+    @cached_property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Other poses, most probable first, without those within 30 degrees of a better one; () without hypotheses."""
+        different = [one for index, one in enumerate(self.hypotheses) if one.mode == index]
+        return tuple(
+            Alternative(
+                rank, one.sim3, one.view, one.confidence,
+                float(rotation_error(self.world_rotation(), self.world_rotation(one))),
+                different[0].score - one.score,
+            )
+            for rank, one in enumerate(different[1:], 2)
+        )  # fmt: skip
+
+    def world_rotation(self, pose: "Hypothesis | Alternative | None" = None) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from the reference camera's frame to the world of the target views.
+
+        Args:
+            pose: A pose of this estimate; by default the estimate's own.
+        """
+        sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
+        return self.target_views[view].frame.camera.R.T @ sim3.R
 
     @property
     def reliable(self) -> bool:

@@ -24,7 +24,6 @@ from zsp_lite.pair_result import (
     SEQUENCE_FRAMES,
     SOLVER_CHOICES,
     PairResult,
-    alternatives,
     label_error,
     solve_pair,
 )
@@ -78,12 +77,13 @@ class OwnPair:
                 "confidence": estimate.confidence,
                 "error_degrees": self.result.errors.get(solver),
                 "flags": list(estimate.flags),
+                "one_of_two": estimate.one_of_two,
                 "alternatives": [
                     {
-                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "degrees_from_best": one.angle,
-                        "score_below_best": one.deficit,
+                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.probability,
+                        "degrees_from_best": one.angle, "score_below_best": one.deficit,
                     }
-                    for one in alternatives(estimate)
+                    for one in estimate.alternatives
                 ],
                 "seconds": dict(estimate.timings),
             }  # fmt: skip

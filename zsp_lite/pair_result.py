@@ -3,10 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from jaxtyping import Float
-
-from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, relative_pose
 from zsp_lite.data.pairs import Pair
@@ -56,46 +52,8 @@ class PairResult:
         """Angle in degrees between the rotations of two solvers; None if only one ran."""
         if len(self.estimates) < 2:
             return None
-        first, second = (world_rotation(one, one.sim3, one.view) for one in self.estimates.values())
+        first, second = (one.world_rotation() for one in self.estimates.values())
         return float(rotation_error(first, second))
-
-
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """A hypothesis of the verified solver below its best one.
-
-    Attributes:
-        rank: Rank among the hypotheses; the best one has 1.
-        sim3: Reference-camera points to camera points of target view `view`.
-        view: Index of the target view that is closest to the reference viewpoint under this pose.
-        angle: Angle between its rotation and that of the best hypothesis in degrees.
-        deficit: Score of the best hypothesis minus its own, in nats.
-    """
-
-    rank: int
-    sim3: Sim3
-    view: int
-    angle: float
-    deficit: float
-
-
-def alternatives(estimate: PoseEstimate) -> list[Alternative]:
-    """List the hypotheses of an estimate below the best one, best first; the paper's solver has none."""
-    best, *others = estimate.hypotheses or (None,)
-    return [
-        Alternative(
-            rank, one.sim3, one.view,
-            float(rotation_error(world_rotation(estimate, best.sim3, best.view),
-                                 world_rotation(estimate, one.sim3, one.view))),
-            best.score - one.score,
-        )
-        for rank, one in enumerate(others, 2)
-    ]  # fmt: skip
-
-
-def world_rotation(estimate: PoseEstimate, sim3: Sim3, view: int) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation from the reference camera's frame to the world of the target views."""
-    return estimate.target_views[view].frame.camera.R.T @ sim3.R
 
 
 def label_error(

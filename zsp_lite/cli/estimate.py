@@ -108,7 +108,6 @@ def _print_tables(found) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from zsp_lite.pair_result import alternatives
     from zsp_lite.viz.report import COLUMNS, table_rows
 
     console, result = Console(markup=False, highlight=False), found.result
@@ -127,10 +126,10 @@ def _print_tables(found) -> None:
         console.print(f"{solver}: reference-camera points to camera points of view {one.view + 1} ({view})")
         for line in one.sim3.matrix:
             console.print("  " + " ".join(f"{value:10.5f}" for value in line))
-        for other in alternatives(one):
+        for other in one.alternatives:
             console.print(
                 f"  hypothesis {other.rank}: turned by {other.angle:.0f}° from the best, "
-                f"score {other.deficit:.1f} nats below it"
+                f"score {other.deficit:.1f} nats below it, probability {other.probability:.2f}"
             )
         for flag in one.flags:
             console.print(f"  flag: {flag}", soft_wrap=True)

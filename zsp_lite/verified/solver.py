@@ -12,7 +12,15 @@ from torch import Tensor
 from zsp_lite.best_view import ViewPair
 from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, match_points, timed
-from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, calibration_for, score_margins
+from zsp_lite.verified.confidence import (
+    MODE_ANGLE,
+    TIE_MARGIN,
+    Calibration,
+    calibration_for,
+    hypothesis_probabilities,
+    is_one_of_two,
+    modes,
+)
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
@@ -23,12 +31,6 @@ from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
 _MAX_REFINED, _MIN_ANGLE_REFINED = 12, 20.0
-# Hypotheses are tied if their scores differ by less than this many nats. On ellipsoids whose features have the same
-# symmetry, seen from all sides, the scores of equally correct poses differ by 0.6 nats in the median and by less than
-# 1 in three of four cases. Of training pairs with a margin below 1, the best hypothesis was correct in 62 %
-# (tools/tuning.py). Ties are not detected if the views show more of the object under one pose than under the other:
-# then scores of equally correct poses differ by several nats.
-TIE_MARGIN = 1.0
 # The estimate is flagged below this fraction of points that lie on an observed surface, in both directions.
 _MIN_OVERLAP = 0.05
 # The estimate is flagged below this similarity term, in both directions. Correct and wrong hypotheses have 0.06 and
@@ -44,6 +46,7 @@ class Solution:
         hypotheses: Best score first, at least one, at least 15 degrees apart.
         view_angles: (N,) angle in degrees between the reference's camera and each target view's under the best one.
         flags: One line per reason not to trust the best one.
+        one_of_two: Whether the answer is one of two poses (see `confidence.is_one_of_two`).
         timings: Seconds per stage.
         scene: The scene that poses were scored on.
         view_order: Index of the target view behind each view of the scene.
@@ -53,6 +56,7 @@ class Solution:
     hypotheses: tuple[Hypothesis, ...]
     view_angles: Float[np.ndarray, " n"]
     flags: tuple[str, ...]
+    one_of_two: bool
     timings: dict[str, float]
     scene: Scene
     view_order: tuple[int, ...]
@@ -93,7 +97,7 @@ class VerifiedSolver:
         residual = np.linalg.norm(best.sim3.apply(source) - target, axis=1)
         return PoseEstimate(
             best.sim3, best.view, matches, residual < threshold * solution.target_spread, -solution.view_angles,
-            reference, tuple(targets), solution.timings, solution.flags, solution.hypotheses,
+            reference, tuple(targets), solution.timings, solution.flags, solution.hypotheses, solution.one_of_two,
         )  # fmt: skip
 
     def solve(
@@ -142,7 +146,10 @@ class VerifiedSolver:
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)
-        return Solution(hypotheses, view_angles, reliability_flags(hypotheses, poses), timings, scene, order, poses)
+        angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
+        one_of_two = is_one_of_two(np.array([one.confidence for one in hypotheses]), angle)
+        flags = reliability_flags(hypotheses, poses, one_of_two)
+        return Solution(hypotheses, view_angles, flags, one_of_two, timings, scene, order, poses)
 
     def _hypotheses(
         self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
@@ -151,12 +158,15 @@ class VerifiedSolver:
         score = self.weights.score(terms).double().numpy()
         angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
         calibration = self.calibration or calibration_for(len(order))
-        confidence = calibration.confidence(score_margins(score, angle), scene.view_similarity_std)
+        confidence = hypothesis_probabilities(score, angle, calibration, scene.view_similarity_std)
+        mode = modes(angle)
         view_angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
         hypotheses = []
         for i, view in enumerate(view_angle.argmin(axis=1)):
             sim3 = scene.to_sim3(poses, i, int(view))
-            hypotheses.append(Hypothesis(sim3, order[view], float(score[i]), terms.as_dict(i), float(confidence[i])))
+            hypotheses.append(
+                Hypothesis(sim3, order[view], float(score[i]), terms.as_dict(i), float(confidence[i]), int(mode[i]))
+            )
         view_angles = np.empty(len(order))
         view_angles[list(order)] = view_angle[0]
         return tuple(hypotheses), view_angles
@@ -176,16 +186,24 @@ def tied_hypotheses(score: Float[Tensor, " m"], rotation: Float[Tensor, "m 3 3"]
     return [int(i) for i in modes if score[modes[0]] - score[i] < TIE_MARGIN]
 
 
-def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses) -> tuple[str, ...]:
+def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses, one_of_two: bool = False) -> tuple[str, ...]:
     """Say why the best hypothesis may be wrong, one line per reason.
 
     Args:
         hypotheses: Hypotheses, best first.
         poses: The same in working units.
+        one_of_two: Whether the answer is one of two poses.
     """
     terms, flags = hypotheses[0].terms, []
     tied = tied_hypotheses(torch.tensor([one.score for one in hypotheses]), poses.rotation)
-    if len(tied) > 1:
+    if one_of_two:
+        second = next(i for i, one in enumerate(hypotheses) if i > 0 and one.mode == i)
+        angle = float(rotation_angles(poses.rotation[:1], poses.rotation[second : second + 1]))
+        flags.append(
+            f"one of two: poses {angle:.0f} degrees apart explain the views about equally well (probabilities "
+            f"{hypotheses[0].confidence:.2f} and {hypotheses[second].confidence:.2f}): the object may be symmetric"
+        )
+    elif len(tied) > 1:
         scores = ", ".join(f"{hypotheses[i].score:.1f}" for i in tied)
         flags.append(
             f"{len(tied)} poses more than 30 degrees apart explain the views equally well (scores {scores}): "

@@ -29,7 +29,7 @@ from zsp_lite.demo import PhotographResult
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.pair_result import PairResult, alternatives
+from zsp_lite.pair_result import PairResult
 from zsp_lite.points import axis_deviation, coloured_cloud, object_cloud
 from zsp_lite.views import View, frame_defect, object_crop
 from zsp_lite.viz import plots
@@ -171,7 +171,7 @@ def _answer(solver: str, estimate: PoseEstimate, result: PairResult) -> dict:
         "matrix": estimate.sim3.matrix,
         "scale": estimate.sim3.scale,
         "view": estimate.view + 1,
-        "alternatives": alternatives(estimate),
+        "alternatives": estimate.alternatives,
         "flags": estimate.flags,
         "timings": estimate.timings,
     }
@@ -420,7 +420,7 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     poses = []
     for solver, estimate in result.estimates.items():
         poses.append((f"{solver} solver", _in_camera(estimate, estimate.sim3, estimate.view, camera)))
-        for one in alternatives(estimate):
+        for one in estimate.alternatives:
             pose = _in_camera(estimate, one.sim3, one.view, camera)
             poses.append((f"{solver} solver, hypothesis {one.rank}", pose))
     scene = aligned_clouds(poses[0][1].apply(cloud), target, colours=(colours, target_colours))
