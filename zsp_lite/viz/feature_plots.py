@@ -1,0 +1,560 @@
+"""Figures of the notebooks on the first estimate (00), features (01) and cyclical distances (02).
+
+Each function shows one thing and returns the figure. They are made of the primitives of `plots`.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int, Real, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch, Rectangle
+from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import ArrayLike
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.data.frames import Frame
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.features import FeatureMap
+from zsp_lite.matching import Matches
+from zsp_lite.points import object_cloud
+from zsp_lite.synthetic.ground_truth import GroundTruthPair
+from zsp_lite.views import View
+from zsp_lite.viz import plots
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+_POINTS = 1500  # drawn of a cloud
+_AXIS_LENGTH = 2.0  # scene units; the points of an object have unit standard deviation
+_WRONG = "#D40000"  # with black borders or beside orange, also distinguishable with colour-vision deficiencies
+_MAP = {"limits": (-8, 0), "cmap": "cividis", "alpha": 0.85}  # of a cyclical distance map
+_COLOURS = plots.ORANGE, plots.BLUE, plots.GREEN, plots.VERMILLION
+
+
+def views_with_choice(reference: Frame, targets: Sequence[Frame], chosen: int, size: float = 3.0) -> Figure:
+    """Show the reference and the target views, three in a row, with a frame around the chosen target view.
+
+    Args:
+        reference: Reference frame.
+        targets: Target frames.
+        chosen: Index of the chosen target view.
+        size: Width of an image in inches.
+    """
+    titles = ["reference", *(f"target {number}" for number in range(1, len(targets) + 1))]
+    figure, axes = plots.show_images([frame.rgb for frame in (reference, *targets)], titles, columns=3, size=size)
+    plots.mark(axes[1 + chosen], "chosen")
+    return figure
+
+
+def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Figure:
+    """Show the reference under its own points, and for each estimate its target view under the moved points.
+
+    The colour of a point is its position along the reference object.
+
+    Args:
+        estimates: Estimates with one reference, by the title of their panel.
+        size: Width of a panel in inches.
+    """
+    reference = next(iter(estimates.values())).reference_view
+    cloud = object_cloud(reference, most=_POINTS)
+    colours = plots.coordinate_colours(cloud)
+    chosen = [estimate.target_views[estimate.view].frame for estimate in estimates.values()]
+    pictures = [reference.frame.rgb, *(frame.rgb for frame in chosen)]
+    figure, axes = plots.show_images(pictures, ["reference, its own points", *estimates], size=size)
+    plots.draw_points(axes[0], reference.frame.camera, cloud, colours)
+    for axis, frame, estimate in zip(axes[1:], chosen, estimates.values()):
+        plots.draw_points(axis, frame.camera, estimate.sim3.apply(cloud), colours)
+    return figure
+
+
+def matches_of_estimate(estimate: PoseEstimate, size: float = 3.6) -> Figure:
+    """Show the matches between the reference and the chosen target view; see `plots.draw_matches` for the lines.
+
+    Args:
+        estimate: Estimate.
+        size: Width of an image in inches.
+    """
+    views = estimate.reference_view, estimate.target_views[estimate.view]
+    ends = [
+        plots.patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
+        for cells, view in zip((estimate.matches.reference, estimate.matches.target), views)
+    ]
+    pictures = [view.frame.rgb for view in views]
+    return plots.draw_matches(*pictures, *ends, estimate.inliers, ("reference", "chosen target"), size=size)
+
+
+def moved_points_in_frames(
+    reference: View, frames: Sequence[Frame], poses: Sequence[Sim3], size: float = 3.0
+) -> Figure:
+    """Show frames of the target sequence, three in a row, under the reference's points and camera axes.
+
+    Args:
+        reference: Reference view.
+        frames: Frames of the target sequence.
+        poses: For each frame, the similarity from reference-camera points to its camera points.
+        size: Width of a frame in inches.
+    """
+    cloud = object_cloud(reference, most=_POINTS)
+    colours = plots.coordinate_colours(cloud)
+    titles = [f"frame {frame.name.split('/')[-1]}" for frame in frames]
+    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=size)
+    for axis, frame, pose in zip(axes, frames, poses):
+        plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
+        plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), _AXIS_LENGTH, names=("", "", ""))
+    return figure
+
+
+def saliency_of_backbones(
+    images: Mapping[str, Image], maps: Mapping[str, Sequence[FeatureMap]], size: float = 3.0
+) -> Figure:
+    """Show the saliency of several backbones on several images, one image per row.
+
+    Args:
+        images: Images by title.
+        maps: For each backbone, by its name, the features of every image.
+        size: Width of a panel in inches.
+    """
+    pictures = [image for image in images.values() for _ in range(1 + len(maps))]
+    titles = [title for name in images for title in (name, *maps)]
+    figure, axes = plots.show_images(pictures, titles, columns=1 + len(maps), size=size)
+    for row in range(len(images)):
+        for axis, features in zip(axes[row * (1 + len(maps)) + 1 :], maps.values()):
+            plots.overlay_map(axis, features[row].saliency.cpu().numpy(), alpha=0.75, limits=(0, 1))
+    return figure
+
+
+def image_in_patches(
+    image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int], count: int = 8
+) -> Figure:
+    """Show an image under the grid of its patches, and some of them pulled apart.
+
+    Args:
+        image: Image.
+        patches: Its patches.
+        corner: (row, col) of the first patch that is pulled apart.
+        count: Number of rows and of columns that are pulled apart.
+    """
+    rows, cols, p = patches.shape[:3]
+    (top, left), last = corner, count - 1
+    titles = [f"{rows} x {cols} patches", f"rows {top} to {top + last}, columns {left} to {left + last}"]
+    figure, axes = plots.show_images([image, image[:1, :1]], titles, size=3.4)
+    axes[0].vlines(np.arange(0, cols * p, p), 0, rows * p, color="white", linewidth=0.5)
+    axes[0].hlines(np.arange(0, rows * p, p), 0, cols * p, color="white", linewidth=0.5)
+    for row, col in np.ndindex(count, count):
+        x, y = 1.25 * col, 1.25 * row
+        axes[1].imshow(patches[top + row, left + col], extent=(x, x + 1, y + 1, y))
+    axes[1].set(xlim=(-0.25, 1.25 * count), ylim=(1.25 * count, -0.25))
+    return figure
+
+
+def maps_of_positions(maps: Mapping[tuple[int, int], Real[np.ndarray, "rows cols"]], label: str) -> Figure:
+    """Show maps over the patch grid, from 0 to 1, without an image; a circle marks the patch of each.
+
+    Args:
+        maps: Maps by their patch (row, col).
+        label: Label of the colour bars.
+    """
+    shape = next(iter(maps.values())).shape
+    titles = [f"position ({row}, {col})" for row, col in maps]
+    figure, axes = plots.show_images([np.ones((*shape, 3))] * len(maps), titles, size=3.2)
+    for axis, (cell, values) in zip(axes, maps.items()):
+        plots.overlay_map(axis, values, alpha=1, limits=(0, 1), label=label)
+        _circle(axis, cell, shape, shape)
+    return figure
+
+
+def attention_of_patch(
+    image: Image, cell: tuple[int, int], weights: Mapping[str, Float[np.ndarray, "rows cols"]], columns: int
+) -> Figure:
+    """Show the attention weights of one patch, each panel relative to its largest weight; a circle marks the patch.
+
+    Args:
+        image: Image.
+        cell: The patch (row, col).
+        weights: Weights by the title of their panel; the largest one is added to the title.
+        columns: Panels per row.
+    """
+    titles = [f"{title}\nat most {values.max():.0%}" for title, values in weights.items()]
+    figure, axes = plots.show_images([image] * len(weights), titles, columns=columns, size=2.6)
+    for axis, values in zip(axes, weights.values()):
+        plots.overlay_map(axis, values / values.max(), alpha=0.75)
+        _circle(axis, cell, values.shape, image.shape[:2], size=5)
+    return figure
+
+
+def similarities_of_patch(
+    image: Image,
+    cell: tuple[int, int],
+    pictures: Sequence[Image],
+    maps: Mapping[str, Real[np.ndarray, "rows cols"]],
+    true_cell: ArrayLike | None = None,
+    limits: tuple[float, float] | None = None,
+    size: float = 3.2,
+) -> Figure:
+    """Show a patch of an image, and how similar the patches of other pictures are to it.
+
+    A circle marks the patch, and in each other panel the most similar patch; a star marks the true partner.
+
+    Args:
+        image: Image.
+        cell: The patch (row, col).
+        pictures: Picture of each map.
+        maps: Similarities by the title of their panel.
+        true_cell: The true partner (row, col) in all pictures; None if there is none to show.
+        limits: Values at the ends of the colours; default those of each map.
+        size: Width of a panel in inches.
+    """
+    columns = 2 if len(maps) == 3 else min(1 + len(maps), 3)
+    figure, axes = plots.show_images([image, *pictures], ["this patch", *maps], columns=columns, size=size)
+    _circle(axes[0], cell, next(iter(maps.values())).shape, image.shape[:2])
+    for axis, picture, values in zip(axes[1:], pictures, maps.values()):
+        values = np.asarray(values)
+        plots.overlay_map(axis, values, limits=limits, label="cosine")
+        _circle(axis, np.unravel_index(values.argmax(), values.shape), values.shape, picture.shape[:2])
+        if true_cell is not None:
+            centre = plots.patch_centres(np.array([true_cell]), values.shape, picture.shape[:2])[0]
+            axis.plot(*centre, "*", color=plots.ORANGE, markersize=18, markeredgecolor="black")
+    return figure
+
+
+def true_partners(pair: GroundTruthPair, count: int = 14, seed: int = 0) -> Figure:
+    """Show some patches of the reference with the patches of the target that show the same place.
+
+    Args:
+        pair: Pair with its true matches.
+        count: Number of patches, drawn at random.
+        seed: Seed of the draw.
+    """
+    known = np.argwhere(pair.valid)
+    some = known[np.random.default_rng(seed).choice(len(known), min(count, len(known)), replace=False)]
+    grid = pair.valid.shape
+    ends = [
+        plots.patch_centres(cells, grid, frame.rgb.shape[:2])
+        for cells, frame in ((some, pair.reference), (pair.cells[tuple(some.T)], pair.target))
+    ]
+    return plots.draw_matches(
+        pair.reference.rgb, pair.target.rgb, *ends, titles=("reference", "target: the same places"), size=3.6
+    )
+
+
+def scores_by_layer(scores: pd.DataFrame, used: int, guessing: float) -> Figure:
+    """Draw a score against the layer, one line for each facet.
+
+    Args:
+        scores: Shares from 0 to 1; one row per layer, one column per facet.
+        used: Layer that the backbone is used at, drawn as a dashed line.
+        guessing: Score of a random partner, drawn as a dotted line.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
+    for name, marker, colour in zip(scores.columns, "o^sD", _COLOURS):
+        width = 2.5 if name == "key" else 1.2
+        axis.plot(scores.index, 100 * scores[name], marker=marker, color=colour, label=name, linewidth=width)
+    axis.axhline(100 * guessing, color="0.4", linestyle=":", label="guessing")
+    axis.axvline(used, color="0.6", linestyle="--", linewidth=1)
+    axis.set(xlabel="layer", ylabel="nearest neighbour within one patch (%)", xticks=scores.index, ylim=(0, None))
+    axis.legend(ncols=5, loc="lower right", fontsize=9)
+    return figure
+
+
+def rows_of_pictures(rows: Mapping[str, Sequence[np.ndarray]], size: float = 2.0) -> Figure:
+    """Show rows of pictures, each under the title of its row.
+
+    Args:
+        rows: As many pictures in each row, by its title.
+        size: Width of a picture in inches.
+    """
+    columns = len(next(iter(rows.values())))
+    pictures = [picture for row in rows.values() for picture in row]
+    titles = [title for title in rows for _ in range(columns)]
+    return plots.show_images(pictures, titles, columns=columns, size=size)[0]
+
+
+def cls_attention_and_saliency(
+    image: Image, attention: Float[np.ndarray, "heads rows cols"], saliency: Float[np.ndarray, "rows cols"]
+) -> Figure:
+    """Show what CLS attends to in each head, relative to the largest weight of the head, and the saliency.
+
+    Args:
+        image: Image.
+        attention: Weights of the patches in each head.
+        saliency: Saliency from 0 to 1.
+    """
+    titles = [*(f"CLS, head {head}" for head in range(len(attention))), "saliency"]
+    figure, axes = plots.show_images([image] * len(titles), titles, columns=4, size=2.4)
+    for axis, values in zip(axes, [*(head / head.max() for head in attention), saliency]):
+        plots.overlay_map(axis, values, alpha=0.8, limits=(0, 1))
+    return figure
+
+
+def foreground_above(image: Image, saliency: Float[np.ndarray, "rows cols"], thresholds: Sequence[float]) -> Figure:
+    """Show the patches whose saliency is above each of some thresholds.
+
+    Args:
+        image: Image.
+        saliency: Saliency from 0 to 1.
+        thresholds: One panel each.
+    """
+    titles = [f"saliency above {threshold}" for threshold in thresholds]
+    figure, axes = plots.show_images([image] * len(titles), titles, size=3.0)
+    for axis, threshold in zip(axes, thresholds):
+        plots.overlay_map(axis, np.where(saliency > threshold, saliency, np.nan), limits=(0, 1))
+    return figure
+
+
+def overlap_by_threshold(thresholds: Float[np.ndarray, " t"], overlap: Float[np.ndarray, "n t"], used: float) -> Figure:
+    """Draw the overlap of foreground and mask against the threshold, thin for each image and bold for the mean.
+
+    Args:
+        thresholds: Thresholds of the saliency.
+        overlap: Intersection over union of each image at each threshold.
+        used: Threshold that the method uses, drawn as a dashed line.
+    """
+    figure, axis = plt.subplots(figsize=(5.6, 3.6), layout="constrained")
+    axis.plot(thresholds, overlap.T, color="0.75", linewidth=1)
+    axis.plot(thresholds, overlap.mean(axis=0), color=plots.BLUE, linewidth=2.5, label=f"mean of {len(overlap)}")
+    axis.axvline(used, color="black", linestyle="--", label=f"threshold {used}")
+    axis.set(xlabel="threshold of the saliency", ylabel="intersection over union (IoU)", ylim=(0, 1))
+    axis.legend(loc="lower left", fontsize=9)
+    return figure
+
+
+def bins_of_patches(image: Image, cells: Mapping[str, tuple[int, int]], grid: tuple[int, int]) -> Figure:
+    """Show the 17 bins of the log-binned descriptor of some patches: nine white cells and eight dashed blocks.
+
+    Args:
+        image: Image.
+        cells: Patches (row, col) by the title of their panel.
+        grid: Patches (rows, columns) of the image.
+    """
+    figure, axes = plots.show_images([image] * len(cells), list(cells), size=3.4)
+    height, width = image.shape[0] / grid[0], image.shape[1] / grid[1]
+    near = {"edgecolor": "white", "linewidth": 1.2}
+    far = {"edgecolor": "black", "linewidth": 2, "linestyle": "--"}
+    for axis, cell in zip(axes, cells.values()):
+        for step in np.ndindex(3, 3):
+            for reach, half, style in ((1, 0, near), (3, 1, far)):
+                if half and step == (1, 1):
+                    continue
+                row, col = (np.clip(c + reach * (s - 1), 0, n - 1) for c, s, n in zip(cell, step, grid))
+                (top, left), (bottom, right) = (
+                    [np.clip(place, 0, n) for place, n in zip(corner, grid)]
+                    for corner in ((row - half, col - half), (row + half + 1, col + half + 1))
+                )
+                box = (left * width, top * height), (right - left) * width, (bottom - top) * height
+                axis.add_patch(Rectangle(*box, fill=False, **style))
+    return figure
+
+
+def similarities_within_images(
+    images: Mapping[str, Image],
+    cells: Mapping[str, tuple[int, int]],
+    similarities: Mapping[str, Mapping[str, Real[np.ndarray, "rows cols"]]],
+    size: float = 2.4,
+) -> Figure:
+    """Show, for one patch of each image, how similar the other patches of the same image are to it.
+
+    Args:
+        images: Images by title, one per row.
+        cells: The patch (row, col) of each image, marked by a circle.
+        similarities: For each backbone, by its name, the similarities in each image; one column per backbone.
+        size: Width of a panel in inches.
+    """
+    pictures = [image for image in images.values() for _ in range(1 + len(similarities))]
+    titles = [title for name in images for title in (name, *similarities)]
+    figure, axes = plots.show_images(pictures, titles, columns=1 + len(similarities), size=size)
+    panels = iter(axes)
+    for name, image in images.items():
+        first, values = next(panels), next(iter(similarities.values()))[name]
+        _circle(first, cells[name], values.shape, image.shape[:2])
+        for maps in similarities.values():
+            plots.overlay_map(next(panels), maps[name], alpha=0.75, limits=(0, 1))
+    return figure
+
+
+def toy_cycles(
+    values: tuple[Real[np.ndarray, "rows cols"], Real[np.ndarray, "rows cols"]],
+    cycles: Sequence[tuple[tuple[int, int], tuple[int, int], tuple[int, int]]],
+    wrong: Sequence[int] = (),
+) -> Figure:
+    """Show two grids of numbers and some cycles u, v, u' between them: solid arrows to v, dashed ones back to u'.
+
+    Args:
+        values: Number of each patch of the first and the second image.
+        cycles: Patches (row, col) u, v and u' of each cycle.
+        wrong: Indices of the cycles that are drawn in red; the others are orange.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(8.6, 4.3), layout="constrained")
+    for axis, numbers, title in zip(axes, values, ("first image", "second image")):
+        axis.imshow(numbers, cmap="Greys", vmin=0, vmax=400)
+        ticks = {"xticks": range(numbers.shape[1]), "yticks": range(numbers.shape[0])}
+        axis.set(title=title, xlabel="column", ylabel="row", **ticks)
+        for (row, col), number in np.ndenumerate(numbers):
+            axis.text(col - 0.42, row - 0.3, number, va="center")
+    for index, (u, v, back) in enumerate(cycles):
+        colour = _WRONG if index in wrong else plots.ORANGE
+        for (start, end), (first, last), line in (((u, v), axes, "-"), ((v, back), axes[::-1], "--")):
+            arrow = ConnectionPatch(
+                start[::-1], end[::-1], "data", "data", axesA=first, axesB=last, arrowstyle="-|>", mutation_scale=18,
+                connectionstyle="arc3,rad=-0.1", linestyle=line, linewidth=2.2, color=colour,
+            )  # fmt: skip
+            figure.add_artist(arrow)
+        axes[0].plot(*u[::-1], "o", color=colour, markeredgecolor="black", markersize=10)
+    return figure
+
+
+def cyclical_map(reference: Image, distances: Real[np.ndarray, "rows cols"], target: Image) -> Figure:
+    """Show a reference, its cyclical distance map, and the target.
+
+    Args:
+        reference: Reference image.
+        distances: Map C over the reference, -infinity off the foreground.
+        target: Target image.
+    """
+    titles = ["reference", "map C over the reference", "target"]
+    figure, axes = plots.show_images([reference, reference, target], titles, size=3.2)
+    plots.overlay_map(axes[1], distances, label="− d(u, u') in patches", **_MAP)
+    return figure
+
+
+def cyclical_maps(pictures: Sequence[Image], maps: Mapping[str, Real[np.ndarray, "rows cols"]]) -> Figure:
+    """Show several cyclical distance maps, each over its picture, two per row.
+
+    Args:
+        pictures: Picture of each map.
+        maps: Maps by the title of their panel.
+    """
+    figure, axes = plots.show_images(list(pictures), list(maps), columns=2, size=3.2)
+    for axis, values in zip(axes, maps.values()):
+        plots.overlay_map(axis, values, **_MAP)
+    return figure
+
+
+def cycles_between(
+    reference: Image,
+    target: Image,
+    cycles: Mapping[str, ArrayLike],
+    grid: tuple[int, int],
+    wrong: Sequence[str] = (),
+) -> Figure:
+    """Show cycles between two images, one per row: a solid line from u to v, a dashed one from v to u'.
+
+    Args:
+        reference: Reference image.
+        target: Target image of the same size.
+        cycles: Patches (row, col) u, v and u' of each cycle, by the title of its row.
+        grid: Patches (rows, columns) of both images.
+        wrong: Titles of the cycles that are drawn in red; the others are white.
+    """
+    (height, width), gap = reference.shape[:2], 10
+    picture = np.concatenate([reference, np.full((height, gap, 3), 255, np.uint8), target], axis=1)
+    figure, axes = plots.show_images([picture] * len(cycles), list(cycles), columns=1, size=6.6)
+    for axis, (title, cells) in zip(axes, cycles.items()):
+        ends = plots.patch_centres(np.array(cells), grid, (height, width)) + [(0, 0), (width + gap, 0), (0, 0)]
+        border = [Stroke(linewidth=4.5, foreground="black"), Normal()]
+        style = {"color": _WRONG if title in wrong else "white", "linewidth": 2.2, "path_effects": border}
+        for part, line in (([0, 1], "-"), ([1, 2], "--")):
+            axis.plot(*ends[part].T, line, **style)
+        for name, end, side in zip(("u", "v", "u'"), ends, ("left", "left", "right")):
+            white = [Stroke(linewidth=3, foreground="white"), Normal()]
+            axis.text(*end, name, fontsize=11, weight="bold", va="bottom", ha=side, path_effects=white)
+    return figure
+
+
+def counts_of_matches(counts: Mapping[str, pd.DataFrame], wanted: int) -> Figure:
+    """Draw how many matches each rule finds in several pairs of views, one marker for each pair.
+
+    Args:
+        counts: Numbers of matches by category; one row per pair of views, one column per rule.
+        wanted: Number that the method wants, drawn as a dashed line.
+    """
+    figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
+    rules = list(next(iter(counts.values())).columns)
+    for index, (name, table) in enumerate(counts.items()):
+        for place, rule in enumerate(reversed(rules)):
+            heights = np.full(len(table), place) + 0.16 * (index - (len(counts) - 1) / 2)
+            axis.scatter(
+                table[rule], heights, s=45, marker="osD^"[index % 4], color=_COLOURS[index % 4], edgecolors="black",
+                label=None if place else name,
+            )  # fmt: skip
+    axis.axvline(wanted, color="0.4", linestyle="--")
+    labels = {"yticks": range(len(rules)), "yticklabels": rules[::-1]}
+    axis.set(xlabel=f"matches (dashed: {wanted})", xlim=(0, None), **labels)
+    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def correct_by_length(table: pd.DataFrame) -> Figure:
+    """Draw the share of correct matches against the length of their cycle, with the number of matches.
+
+    Args:
+        table: One row per range of lengths, named by its index; columns "correct" (share from 0 to 1) and "matches".
+    """
+    figure, axis = plt.subplots(figsize=(6.8, 3.6), layout="constrained")
+    shares = 100 * table["correct"]
+    bars = axis.bar(table.index, shares, color=plots.BLUE)
+    labels = [f"{share:.0f} % of {count:.0f}" for share, count in zip(shares, table["matches"])]
+    axis.bar_label(bars, labels, fontsize=9)
+    axis.set(xlabel="d(u, u') in patches", ylabel="right within one patch (%)")
+    axis.margins(y=0.15)
+    return figure
+
+
+def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[int, int]) -> Figure:
+    """Show where the matches of several rules start, coloured by their cyclical distance.
+
+    Args:
+        image: Reference image.
+        matches: Matches by the title of their panel.
+        grid: Patches (rows, columns) of the image.
+    """
+    figure, axes = plots.show_images([image] * len(matches), list(matches), size=4.0)
+    for axis, some in zip(axes, matches.values()):
+        centres = plots.patch_centres(some.reference, grid, image.shape[:2]).T
+        style = {"cmap": "cividis_r", "vmin": 0, "vmax": 3, "s": 50, "edgecolors": "white"}
+        dots = axis.scatter(*centres, c=some.distance, **style)
+    figure.colorbar(dots, ax=axes, label="d(u, u') in patches", shrink=0.8)
+    return figure
+
+
+def accuracy_by_number(curves: pd.DataFrame) -> Figure:
+    """Draw the share of correct matches against the number of matches kept, one line for each matcher.
+
+    Args:
+        curves: Shares from 0 to 1; one row per number of matches, one column per matcher.
+    """
+    figure, axis = plt.subplots(figsize=(7.4, 4), layout="constrained")
+    for name, line, marker, colour in zip(curves.columns, ("-", "--", "-.", ":"), "osD^", _COLOURS):
+        style = {"linestyle": line, "marker": marker, "color": colour, "markersize": 4}
+        axis.plot(curves.index, 100 * curves[name], label=name, **style)
+    axis.set(xlabel="matches kept per pair, best first", ylabel="right of those known (%)", ylim=(0, None))
+    axis.legend(loc="upper right", ncols=2)
+    return figure
+
+
+def judged_matches(
+    images: tuple[Image, Image],
+    cells: tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]],
+    good: Bool[np.ndarray, " n"],
+    grid: tuple[int, int],
+    titles: tuple[str, str],
+) -> Figure:
+    """Show matches between two images; the good ones are solid, the others dashed.
+
+    Args:
+        images: Reference and target image.
+        cells: Patches (row, col) of the matches in both.
+        good: Which matches are good.
+        grid: Patches (rows, columns) of both images.
+        titles: Titles of the images.
+    """
+    ends = [plots.patch_centres(some, grid, image.shape[:2]) for some, image in zip(cells, images)]
+    return plots.draw_matches(*images, *ends, good, titles, size=3.8)
+
+
+def _circle(axis: Axes, cell: ArrayLike, grid: tuple[int, int], image: tuple[int, int], size: float = 8) -> None:
+    """Mark a patch (row, col) of an image by a white circle."""
+    centre = plots.patch_centres(np.array([cell]), grid, image)[0]
+    axis.plot(*centre, "o", color="white", markersize=size, markeredgecolor="black")
