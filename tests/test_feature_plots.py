@@ -59,7 +59,7 @@ def test_attention_is_shown_relative_to_its_largest_weight():
 def test_the_most_similar_patch_has_a_circle_and_the_true_one_a_star():
     similar = np.zeros(GRID)
     similar[2, 1] = 0.9
-    figure = figures.similarities_of_patch(IMAGE, (0, 0), [IMAGE], {"key": similar}, true_cell=(1, 3))
+    figure = figures.similarities_of_patch(IMAGE, (0, 0), [IMAGE], {"key": similar}, np.array([1, 3]))
     first, second = (axis for axis in figure.axes if axis.get_title())
     assert markers(first) == [(10, 10)]
     assert markers(second) == [(30, 50)] and markers(second, "*") == [(70, 30)]
@@ -145,7 +145,7 @@ def test_the_wrong_cycle_of_the_toy_is_red_and_goes_back_dashed():
 
 
 def test_a_wrong_cycle_between_images_has_another_colour():
-    cycles = {"right": [(0, 0), (0, 1), (0, 0)], "wrong": [(2, 0), (1, 1), (2, 0)]}
+    cycles = {"right": np.array([(0, 0), (0, 1), (0, 0)]), "wrong": np.array([(2, 0), (1, 1), (2, 0)])}
     figure = figures.cycles_between(IMAGE, IMAGE, cycles, GRID, wrong=["wrong"])
     colours = [{line.get_color() for line in axis.lines} for axis in figure.axes]
     assert colours[0] == {"white"} and "white" not in colours[1]

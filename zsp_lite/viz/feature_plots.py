@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
-from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
@@ -190,7 +189,7 @@ def similarities_of_patch(
     cell: tuple[int, int],
     pictures: Sequence[Image],
     maps: Mapping[str, Real[np.ndarray, "rows cols"]],
-    true_cell: ArrayLike | None = None,
+    true_cell: Int[np.ndarray, "2"] | None = None,
     limits: tuple[float, float] | None = None,
     size: float = 3.2,
 ) -> Figure:
@@ -213,9 +212,9 @@ def similarities_of_patch(
     for axis, picture, values in zip(axes[1:], pictures, maps.values()):
         values = np.asarray(values)
         plots.overlay_map(axis, values, limits=limits, label="cosine")
-        _circle(axis, np.unravel_index(values.argmax(), values.shape), values.shape, picture.shape[:2])
+        _circle(axis, divmod(int(values.argmax()), values.shape[1]), values.shape, picture.shape[:2])
         if true_cell is not None:
-            centre = plots.patch_centres(np.array([true_cell]), values.shape, picture.shape[:2])[0]
+            centre = plots.patch_centres(true_cell[None], values.shape, picture.shape[:2])[0]
             axis.plot(*centre, "*", color=plots.ORANGE, markersize=18, markeredgecolor="black")
     return figure
 
@@ -435,7 +434,7 @@ def cyclical_maps(pictures: Sequence[Image], maps: Mapping[str, Real[np.ndarray,
 def cycles_between(
     reference: Image,
     target: Image,
-    cycles: Mapping[str, ArrayLike],
+    cycles: Mapping[str, Int[np.ndarray, "3 2"]],
     grid: tuple[int, int],
     wrong: Sequence[str] = (),
 ) -> Figure:
@@ -452,7 +451,7 @@ def cycles_between(
     picture = np.concatenate([reference, np.full((height, gap, 3), 255, np.uint8), target], axis=1)
     figure, axes = plots.show_images([picture] * len(cycles), list(cycles), columns=1, size=6.6)
     for axis, (title, cells) in zip(axes, cycles.items()):
-        ends = plots.patch_centres(np.array(cells), grid, (height, width)) + [(0, 0), (width + gap, 0), (0, 0)]
+        ends = plots.patch_centres(cells, grid, (height, width)) + [(0, 0), (width + gap, 0), (0, 0)]
         border = [Stroke(linewidth=4.5, foreground="black"), Normal()]
         style = {"color": _WRONG if title in wrong else "white", "linewidth": 2.2, "path_effects": border}
         for part, line in (([0, 1], "-"), ([1, 2], "--")):
@@ -554,7 +553,7 @@ def judged_matches(
     return plots.draw_matches(*images, *ends, good, titles, size=3.8)
 
 
-def _circle(axis: Axes, cell: ArrayLike, grid: tuple[int, int], image: tuple[int, int], size: float = 8) -> None:
+def _circle(axis: Axes, cell: tuple[int, int], grid: tuple[int, int], image: tuple[int, int], size: float = 8) -> None:
     """Mark a patch (row, col) of an image by a white circle."""
     centre = plots.patch_centres(np.array([cell]), grid, image)[0]
     axis.plot(*centre, "o", color="white", markersize=size, markeredgecolor="black")
