@@ -4,11 +4,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from synthetic_views import AT_HOME, CoordinateBackbone, look_at, render
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import reliability
 from zsp_lite.verified.maps import Projection, ViewMaps
+from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreWeights
+from zsp_lite.views import extract_views, object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz import verified as verified_plots
 
@@ -120,3 +124,79 @@ def test_reliability_points_lie_at_confidence_and_frequency():
     # Wilson's interval for 3 of 10, from a table: 10.8 % to 60.3 %.
     low, high = axis.containers[0][2][0].get_segments()[0][:, 1]
     assert (low, high) == pytest.approx((0.108, 0.603), abs=1e-3)
+    assert axis.get_title() == "10 answers for each point" and not axis.texts
+
+
+def test_counts_that_differ_stand_beside_their_points():
+    _, axis = plt.subplots()
+    verified_plots.draw_reliability(axis, reliability(np.linspace(0.1, 0.9, 5), np.arange(5) > 1, bins=2))
+    assert sorted(text.get_text() for text in axis.texts) == ["2", "3"] and not axis.get_title()
+
+
+def test_some_of_the_views_can_be_drawn(evidence, maps):
+    figure = verified_plots.show_point_classes([IMAGE], evidence, maps, [0], ["target 1"], ["right"])
+    assert figure.axes[0].get_title() == "right: target 1" and len(figure.axes[0].collections) == 5
+    _, axes = plots.show_images([IMAGE] * 2)
+    with pytest.raises(InputError, match="2 axes, expected one for each of the 1 views"):
+        verified_plots.draw_point_classes(axes, evidence, maps, views=[0])
+
+
+def test_a_term_is_shown_for_each_pose_in_a_row_of_its_own(evidence, maps):
+    parts = (evidence.surface, evidence.silhouette, evidence.free_space, evidence.similarity)
+    fields = vars(evidence.projection).values()
+    both = PointTerms(Projection(*(torch.cat([x, x]) for x in fields)), *(torch.cat([x, 0 * x]) for x in parts))
+    figure = verified_plots.show_point_term([IMAGE], both, maps, "silhouette", [0], ["target 1"], ["right", "wrong"])
+    first, second = (axis.collections[0].get_array() for axis in figure.axes[:2])
+    assert first.max() > 0 and second.max() == 0
+
+
+def test_the_reference_lies_on_itself_under_the_identity():
+    frame = object_crop(render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"))
+    (view,) = extract_views(CoordinateBackbone(), [frame])
+    identity = Sim3(1.0, np.eye(3), np.zeros(3))
+    figure = verified_plots.show_moved_reference(view, [view], [identity], {0: ("itself", plots.BLUE)}, most=200)
+    x, y = figure.axes[1].collections[0].get_offsets().T.astype(int)
+    assert len(x) == 200 and (frame.mask[y, x] > 0.5).mean() > 0.95
+    assert any(text.get_text() == "itself" for text in figure.axes[1].texts)
+
+
+def test_proposals_stand_in_the_row_of_their_source():
+    figure = verified_plots.show_proposal_errors(np.array([10.0, 170.0, 20.0]), ["a", "b", "a"])
+    (axis,) = figure.axes
+    np.testing.assert_allclose(axis.collections[-1].get_offsets(), [[10, 0], [170, 1], [20, 0]])
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["a", "b"]
+
+
+def test_from_above_x_and_z_of_the_moved_points_are_drawn():
+    points = torch.tensor([[1.0, 2.0, 3.0]])
+    poses = Poses(torch.tensor([2.0, 1.0]), torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))
+    figure = verified_plots.show_from_above(points, points, poses, ["twice", "once"])
+    drawn = [[np.asarray(part.get_offsets())[0].tolist() for part in axis.collections] for axis in figure.axes]
+    assert drawn == [[[1, 3], [2, 6]], [[1, 3], [1, 3]]]
+
+
+def test_the_star_of_a_stage_is_its_highest_score():
+    figure = verified_plots.show_stages({"first": (np.array([170.0, 5.0]), np.array([1.0, 3.0]))})
+    np.testing.assert_allclose(figure.axes[0].collections[1].get_offsets(), [[5, 3]])
+    assert figure.axes[0].get_title() == "first (2)"
+
+
+def test_forward_and_reverse_curves_of_a_term_share_a_panel():
+    degrees = np.array([0.0, 180.0, 360.0])
+    figure = verified_plots.show_term_curves(degrees, {"free_space": degrees}, {"free_space": 2 * degrees})
+    forward, reverse = figure.axes[0].lines
+    np.testing.assert_allclose(reverse.get_ydata(), 2 * forward.get_ydata())
+    assert figure.axes[0].get_title() == "free space"
+
+
+def test_intervals_are_drawn_with_their_values():
+    figure = verified_plots.show_accuracy_intervals({"paper": (50.0, 40.0, 60.0), "verified": (70.0, 65.0, 75.0)})
+    (axis,) = figure.axes
+    assert [list(line.get_xdata()) for line in axis.lines[:4]] == [[40, 60], [50], [65, 75], [70]]
+    assert axis.lines[4].get_xdata()[0] == 70  # the line marks the first method that is no baseline
+
+
+def test_the_accuracy_of_all_answers_is_where_the_curve_ends():
+    confidence, correct = np.linspace(0, 1, 40), np.arange(40) >= 10
+    right = verified_plots.show_calibration(confidence, correct).axes[1]
+    assert right.lines[0].get_ydata()[0] == 100 and right.lines[0].get_ydata()[-1] == pytest.approx(75)

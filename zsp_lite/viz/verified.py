@@ -1,6 +1,7 @@
 """Plots for the verified solver: the point terms of a pose in every view, its score, and the reliability diagram.
 
-`draw_point_classes` and `draw_point_term` draw into axes from `plots.show_images`, one per view of the scene.
+`draw_point_classes` and `draw_point_term` draw into axes from `plots.show_images`, one per view of the scene. Functions
+whose names begin with `show_` return whole figures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,15 +9,21 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from torch import Tensor
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
-from zsp_lite.verified.confidence import Reliability
+from zsp_lite.points import object_cloud
+from zsp_lite.verified.confidence import MODE_ANGLE, Reliability, reliability
 from zsp_lite.verified.maps import ViewMaps
+from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreWeights
-from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
+from zsp_lite.views import View
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_axes, draw_points, mark, show_images
 
 # Classes of a projected point, each with its colour and marker.
 POINT_CLASSES: dict[str, tuple[str, str]] = {
@@ -37,6 +44,7 @@ _POINT_TERMS = {
 _HATCHES = ("", "///", "...", "xx")
 _COLOURS = (BLUE, ORANGE, "0.6", VERMILLION)
 _NORMAL_95 = 1.96
+_AXIS_LENGTH = 1.2  # of the reference camera, in its units
 
 
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
@@ -59,26 +67,28 @@ def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
 
 
 def draw_point_classes(
-    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, pose: int = 0, size: float = 16.0, legend: bool = True
-) -> Int[np.ndarray, "v classes"]:
+    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, pose: int = 0, size: float = 16.0, legend: bool = True,
+    views: Sequence[int] | None = None,
+) -> Int[np.ndarray, "v classes"]:  # fmt: skip
     """Draw every point over every view's image, marked by its class. Points outside an image are drawn at its border.
 
     Args:
-        axes: One per view, from `plots.show_images`.
+        axes: One per drawn view, from `plots.show_images`.
         terms: Point terms of m poses.
         maps: Maps of the views that the points were projected into.
         pose: Index of the pose.
         size: Marker size in points squared.
         legend: Whether to add a legend below the figure.
+        views: Indices of the views that are drawn; None for all.
 
     Returns:
-        (v, classes) number of points of each class in each view.
+        (v, classes) number of points of each class in each drawn view.
 
     Raises:
-        InputError: There is not one axis per view.
+        InputError: There is not one axis per drawn view.
     """
-    classes, pixels = classify_points(terms, pose), _image_pixels(terms, maps, pose)
-    _check_axes(axes, maps)
+    views = _drawn_views(axes, maps, views)
+    classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
     # Violations are drawn last, so that no other point covers them.
     for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
         colour, marker = list(POINT_CLASSES.values())[index]
@@ -100,8 +110,9 @@ def draw_point_classes(
 
 
 def draw_point_term(
-    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, name: str, pose: int = 0, size: float = 16.0
-) -> None:
+    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, name: str, pose: int = 0, size: float = 16.0,
+    views: Sequence[int] | None = None,
+) -> None:  # fmt: skip
     """Draw one point term over every view's image, with a colour bar.
 
     Marker areas grow with the term; those of the similarity grow with the surface weight that multiplies it.
@@ -113,18 +124,19 @@ def draw_point_term(
         name: "silhouette", "free_space", "surface" or "similarity".
         pose: Index of the pose.
         size: Marker size in points squared.
+        views: Indices of the views that are drawn; None for all.
 
     Raises:
-        InputError: Another name, or there is not one axis per view.
+        InputError: Another name, or there is not one axis per drawn view.
     """
     if name not in _POINT_TERMS:
         raise InputError(f"point term is {name!r}, expected one of {', '.join(_POINT_TERMS)}")
-    _check_axes(axes, maps)
+    views = _drawn_views(axes, maps, views)
     label, (low, high) = _POINT_TERMS[name]
-    values = getattr(terms, name)[pose].numpy()
-    weights = terms.surface[pose].numpy() if name == "similarity" else values
+    values = getattr(terms, name)[pose].numpy()[views]
+    weights = terms.surface[pose].numpy()[views] if name == "similarity" else values
     drawn: PathCollection | None = None
-    for axis, value, weight, pixels in zip(axes, values, weights, _image_pixels(terms, maps, pose)):
+    for axis, value, weight, pixels in zip(axes, values, weights, _image_pixels(terms, maps, pose)[views]):
         order = np.argsort(weight, kind="stable")
         x, y = _clip_to_image(axis, pixels[order]).T
         drawn = axis.scatter(
@@ -171,8 +183,9 @@ def draw_score_contributions(axis: Axes, hypotheses: Mapping[str, Mapping[str, f
 
 
 def draw_reliability(axis: Axes, reliability: Reliability) -> None:
-    """Draw a reliability diagram: accuracy against mean confidence of each bin, with 95 % Wilson intervals and counts.
+    """Draw a reliability diagram: accuracy against mean confidence of each bin, with 95 % Wilson intervals.
 
+    Counts stand beside the points, or in the title if they are equal.
     On the dashed diagonal confidences are calibrated; below it they are too high.
     """
     accuracy, count = reliability.accuracy, reliability.count
@@ -183,11 +196,218 @@ def draw_reliability(axis: Axes, reliability: Reliability) -> None:
         reliability.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
         label="measured",
     )  # fmt: skip
-    for x, y, n in zip(reliability.confidence, accuracy, count):
-        axis.annotate(str(n), (x, y), (5, -10), textcoords="offset points", fontsize=8, color="0.3")
+    if len(set(count.tolist())) == 1:
+        axis.set_title(f"{count[0]} answers for each point", fontsize=10)
+    else:
+        for x, y, n in zip(reliability.confidence, accuracy, count):
+            axis.annotate(str(n), (x, y), (5, -10), textcoords="offset points", fontsize=8, color="0.3")
     axis.set(xlabel="mean confidence", ylabel="fraction within 30 degrees", xlim=(0, 1.03), ylim=(0, 1.03))
     axis.set_aspect("equal")
     axis.legend(loc="upper left", fontsize=9)
+
+
+def show_moved_reference(
+    reference: View,
+    targets: Sequence[View],
+    poses: Sequence[Sim3],
+    marks: Mapping[int, tuple[str, str]],
+    most: int = 2500,
+) -> Figure:
+    """Show the reference and every target view with the points of the reference moved into it, in their own colours.
+
+    Args:
+        reference: Reference view.
+        targets: Target views.
+        poses: For each target view, the pose from the reference camera to its camera.
+        marks: Text and colour of a frame, by index of the target view.
+        most: Largest number of points.
+
+    Returns:
+        The figure; the first axis shows the reference.
+    """
+    frame, cloud = reference.frame, object_cloud(reference, most=most)
+    x, y = frame.camera.project(frame.camera.to_world(cloud))[0].astype(int).T
+    titles = ["reference", *(f"target {number}" for number in range(1, len(targets) + 1))]
+    images = [view.frame.rgb for view in (reference, *targets)]
+    figure, (first, *axes) = show_images(images, titles, columns=3, size=3.0)
+    draw_axes(first, frame.camera, lambda points: points, cloud.mean(axis=0), _AXIS_LENGTH)
+    for axis, view, pose in zip(axes, targets, poses, strict=True):
+        draw_points(axis, view.frame.camera, pose.apply(cloud), frame.rgb[y, x] / 255, size=9)
+        draw_axes(axis, view.frame.camera, pose.apply, cloud.mean(axis=0), _AXIS_LENGTH)
+    for view, (text, colour) in marks.items():
+        mark(axes[view], text, colour)
+    return figure
+
+
+def show_proposal_errors(errors: Float[np.ndarray, " m"], sources: Sequence[str]) -> Figure:
+    """Show the rotation error of every proposal, one row per source, in order of appearance."""
+    rows = list(dict.fromkeys(sources))
+    figure, axis = plt.subplots(figsize=(7.5, 0.9 + 0.42 * len(rows)), layout="constrained")
+    axis.axvspan(0, MODE_ANGLE, color="0.9", zorder=0, label="within 30 degrees of the truth")
+    axis.axvspan(150, 180, color=ORANGE, alpha=0.25, zorder=0, linewidth=0, label="about half a turn off")
+    axis.scatter(errors, [rows.index(source) for source in sources], s=50, color=BLUE, edgecolors="white", zorder=3)
+    axis.set(xlabel="rotation error (degrees)", xlim=(-4, 184), xticks=range(0, 181, 30))
+    axis.set_yticks(range(len(rows)), rows)
+    axis.set_ylim(len(rows) - 0.4, -0.6)
+    figure.legend(loc="outside upper center", ncols=2, fontsize=9)
+    return figure
+
+
+def show_point_classes(
+    images: Sequence[np.ndarray], terms: PointTerms, maps: ViewMaps, views: Sequence[int], names: Sequence[str],
+    poses: Sequence[str], size: float = 3.0,
+) -> Figure:  # fmt: skip
+    """Show the points of each pose by their classes: one row per pose, one column per view (a single view: one row).
+
+    Args:
+        images: Image of each shown view.
+        terms: Point terms of the poses.
+        maps: Maps of all views of the scene.
+        views: Indices of the shown views in the scene.
+        names: Names of the shown views.
+        poses: Names of the poses.
+        size: Width of an image in inches.
+    """
+    titles = [f"{pose}: {name}" for pose in poses for name in names]
+    columns = len(images) if len(images) > 1 else len(poses)
+    figure, axes = show_images(list(images) * len(poses), titles, columns=columns, size=size)
+    for index in range(len(poses)):
+        row = axes[index * len(images) : (index + 1) * len(images)]
+        draw_point_classes(row, terms, maps, index, size=14, legend=not index, views=views)
+    return figure
+
+
+def show_point_term(
+    images: Sequence[np.ndarray], terms: PointTerms, maps: ViewMaps, term: str, views: Sequence[int],
+    names: Sequence[str], poses: Sequence[str], size: float = 3.0,
+) -> Figure:  # fmt: skip
+    """Show one term of every point: one row per pose, one column per view (arguments as in `show_point_classes`)."""
+    titles = [f"{pose}: {name}" for pose in poses for name in names]
+    figure, axes = show_images(list(images) * len(poses), titles, columns=len(images), size=size)
+    for index in range(len(poses)):
+        row = axes[index * len(images) : (index + 1) * len(images)]
+        draw_point_term(row, terms, maps, term, index, views=views)
+    return figure
+
+
+def show_term_curves(
+    degrees: Float[np.ndarray, " m"], forward: Mapping[str, Float[np.ndarray, " m"]],
+    reverse: Mapping[str, Float[np.ndarray, " m"]],
+) -> Figure:  # fmt: skip
+    """Show how terms change as an object is turned: forward and reverse terms of the same name in one panel.
+
+    Args:
+        degrees: Angle of each pose.
+        forward: Values of the forward terms by name.
+        reverse: Values of the reverse terms by the same names.
+    """
+    columns = min(len(forward), 2)
+    rows = -(-len(forward) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.4 * columns, 2.9 * rows), squeeze=False, layout="constrained")
+    for axis, name in zip(axes.flat, forward):
+        axis.plot(degrees, forward[name], color=BLUE, label="forward")
+        axis.plot(degrees, reverse[name], color=VERMILLION, linestyle="--", label="reverse")
+        axis.set(title=name.replace("_", " "), xlabel="turn (degrees)", xlim=(degrees[0], degrees[-1]))
+        axis.set_xticks(range(0, 361, 90))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def show_from_above(
+    reference_points: Float[Tensor, "n 3"], target_points: Float[Tensor, "m 3"], poses: Poses, titles: Sequence[str]
+) -> Figure:
+    """Show the targets' points and the moved points of the reference from above, one panel per pose.
+
+    Above means along the y axis of the scene's first target camera, which points down.
+
+    Args:
+        reference_points: Points of the reference in working units (see `Scene`).
+        target_points: Points of all target views in working units.
+        poses: The poses.
+        titles: Title of each panel.
+    """
+    columns = min(len(poses), 3)
+    rows = -(-len(poses) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(3.3 * columns, 3.5 * rows + 0.3), sharex=True, sharey=True, squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    for axis in list(axes.flat)[len(poses) :]:
+        axis.set_axis_off()
+    there = target_points.numpy()[:, [0, 2]].T
+    for axis, moved, title in zip(axes.flat, poses.apply(reference_points).numpy(), titles):
+        axis.scatter(*there, s=5, marker="D", color=ORANGE, linewidths=0, label="targets, all views")
+        axis.scatter(*moved[:, [0, 2]].T, s=7, color=BLUE, linewidths=0, label="reference, moved")
+        axis.set(title=title, xlim=(-2.6, 2.6), ylim=(-2.6, 2.6), box_aspect=1, xlabel="x, to the right")
+        axis.title.set_fontsize(10)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("z, away")
+    handles = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, markerscale=3)
+    return figure
+
+
+def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> Figure:
+    """Show score against rotation error of every pose after each stage.
+
+    Args:
+        stages: Rotation errors in degrees and scores in nats, by name of the stage.
+    """
+    figure, axes = plt.subplots(
+        1, len(stages), figsize=(3.1 * len(stages), 3.4), sharey=True, squeeze=False, layout="constrained"
+    )
+    for axis, (stage, (error, score)) in zip(axes[0], stages.items()):
+        best = int(np.argmax(score))
+        axis.axvspan(0, MODE_ANGLE, color="0.9", zorder=0)
+        axis.scatter(error, score, s=30, color=BLUE, edgecolors="white", linewidths=0.5, label="a pose")
+        axis.scatter(
+            error[best], score[best], s=150, marker="*", color=ORANGE, edgecolors="black", label="highest score"
+        )
+        axis.set(title=f"{stage} ({len(error)})", xlabel="rotation error (degrees)")
+        axis.set(xlim=(-8, 188), xticks=range(0, 181, 60))
+    axes[0, 0].set_ylabel("score (nats)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def show_accuracy_intervals(accuracy: Mapping[str, tuple[float, float, float]], first: int = 1) -> Figure:
+    """Show the accuracy of several methods with intervals.
+
+    Args:
+        accuracy: Accuracy, lower and upper end of its interval in per cent, by name of the method.
+        first: Number of methods at the top that are drawn as orange squares; a line marks the next one.
+    """
+    figure, axis = plt.subplots(figsize=(8, 0.9 + 0.3 * len(accuracy)), layout="constrained")
+    for row, (value, low, high) in enumerate(accuracy.values()):
+        marker, colour = ("s", ORANGE) if row < first else ("o", BLUE)
+        axis.plot([low, high], [row, row], color="0.4", linewidth=1.5)
+        axis.plot(value, row, marker, color=colour, markeredgecolor="black")
+    if len(accuracy) > first:
+        axis.axvline(list(accuracy.values())[first][0], color="0.6", linestyle=":")
+    axis.set(xlabel="pairs within 30 degrees (per cent), with 95 % intervals", xlim=(0, 100))
+    axis.set_yticks(range(len(accuracy)), accuracy)
+    axis.invert_yaxis()
+    return figure
+
+
+def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> Figure:
+    """Show a reliability diagram, and the accuracy among the most confident answers against their share.
+
+    Args:
+        confidence: Confidence of each answer.
+        correct: Whether it is correct.
+    """
+    measured = reliability(confidence, correct, bins=max(2, min(10, len(correct) // 20)))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 4.2), layout="constrained")
+    draw_reliability(left, measured)
+    order = np.argsort(-confidence, kind="stable")
+    number = np.arange(1, len(order) + 1)
+    right.plot(100 * number / len(order), 100 * np.cumsum(correct[order]) / number, color=BLUE, label="surest first")
+    right.axhline(100 * correct.mean(), color="0.4", linestyle="--", label="all answers")
+    right.set(xlabel="share of pairs that are answered (per cent)", ylabel="of these within 30 degrees (per cent)")
+    right.set(xlim=(0, 100), ylim=(0, 103))
+    right.legend(loc="lower left")
+    return figure
 
 
 def _wilson_interval(
@@ -211,6 +431,8 @@ def _clip_to_image(axis: Axes, pixels: Float[np.ndarray, "n 2"]) -> Float[np.nda
     return np.clip(pixels, [left, top], [right, bottom])
 
 
-def _check_axes(axes: Sequence[Axes], maps: ViewMaps) -> None:
-    if len(axes) != len(maps):
-        raise InputError(f"{len(axes)} axes, expected one for each of the {len(maps)} views")
+def _drawn_views(axes: Sequence[Axes], maps: ViewMaps, views: Sequence[int] | None) -> list[int]:
+    views = list(range(len(maps)) if views is None else views)
+    if len(axes) != len(views):
+        raise InputError(f"{len(axes)} axes, expected one for each of the {len(views)} views")
+    return views

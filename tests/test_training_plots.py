@@ -1,0 +1,104 @@
+"""Plots of trainings show the values that they are given, at the right places."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from zsp_lite.errors import InputError
+from zsp_lite.viz import training_plots
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def test_the_same_place_has_the_same_colour_and_the_background_is_white():
+    surface = np.full((1, 3, 3), np.nan, np.float32)
+    surface[0, :2] = 0.5
+    first, second, background = training_plots.coordinate_picture(surface)[0]
+    assert (first == second).all() and (background == 1).all() and not (first == 1).any()
+
+
+def test_coordinates_stand_below_the_pictures_of_their_object():
+    pictures = np.arange(2, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 4, 4, 3), np.float32)
+    figure = training_plots.show_object_coordinates(pictures, np.full((2, 2, 4, 4, 3), np.nan))
+    shown = [float(np.mean(axis.images[0].get_array())) for axis in figure.axes]
+    assert shown == [0, 0, 1, 1, 1, 1, 1, 1]
+    assert [axis.get_title() for axis in figure.axes[:3]] == ["view 0", "view 1", ""]
+
+
+def test_each_case_has_a_panel_with_its_probabilities():
+    figure = training_plots.show_answers({"even": np.full((2, 4), 0.25), "sure": np.eye(2, 4)})
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["even", "sure"]
+    np.testing.assert_allclose(figure.axes[1].images[0].get_array(), np.eye(2, 4))
+
+
+def test_a_running_mean_stands_at_the_middle_of_its_window():
+    steps, means = training_plots.smoothed([3.0, 0.0, 3.0, 6.0], 3)
+    assert steps.tolist() == [2, 3] and means.tolist() == [2, 3]
+    with pytest.raises(InputError, match="2 values, expected at least the window of 3"):
+        training_plots.smoothed([1.0, 2.0], 3)
+
+
+def test_a_collapse_is_drawn_against_the_largest_entropy():
+    rows = [{"teacher_entropy": 1.0, "kl": 0.5, "information": 0.25}] * 12
+    figure = training_plots.show_collapses({"both": rows, "none": rows[:9]}, outputs=512)
+    entropy = figure.axes[0]
+    assert [len(line.get_xdata()) for line in entropy.lines[:2]] == [4, 1]
+    assert entropy.lines[2].get_ydata()[0] == pytest.approx(np.log(512))
+    assert [axis.lines[0].get_ydata()[0] for axis in figure.axes] == pytest.approx([1, 0.5, 0.25])
+
+
+def test_a_query_is_framed_and_small_weights_are_left_out():
+    target = np.zeros((2, 4, 4))
+    target[1, 2, 3] = 1
+    views = np.zeros((2, 32, 32, 3), np.float32)
+    figure = training_plots.show_query(views, (1, 2), target, target * 0)
+    query, drawn, _, answer = figure.axes
+    assert query.patches[0].get_xy() == (16, 8) and query.patches[0].get_width() == 8
+    assert drawn.images[1].get_array().compressed().tolist() == [1]
+    assert answer.images[1].get_array().compressed().size == 0
+
+
+def test_supervision_is_white_off_the_object():
+    inside = np.eye(2, dtype=bool)
+    view, normals = np.zeros((16, 16, 3), np.float32), np.zeros((2, 2, 3), np.float32)
+    figure = training_plots.show_supervision(view, normals, np.ones((2, 2)), np.ones((2, 2)), inside)
+    colours = figure.axes[1].images[0].get_array()
+    np.testing.assert_allclose(colours[0, 0], 0.5)
+    np.testing.assert_allclose(colours[0, 1], 1)
+    assert figure.axes[2].images[1].get_array().compressed().size == 2
+
+
+def test_the_step_of_a_change_is_marked_in_each_loss():
+    rows = [{"match": float(step), "geometry": 1.0} for step in range(20)]
+    figure = training_plots.show_losses(rows, {"match": "correspondence", "geometry": "geometry"}, 15)
+    assert [axis.lines[1].get_xdata()[0] for axis in figure.axes] == [15, 15]
+    assert figure.axes[0].lines[0].get_ydata()[0] == pytest.approx(5)  # mean of the first eleven
+
+
+def test_a_measurement_of_all_runs_is_in_one_panel():
+    figure = training_plots.show_measurements(
+        {"a": [0, 1], "b": [0, 1]}, {"a": [(0.1, 1.0), (0.2, 2.0)], "b": [(0.1, 1.0), (0.3, 4.0)]}, ["one", "two"]
+    )
+    assert [line.get_ydata()[-1] for line in figure.axes[1].lines] == [2, 4]
+
+
+def test_keys_stand_on_the_left_and_attention_on_the_right():
+    picture = np.zeros((8, 8, 3), np.float32)
+    figure = training_plots.show_keys_and_attention(
+        [picture], [("untrained", [np.full((2, 2, 3), 0.5)], [np.ones((2, 2))])]
+    )
+    assert figure.axes[2].get_title(loc="left") == "untrained"
+    assert figure.axes[2].images[0].get_array().ndim == 3 and figure.axes[3].images[0].get_cmap().name == "viridis"
+
+
+def test_logs_follow_one_another_in_time_and_rows_without_a_measurement_are_left_out():
+    first = [{"seconds": 60, "side": 64, "iou": 0.5}, {"seconds": 120, "side": 128, "iou": 0.6}]
+    second = [{"seconds": 30, "side": 128}, {"seconds": 60, "side": 224, "iou": 0.7}]
+    figure = training_plots.show_training_logs({"run 1": first, "run 2": second}, {"iou": "IoU"})
+    lines = figure.axes[0].lines
+    assert [line.get_xdata().tolist() for line in lines] == [[1, 2], [3]]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["64 px", "128 px", "224 px", "224 px"]

@@ -1,0 +1,232 @@
+"""Plots of trainings: pictures with the renderer's knowledge, distributions of answers, curves, and shipped logs.
+
+Functions whose names begin with `show_` return whole figures.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Bool, Float, Real
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+
+from zsp_lite.errors import InputError
+from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION, overlay_map, show_images
+
+_STYLES = ((BLUE, "-", "o"), (VERMILLION, "--", "s"), (ORANGE, ":", "^"), (GREEN, "-.", "D"), ("0.3", "-", "v"))
+# Objects are three or four units wide; this many fit into the range of colours.
+_COORDINATE_SPAN = 2.6
+
+
+def coordinate_picture(surface: Real[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Colour pixels by their place on the object; pixels without one (NaN, the background) are white."""
+    colours = (np.asarray(surface, np.float32) / _COORDINATE_SPAN + 0.5).clip(0, 1)
+    return np.where(np.isnan(surface), np.float32(1), colours)
+
+
+def show_object_coordinates(
+    pictures: Real[np.ndarray, "objects v h w 3"], surfaces: Real[np.ndarray, "objects v h2 w2 3"]
+) -> Figure:
+    """Show the views of several objects, and below each view the place on the object of each pixel as a colour."""
+    views = len(pictures[0])
+    rows = [row for pair in zip(pictures, (map(coordinate_picture, one) for one in surfaces)) for row in pair]
+    images = [image for row in rows for image in row]
+    titles = [f"view {i}" for i in range(views)] + [""] * (len(images) - views)
+    return show_images(images, titles, columns=views, size=1.2)[0]
+
+
+def draw_answers(axis: Axes, probabilities: Float[np.ndarray, "pictures outputs"]) -> AxesImage:
+    """Draw distributions over outputs as an image, one row per picture; fill it again with `set_data`."""
+    pictures, outputs = probabilities.shape
+    axis.set(xlabel="output", xticks=range(outputs), yticks=range(pictures))
+    return axis.imshow(probabilities, vmin=0, vmax=1, cmap="viridis")
+
+
+def show_answers(cases: Mapping[str, Float[np.ndarray, "pictures outputs"]]) -> Figure:
+    """Show distributions over outputs side by side, one panel per case."""
+    figure, axes = plt.subplots(
+        1, len(cases), figsize=(3.2 * len(cases), 3), layout="constrained", sharey=True, squeeze=False
+    )
+    for axis, (name, probabilities) in zip(axes[0], cases.items()):
+        drawn = draw_answers(axis, probabilities)
+        axis.set_title(name, fontsize=10)
+    axes[0, 0].set_ylabel("picture")
+    figure.colorbar(drawn, ax=axes, label="probability", shrink=0.8)
+    return figure
+
+
+def smoothed(values: Sequence[float], window: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the running mean over `window` values (odd), and the steps, counted from 1, at its middles.
+
+    Raises:
+        InputError: Fewer values than the window.
+    """
+    if len(values) < window:
+        raise InputError(f"{len(values)} values, expected at least the window of {window}")
+    means = np.convolve(np.asarray(values, float), np.ones(window) / window, "valid")
+    return np.arange(len(means)) + (window + 1) / 2, means
+
+
+def show_collapses(runs: Mapping[str, Sequence[Mapping[str, float]]], outputs: int) -> Figure:
+    """Show the teacher's entropy, the divergence of the student and the information over the steps of several runs.
+
+    Args:
+        runs: The figures of every step (see `training.distillation`), by name of the run.
+        outputs: Number of outputs K; the entropy is at most log K.
+    """
+    panels = {"teacher_entropy": "teacher's entropy", "kl": "divergence of the student", "information": "information"}
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.4), layout="constrained")
+    for axis, (name, label) in zip(axes, panels.items()):
+        for (run, rows), (colour, line, _) in zip(runs.items(), _STYLES):
+            steps, values = smoothed([row[name] for row in rows], 9)
+            axis.plot(steps, values, color=colour, linestyle=line, linewidth=2, label=run)
+        axis.set(xlabel="step", ylabel=f"{label} (nats)", ylim=(-0.1, None))
+    top = np.log(outputs)
+    axes[0].axhline(top, color="0.5", linewidth=1)
+    for height, text in ((top + 0.08, "log K: all outputs alike"), (0.1, "0: one output for all")):
+        axes[0].text(0.97, height, text, ha="right", fontsize=9, transform=axes[0].get_yaxis_transform())
+    axes[0].set_ylim(-0.1, 1.12 * top)
+    figure.legend(*axes[2].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))
+    return figure
+
+
+def show_query(
+    views: Real[np.ndarray, "v h w 3"], query: tuple[int, int],
+    targets: Real[np.ndarray, "v rows cols"], answers: Real[np.ndarray, "v rows cols"], least: float = 0.05,
+) -> Figure:  # fmt: skip
+    """Show a query patch in the first view, and over the other views its target (above) and an answer (below).
+
+    Args:
+        views: Images of the v views.
+        query: Patch (row, col) of the first view.
+        targets: Weight of each patch of each view in the target.
+        answers: The same of the answer; the first view's are not shown.
+        least: Smaller weights are left out.
+    """
+    columns = len(views)
+    titles = ["query: framed", *["target"] * (columns - 1), "query: framed", *["answer"] * (columns - 1)]
+    figure, axes = show_images([*views, *views], titles, columns=columns, size=1.6)
+    for row, maps in enumerate((targets, answers)):
+        for axis, weights in zip(axes[row * columns + 1 : (row + 1) * columns], maps[1:]):
+            overlay_map(axis, np.where(weights > least, weights, np.nan), alpha=1, limits=(0, 1))
+    height, width = (size / cells for size, cells in zip(views[0].shape[:2], targets.shape[1:]))
+    for axis in (axes[0], axes[columns]):
+        for colour, line in (("black", 4), ("white", 2)):
+            corner = (query[1] * width, query[0] * height)
+            axis.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=colour, linewidth=line))
+    return figure
+
+
+def show_supervision(
+    view: Real[np.ndarray, "h w 3"], normals: Real[np.ndarray, "rows cols 3"], depth: Real[np.ndarray, "rows cols"],
+    coverage: Real[np.ndarray, "rows cols"], inside: Bool[np.ndarray, "rows cols"],
+) -> Figure:  # fmt: skip
+    """Show what a renderer knows of each patch of a view: normals, relative depth and share of the object.
+
+    Args:
+        view: Image.
+        normals: Unit normals.
+        depth: Depth relative to the object's mean, in standard deviations.
+        coverage: Share of the patch that the object covers.
+        inside: Patches of the object; the others are white.
+    """
+    pictures = [view, np.where(inside[..., None], normals / 2 + 0.5, 1), np.ones_like(view), view]
+    titles = ["the view", "geometry: normals", "geometry: depth", "attention: the object"]
+    figure, axes = show_images(pictures, titles, size=2.3)
+    overlay_map(axes[2], np.where(inside, depth, np.nan), alpha=1, label="relative depth (standard deviations)")
+    overlay_map(axes[3], coverage, alpha=1, limits=(0, 1), label="share of the patch")
+    return figure
+
+
+def show_losses(rows: Sequence[Mapping[str, float]], losses: Mapping[str, str], change: int) -> Figure:
+    """Show the running means of several losses over the steps; a dotted line marks the step of a change."""
+    figure, axes = plt.subplots(1, len(losses), figsize=(3.4 * len(losses), 2.9), layout="constrained", squeeze=False)
+    for axis, (name, label) in zip(axes[0], losses.items()):
+        steps, values = smoothed([row[name] for row in rows], 11)
+        axis.plot(steps, values, color=BLUE, linewidth=2)
+        axis.axvline(change, color="0.5", linestyle=":")
+        axis.set(xlabel="step", ylabel=f"{label} loss", ylim=(0, 1.05 * max(values)))
+    return figure
+
+
+def show_measurements(
+    shares: Mapping[str, Sequence[float]], values: Mapping[str, Sequence[tuple[float, ...]]], labels: Sequence[str]
+) -> Figure:
+    """Show several measurements over the course of several runs, one panel per measurement.
+
+    Args:
+        shares: For each run, the share of the run at which was measured.
+        values: For each run, the measurements at each of these times.
+        labels: Names of the measurements.
+    """
+    figure, axes = plt.subplots(1, len(labels), figsize=(4.4 * len(labels), 3.3), layout="constrained", squeeze=False)
+    for index, (axis, label) in enumerate(zip(axes[0], labels)):
+        for run, (colour, line, marker) in zip(values, _STYLES):
+            curve = [one[index] for one in values[run]]
+            axis.plot(shares[run], curve, color=colour, linestyle=line, marker=marker, label=run)
+        highest = max(one[index] for curve in values.values() for one in curve)
+        axis.set(xlabel="share of the run", ylabel=label, ylim=(0, 1.2 * highest))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(values))
+    return figure
+
+
+def show_keys_and_attention(
+    pictures: Sequence[np.ndarray], rows: Sequence[tuple[str, Sequence[np.ndarray], Sequence[np.ndarray]]],
+    size: float = 1.15,
+) -> Figure:  # fmt: skip
+    """Show pictures above the colours of their keys (left) and their attention (right), one row per network.
+
+    Args:
+        pictures: Images.
+        rows: Name of the network, colours of the keys of each picture, attention of each picture.
+        size: Width of an image in inches.
+    """
+    count = len(pictures)
+    images = [*pictures, *pictures]
+    for _, colours, attention in rows:
+        images += [*colours, *attention]
+    figure, axes = show_images(images, [""] * len(images), columns=2 * count, size=size)
+    axes[0].set_title("keys of these pictures", fontsize=10, loc="left")
+    axes[count].set_title("attention in these pictures", fontsize=10, loc="left")
+    for row, (name, _, _) in enumerate(rows, 1):
+        axes[2 * count * row].set_title(name, fontsize=9, loc="left")
+        for axis in axes[2 * count * row + count : 2 * count * (row + 1)]:
+            axis.images[0].set_cmap("viridis")
+    return figure
+
+
+def show_training_logs(logs: Mapping[str, Sequence[Mapping[str, float]]], panels: Mapping[str, str]) -> Figure:
+    """Show logged measurements of consecutive trainings over their minutes, one panel per measurement.
+
+    The first panel has the side of the crops, in pixels, at the first and the last measurement of each run.
+
+    Args:
+        logs: Rows of each training's log, in order, by name; rows have "seconds" and "side".
+        panels: Names of measurements in the log, each with its label; rows without one are left out.
+    """
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.7 * len(panels), 3.6), layout="constrained", squeeze=False)
+    before = 0.0
+    for index, (name, rows) in enumerate(logs.items()):
+        colour, line, marker = _STYLES[index % len(_STYLES)]
+        for axis, panel in zip(axes[0], panels):
+            measured = [row for row in rows if panel in row]
+            if not measured:
+                continue
+            minutes = [before + row["seconds"] / 60 for row in measured]
+            values = [row[panel] for row in measured]
+            axis.plot(minutes, values, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
+            for at, above in ((0, -14), (-1, 7)) if axis is axes[0, 0] else ():
+                axis.annotate(
+                    f"{measured[at]['side']:.0f} px", (minutes[at], values[at]), (0, above), fontsize=8, ha="center",
+                    textcoords="offset points",
+                )  # fmt: skip
+        before += rows[-1]["seconds"] / 60
+    for axis, label in zip(axes[0], panels.values()):
+        highest = max((max(line.get_ydata()) for line in axis.lines), default=1)
+        axis.set(xlabel="minutes of training", ylabel=label, xlim=(-0.12 * before, 1.12 * before))
+        axis.set_ylim(0, 1.15 * highest)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(logs))
+    return figure
