@@ -18,6 +18,7 @@ REPOSITORY = Path(__file__).parents[1]
 PAGES = [
     REPOSITORY / "README.md",
     *sorted((REPOSITORY / "docs").glob("*.md")),
+    *sorted((REPOSITORY / "docs" / "slides").glob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
     REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
     *sorted((REPOSITORY / "notebooks").glob("*.ipynb")),

@@ -1,5 +1,7 @@
-"""The exercises: the solutions pass every test, the students' version passes none, and typical mistakes fail."""
+"""The exercises: given cells run, the solutions pass every test, the students' version none, typical mistakes fail."""
 
+import ast
+import builtins
 import os
 import re
 import shutil
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
 from nbgrader.api import Gradebook
 from nbgrader.apps.api import NbGraderAPI
@@ -140,6 +143,81 @@ MISTAKES = {
 }
 
 
+# For each assignment: a statement of a marking guide, and a check of it on what the given cells computed.
+STATEMENTS = {
+    "01_features": {
+        "the similarity of true partners falls even if every key stays the same": lambda cells: (
+            turned_similarity(cells["log_bin"], cells["keys"]) < 0.99 * turned_similarity(lambda x, _: x, cells["keys"])
+        ),
+        "9 parts take 9 times the storage of the bare key, 17 parts 17 times": lambda cells: (
+            (cells["choices"]["numbers per image"] / cells["choices"]["numbers per image"][0]).tolist() == [1, 9, 17]
+        ),
+    },
+    "02_cyclical_maps": {
+        "The counts never fall from *within 0* to *within 2*": lambda cells: (
+            np.diff(cells["counts"].iloc[:, 2:].to_numpy()) >= 0
+        ).all(),
+        "The column *within 0* counts the mutual nearest neighbours": lambda cells: (
+            cells["counts"].set_index("category")["within 0"]["chair"]
+            == sum(
+                cells["fg1"].ravel()[u] and cells["fg2"].ravel()[v]
+                for u, v in cells["mutual"](cells["chairs_forth"], cells["chairs_back"])
+            )
+        ),
+        "a larger one never accepts fewer": lambda cells: all(
+            group.is_monotonic_increasing for _, group in cells["limits"].groupby("category")["accepted"]
+        ),
+    },
+    "03_best_view": {
+        "The nearest view never gets farther away as N grows": lambda cells: all(
+            group.is_monotonic_decreasing for _, group in cells["views"].groupby("category")["nearest (°)"]
+        ),
+    },
+    "04_umeyama_ransac": {
+        "the number of inliers never falls as the threshold grows": lambda cells: (
+            cells["thresholds"]["inliers"].is_monotonic_increasing
+        ),
+        "at 3 scene units nearly all matches are inliers, also the shuffled ones": lambda cells: (
+            cells["thresholds"].iloc[-1, 1:3].min() > 0.8 * len(cells["points"][0])
+        ),
+        "The shuffled matches have inliers, too, and their number never falls": lambda cells: (
+            cells["thresholds"]["inliers if shuffled"].is_monotonic_increasing
+            and cells["thresholds"].set_index("threshold")["inliers if shuffled"][0.2] > 0
+        ),
+        "574 trials with samples of 3, 2,876 with samples of 4 and 1,798,893 with samples of 8": lambda cells: (
+            [cells["trials"](0.2, size) for size in (3, 4, 8)] == [574, 2876, 1798893]
+        ),
+    },
+    "05_metrics": {
+        "two intervals that overlap, and p = 0.002": lambda cells: (
+            cells["bootstrap_ci"](cells["new"], lambda e, drawn: cells["library_accuracy"](e, 30, drawn))[0]
+            < cells["bootstrap_ci"](cells["old"], lambda e, drawn: cells["library_accuracy"](e, 30, drawn))[1]
+            and round(cells["paired_test"](cells["old"], cells["new"])["sign_test_p"], 3) == 0.002
+        ),
+        "13 that only the new method solves against 1": lambda cells: (
+            np.sum((cells["new"] < 30) & (cells["old"] >= 30)) == 13
+            and np.sum((cells["old"] < 30) & (cells["new"] >= 30)) == 1
+        ),
+        # A gain of 3 points at a discordance of 12 %: z = 2, and z = 1.96 + 0.84 for a power of 80 %.
+        "exceeded from about 530 pairs on, and a power of 80 % takes about 1,050": lambda cells: (
+            round(0.12 * (2 / 0.03) ** 2, -1) == 530 and round(0.12 * (2.8 / 0.03) ** 2, -1) == 1050
+        ),
+        "A has the smaller median and the larger Acc30, B the smaller mean and no error above 45°": lambda cells: (
+            (cells["figures"]["A"] - cells["figures"]["B"] > 0).tolist() == [False, True, True]
+            and cells["method_b"].max() <= 45
+        ),
+    },
+}
+
+
+def turned_similarity(described, keys):
+    """Mean cosine of a grid's descriptors with those of the same grid, turned by 90 degrees and back again."""
+    turned = np.rot90(keys)
+    pair = described(keys, keys), np.rot90(described(turned, turned), -1)
+    a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in pair)
+    return (a * b).sum(axis=-1).mean()
+
+
 @pytest.fixture(scope="module")
 def config():
     return PyFileConfigLoader("nbgrader_config.py", path=str(EXERCISES)).load_config()
@@ -189,9 +267,8 @@ def prepared():
 
 def failing_tests(namespace, answers, tests):
     """Names of the test cells of notebook `tests` that fail for the functions defined in notebook `answers`."""
-    for task, cell in graded(answers, solution=True, grade=False).items():
-        if task != "experiment":
-            exec(cell.source, namespace)
+    for cell in graded(answers, solution=True, grade=False).values():
+        exec(cell.source, namespace)
     failing = set()
     for name, cell in graded(tests, grade=True, solution=False).items():
         try:
@@ -201,14 +278,68 @@ def failing_tests(namespace, answers, tests):
     return failing
 
 
-@pytest.mark.slow
+def tasks(notebook):
+    """The cells of each task, by the heading of its first cell."""
+    found = {}
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown" and cell.source.startswith("## Task"):
+            found[cell.source.splitlines()[0]] = under = []
+        if found:
+            under.append(cell)
+    return found
+
+
+def unknown_names(text, namespace):
+    """Names in the inline code of a text that are neither known nor defined there."""
+    codes = [code for code in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text) if "-" not in code and "..." not in code]
+    used = [node for code in codes for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)]
+    defined = {name.id for name in used if isinstance(name.ctx, ast.Store)} | {*namespace, *dir(builtins)}
+    return {name.id for name in used} - defined
+
+
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_every_cell_runs_and_every_test_passes_with_the_solutions(prepared, assignment):
-    namespace = prepared(assignment)
-    for cell in source(assignment).cells:
-        if cell.cell_type == "code" and cell.metadata.get("nbgrader", {}).get("grade_id") != "setup":
+def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_marking_guides(prepared, config, assignment):
+    """No given cell needs more than the first cell of the notebook and the function of its own task."""
+    handed_out, solutions = students_version(assignment, config), graded(source(assignment), solution=True)
+    computed, given = {}, 0
+    for title, cells in tasks(handed_out).items():
+        namespace = prepared(assignment)
+        for cell in graded(handed_out, solution=True, grade=False).values():
             exec(cell.source, namespace)
+        for cell in cells:
+            if cell.cell_type == "code" and "nbgrader" not in cell.metadata:
+                exec(cell.source, namespace)
+                given += 1
+            elif "nbgrader" in cell.metadata and cell.cell_type == "code" and cell.metadata.nbgrader.solution:
+                exec(solutions[cell.metadata.nbgrader.grade_id].source, namespace)
+        if "read by a person" in title:
+            assert not unknown_names(cells[0].source, namespace), title
+        computed |= namespace
     plt.close("all")
+    assert given == len(tasks(handed_out))
+    exec("\n".join(cell.source for cell in graded(source(assignment), solution=True, grade=False).values()), computed)
+    if assignment == "01_features":
+        computed["keys"] = computed["views"][0].features.keys.numpy()
+    guides = " ".join(cell.source for cell in graded(source(assignment), solution=True, grade=True).values())
+    for statement, holds in STATEMENTS[assignment].items():
+        assert statement in " ".join(guides.split()), statement
+        assert holds(computed), statement
+
+
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_every_test_passes_with_the_solutions(prepared, assignment):
+    assert failing_tests(prepared(assignment), source(assignment), source(assignment)) == set()
+
+
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_every_function_that_is_handed_out_empty_says_what_it_gets_and_returns(config, assignment):
+    for task, cell in graded(students_version(assignment, config), solution=True, grade=False).items():
+        (function,) = (node for node in ast.parse(cell.source).body if isinstance(node, ast.FunctionDef))
+        arguments, _, returned = ast.get_docstring(function).partition("\nReturns:\n")
+        described = re.findall(r"^    (\w+(?:, \w+)*): \S", arguments.partition("\nArgs:\n")[2], re.MULTILINE)
+        assert sorted(", ".join(described).split(", ")) == sorted(each.arg for each in function.args.args), task
+        assert arguments.splitlines()[0].endswith((".", "better.")) and len(returned) > 40, task
+        assert isinstance(function.body[-1], ast.Raise) and len(function.body) == 2, task
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
@@ -226,7 +357,7 @@ def test_students_see_neither_solutions_nor_hidden_tests(config, assignment):
     assert "SOLUTION" not in text and "HIDDEN" not in text and "Guide for marking" not in text
     for task, cell in graded(notebook, solution=True).items():
         stub = "*Write your answer" if cell.cell_type == "markdown" else "raise NotImplementedError"
-        assert stub in cell.source or task == "experiment", task
+        assert stub in cell.source, task
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
@@ -242,7 +373,7 @@ def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task
 
 
 @pytest.mark.slow
-def test_nbgrader_generates_and_grades_an_assignment(tmp_path, config, monkeypatch):
+def test_nbgrader_generates_grades_and_returns_an_assignment(tmp_path, config, monkeypatch):
     """A hand-in with one solution, one mistake and the other tasks left open gets the points of the first task."""
     assignment = "05_metrics"
     shutil.copytree(EXERCISES / "source" / assignment, tmp_path / "source" / assignment)
@@ -264,6 +395,8 @@ def test_nbgrader_generates_and_grades_an_assignment(tmp_path, config, monkeypat
     nbformat.write(handed_in, folder / f"{assignment}.ipynb")
     result = nbgrader.autograde(assignment, "student")
     assert result["success"], result["log"]
+    with_hidden_part = {name for name, cell in graded(source(assignment)).items() if "HIDDEN TESTS" in cell.source}
+    assert set(re.findall("'checksum' for cell (\\w+) has changed", result["log"])) == with_hidden_part
 
     with Gradebook(nbgrader.coursedir.db_url, nbgrader.coursedir.course_id) as gradebook:
         grades = gradebook.find_submission(assignment, "student").notebooks[0].grades
@@ -272,6 +405,29 @@ def test_nbgrader_generates_and_grades_an_assignment(tmp_path, config, monkeypat
     expected[f"test_{first}"] = graded(source(assignment))[f"test_{first}"].metadata.nbgrader.points
     assert points == expected
 
+    result = nbgrader.generate_feedback(assignment, "student")
+    assert result["success"], result["log"]
+    page = (tmp_path / "feedback" / "student" / assignment / f"{assignment}.html").read_text(encoding="utf-8")
+    scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
+    titles = [title.removeprefix("## ").partition(" (")[0] for title in tasks(source(assignment))]
+    assert [name for name, _, _ in scores] == titles and "Test cell" not in page
+    assert scores[0] == (titles[0], "4.0", "4.0") and "HIDDEN TESTS" in page
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "archive/Ada Lovelace_123_assignsubmission_file_05_metrics.ipynb",
+        "archive/Ada Lovelace_123_assignsubmission_file/05_metrics.ipynb",
+        "archive/Ada Lovelace_123_assignsubmission_file_/05_metrics.ipynb",
+        "archive/lovelaceada_123_67890_05_metrics.ipynb",
+        "archive/lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
+    ],
+)
+def test_nbgrader_recognises_the_files_of_learning_platforms(config, name):
+    found = re.match(config.FileNameCollectorPlugin.named_regexp, f"downloaded/05_metrics/extracted/{name}")
+    assert found.groupdict() == {"student_id": "123", "file_id": "05_metrics"}
+
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_every_task_has_a_mistake_and_the_points_equal_those_in_the_text(assignment):
@@ -279,7 +435,8 @@ def test_every_task_has_a_mistake_and_the_points_equal_those_in_the_text(assignm
     tests, answers = graded(notebook, grade=True, solution=False), graded(notebook, grade=True, solution=True)
     assert set(tests) == {f"test_{task}" for task in MISTAKES[assignment]} and len(tests) >= 3
     points = [cell.metadata.nbgrader.points for cell in (*tests.values(), *answers.values())]
-    said = re.search(r"(\d+) points: ([\d + ]+) by tests, (\d+) by a reader", notebook.cells[0].source)
-    assert [int(number) for number in (*said[2].split(" + "), said[3])] == points and int(said[1]) == sum(points)
+    said = re.search(r"(\d+) points: ([\d + ]+) by tests, ([\d + ]+) by a reader", notebook.cells[0].source)
+    parts = [int(number) for group in (said[2], said[3]) for number in group.split(" + ")]
+    assert parts == points and int(said[1]) == sum(points)
     titles = [re.match(r"## Task .*\((\d+) points", cell.source) for cell in notebook.cells]
     assert [int(title[1]) for title in titles if title] == points

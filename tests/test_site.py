@@ -8,6 +8,7 @@ import sys
 import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
+from types import ModuleType
 from urllib.parse import unquote, urlsplit
 
 import nbformat
@@ -18,6 +19,7 @@ import zsp_lite
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
+DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
 URLS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"].get("urls", {})
 
 
@@ -64,17 +66,26 @@ def pages(site):
     return {str(path.relative_to(site)): Page(path) for path in paths}
 
 
-@pytest.fixture(scope="module")
-def course():
-    """The site's extension of Sphinx, as a module."""
-    spec = importlib.util.spec_from_file_location("course", REPOSITORY / "docs" / "site" / "course.py")
+def extension(name: str) -> ModuleType:
+    """One of the site's extensions of Sphinx, as a module."""
+    spec = importlib.util.spec_from_file_location(name, REPOSITORY / "docs" / "site" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def page_of(notebook: Path) -> str:
-    return str(notebook.relative_to(REPOSITORY).with_suffix(".html"))
+@pytest.fixture(scope="module")
+def course():
+    return extension("course")
+
+
+@pytest.fixture(scope="module")
+def slides():
+    return extension("slides")
+
+
+def page_of(source: Path) -> str:
+    return str(source.relative_to(REPOSITORY).with_suffix(".html"))
 
 
 pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
@@ -99,7 +110,46 @@ def test_no_page_loads_anything_from_elsewhere(site, pages):
     for name, page in pages.items():
         for source in page.loaded:
             path = urlsplit(source)
+            if path.scheme == "data":
+                continue
             assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
+
+
+@pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
+def test_a_deck_of_slides_is_a_single_file_with_the_pictures_of_the_notebooks(pages, path):
+    page, text = pages[page_of(path)], path.read_text(encoding="utf-8")
+    assert page.loaded == [picture["src"] for picture in page.pictures]
+    assert all(re.match("data:image/(png|jpeg|svg)", source) for source in page.loaded)
+    assert len(page.pictures) == text.count("```{picture}") and all(
+        len(picture["alt"]) > 20 for picture in page.pictures
+    )
+    stored = "".join(notebook.read_text(encoding="utf-8").replace("\\n", "") for notebook in NOTEBOOKS)
+    for picture in page.pictures:
+        form, data = picture["src"].split(";base64,")
+        assert data in stored or picture["alt"] in text, picture["alt"]
+    assert "<math" in page.html or path.stem == "lab_90_minutes"
+    for heading in re.findall("^## (.*)$", text, re.MULTILINE):
+        assert heading in page.text
+
+
+def test_pictures_below_a_heading_end_with_its_section(slides):
+    def picture(name):
+        return nbformat.v4.new_output("display_data", {"image/png": name}, metadata={"image/png": {"alt": name}})
+
+    def code(*names):
+        return nbformat.v4.new_code_cell(outputs=[picture(name) for name in names])
+
+    cells = ["# 1 · One", code("a"), "text\n\n## Part\n", code("b", "c"), "end\n\n# 2 · Two", code("d")]
+    cells = [nbformat.v4.new_markdown_cell(cell) if isinstance(cell, str) else cell for cell in cells]
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    for heading, names in {"One": "abc", "Part": "bc", "2 · T": "d", "3 ·": ""}.items():
+        assert slides.pictures_below(notebook, heading) == [("image/png", name, name) for name in names]
+
+
+@pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
+def test_the_minutes_of_a_lab_add_up(path):
+    plan = re.search(r"Plan\n:class: notes\n(.*?):::", path.read_text(encoding="utf-8"), re.DOTALL)[1]
+    assert sum(map(int, re.findall(r"(\d+) min", plan))) == (90 if path.stem == "lab_90_minutes" else 120)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -19,12 +19,14 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "course",
+    "slides",
 ]
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
     "docs/**.md",
     "notebooks/README.md",
+    "notebooks/exercises/README.md",
     "notebooks/*.ipynb",
     "notebooks/exercises/source/*/*.ipynb",
     "notebooks/results/*/README.md",

@@ -1,0 +1,92 @@
+"""Sphinx extension of the course site: slides for the labs, from the pages of `docs/slides/`.
+
+A page becomes a deck in one HTML file that needs no network: its title is the first slide, each of its sections another
+one. The directive `picture` embeds a picture that a notebook shows, so that the slides show the stored results:
+
+    ```{picture} ../../notebooks/02_cyclical_maps.ipynb
+    :heading: The map of a real pair
+    ```
+
+is the first picture below the heading that contains these words. `:number: 2` is the second one. The path may also be
+that of a picture file (`:alt:` describes it).
+"""
+
+import base64
+import re
+from html import escape
+from pathlib import Path
+
+import nbformat
+from docutils import nodes
+from docutils.parsers.rst import directives
+from nbformat import NotebookNode
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+DECKS = "docs/slides/"
+FORMATS = {".svg": "image/svg+xml", ".png": "image/png", ".jpg": "image/jpeg"}
+
+
+class Picture(SphinxDirective):
+    """Embed a picture file or a picture of a notebook's stored outputs, with its alternative text."""
+
+    required_arguments = 1
+    option_spec = {"heading": directives.unchanged, "number": directives.positive_int, "alt": directives.unchanged}
+
+    def run(self) -> list[nodes.Node]:
+        path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
+        if not path.is_file():
+            raise self.error(f"no file {self.arguments[0]}")
+        self.env.note_dependency(str(path))
+        if path.suffix == ".ipynb":
+            notebook = nbformat.read(path, as_version=4)
+            found = pictures_below(notebook, self.options["heading"])
+            number = self.options.get("number", 1)
+            if len(found) < number:
+                raise self.error(
+                    f"{path.name} has {len(found)} pictures below the heading {self.options['heading']!r}, "
+                    f"expected at least {number}"
+                )
+            form, data, alt = found[number - 1]
+        else:
+            form, alt = FORMATS[path.suffix], self.options["alt"]
+            data = base64.b64encode(path.read_bytes()).decode()
+        image = f'<img class="picture" src="data:{form};base64,{data}" alt="{escape(alt)}">'
+        return [nodes.raw("", image, format="html")]
+
+
+def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str, str]]:
+    """Find the pictures of a section.
+
+    Args:
+        notebook: Notebook with stored outputs.
+        heading: Words of the section's heading.
+
+    Returns:
+        Media type, data in base64 and alternative text of each PNG or JPEG picture in the outputs from the cell with
+        the heading to the next cell with a heading of the same or a higher level. Empty without such a heading.
+    """
+    found, level = [], 0
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            if level and re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
+                break
+            if not level and (mark := re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)):
+                level = len(mark[1])
+        elif level:
+            for output in cell.get("outputs", []):
+                for form in {"image/png", "image/jpeg"} & set(output.get("data", {})):
+                    data = output.data[form].replace("\n", "")
+                    found.append((form, data, output.metadata.get(form, {}).get("alt", "")))
+    return found
+
+
+def choose_template(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object) -> str | None:
+    """Use the template of the slides for the pages of `docs/slides/` (Sphinx's event `html-page-context`)."""
+    return "slides.html" if pagename.startswith(DECKS) else None
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_directive("picture", Picture)
+    app.connect("html-page-context", choose_template)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
