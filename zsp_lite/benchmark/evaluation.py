@@ -41,7 +41,8 @@ def evaluate_pair(
 
     Returns:
         {"pair": its key, "results": by row, {"error": degrees, and where the row has them "translation_error",
-        "scale", "view", "note", "timings", "hypotheses" and its details; or "error": 180 and "failed": the reason},
+        "scale", "view", "note", "timings", "hypotheses" and its details, and of solvers that have hypotheses
+        "one_of_two" and the error of the second pose, "second_error"; or "error": 180 and "failed": the reason},
         "seconds": of this call, "timings": see `FrameStore.timings`, "saliency_iou": by frame, IoU of the backbone's
         foreground with the mask}.
 
@@ -92,6 +93,12 @@ def _evaluate(
         result["translation_error"] = float(translation_error(answer.translation, truths[answer.view, :3, 3]))
     if answer.scale is not None:
         result["scale"] = float(answer.scale)
+    if answer.hypotheses:
+        result["one_of_two"] = answer.one_of_two
+        different = [one for index, one in enumerate(answer.hypotheses) if one.mode == index]
+        if len(different) > 1:
+            second = different[1]
+            result["second_error"] = float(rotation_error(second.sim3.R, truths[second.view, :3, :3]))
     if keep_hypotheses and answer.hypotheses:
         result["hypotheses"] = [
             {

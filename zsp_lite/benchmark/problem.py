@@ -20,7 +20,9 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
 # Members of a stored result; an answer's details must have other names.
-RESERVED = ("error", "failed", "translation_error", "scale", "view", "note", "hypotheses")
+RESERVED = (
+    "error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two",
+)  # fmt: skip
 # Settings of ZeroShotPose that decide the matches: rows that agree in them share the matches.
 _MATCH_SETTINGS = ("k", "kmeans", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning")
 
@@ -38,6 +40,7 @@ class Answer:
         details: Numbers and texts to store with the result, such as {"inliers": 12}. "timings" in it are seconds per
             stage.
         hypotheses: Ranked candidate poses, of solvers that have them.
+        one_of_two: Whether the solver cannot decide between the two best poses (see `PoseEstimate.one_of_two`).
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -47,6 +50,7 @@ class Answer:
     note: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
     hypotheses: tuple[Hypothesis, ...] = ()
+    one_of_two: bool = False
 
 
 class Row(Protocol):
@@ -92,7 +96,9 @@ def as_answer(found: Any) -> Answer:
         if found.confidence is not None:
             details["confidence"] = round(found.confidence, 4)
         sim3 = found.sim3
-        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses)
+        return Answer(
+            sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses, found.one_of_two
+        )  # fmt: skip
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)

@@ -23,7 +23,10 @@ RESULTS = "results.json.gz"
 _NEEDED = ("data", "backbone", "targets", "seed")  # of run.json, for the summary
 _DECIMALS = 4  # of degrees and lengths in an export
 _KEY = re.compile(r"[^/]+/[^/]+:\d+/[^/]+:\d+(,\d+)*")
-_EXPORTED = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
+_EXPORTED = (
+    "error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note", "second_error",
+    "one_of_two",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Results:
         settings: What decided the results (see `database.check_settings`).
         invocations: Calls of `evaluate`.
         rows: By row and pair key, what the row found: "error" in degrees, and where it has them "translation_error",
-            "scale", "view", "inliers", "confidence", "failed", "note".
+            "scale", "view", "inliers", "confidence", "failed", "note", "second_error", "one_of_two".
     """
 
     summary: dict[str, Any]
@@ -131,7 +134,7 @@ def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], where: str)
                 raise InputError(
                     f"results {where}: {key!r} is no key of a pair, expected CATEGORY/SEQUENCE:FRAME/SEQUENCE:FRAME,..."
                 )
-            for part, most in (("error", 180.0), ("confidence", 1.0)):
+            for part, most in (("error", 180.0), ("second_error", 180.0), ("confidence", 1.0)):
                 value = found.get(part, None if part == "error" else 0.0)
                 if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:
                     raise InputError(f"results {where}: {part} of {name} on {key} is {value!r}, expected 0 to {most:g}")
@@ -169,12 +172,23 @@ class _Figures(msgspec.Struct):
     acc15_ci: _Interval
 
 
+class _BestTwo(msgspec.Struct):
+    """See `summary.best_two_figures`."""
+
+    acc30: _Percent
+    acc30_ci: _Interval
+    one_of_two: Annotated[int, msgspec.Meta(ge=0)]
+    one_of_two_acc30: _Percent | None
+    one_of_two_first_acc30: _Percent | None
+
+
 class _RowFigures(_Figures, kw_only=True):
     mean_category_median: _Angle
     mean_category_median_ci: _Interval
     failed: int
     flagged: int
     per_category: dict[str, _Figures]
+    best_two: _BestTwo | None = None
 
 
 class _Difference(msgspec.Struct):

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.metrics import (
+    accuracy,
+    bootstrap_ci,
     mean_category_median,
     object_weights,
     paired_difference,
@@ -69,11 +71,12 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
 
     Args:
         rows: By row and pair key, {"error": degrees, "failed": present where the row failed, "note": not "" where the
-            method flagged its estimate}.
+            method flagged its estimate, and of solvers with hypotheses "second_error" and "one_of_two"}.
 
     Returns:
         {"methods": by row, over all pairs and "per_category", the figures of `metrics.summarise`, and
-        "mean_category_median": the paper's way of averaging medians; "against_ours": every other row that has the same
+        "mean_category_median": the paper's way of averaging medians, and of solvers with hypotheses "best_two": see
+        `best_two_figures`; "against_ours": every other row that has the same
         problems in the same order against "ours", see `metrics.paired_difference`; "intervals": their method}.
         Intervals and p values come from resampled objects, except for "sign_test_p".
     """
@@ -98,6 +101,8 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
                 for members in [categories == category]
             },
         }
+        if any("one_of_two" in one for one in row.values()):
+            methods[name]["best_two"] = best_two_figures(row, drawn)
     summary: dict[str, Any] = {"methods": methods, "intervals": {"level": 0.95, "resampled": "objects"}}
     if "ours" in rows:
         problems, drawn = list(map(_problem, rows["ours"])), weights_of_pairs(rows["ours"])
@@ -108,6 +113,31 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
             if name != "ours" and list(map(_problem, rows[name])) == problems
         }
     return summary
+
+
+def best_two_figures(row: Mapping[str, Mapping[str, Any]], weights: Float[np.ndarray, "resamples n"]) -> dict[str, Any]:
+    """Compute how often one of the two best poses is right. These figures are not comparable with Acc30.
+
+    Args:
+        row: By pair key, {"error": degrees, and where the estimate has an alternative "second_error": that of its
+            first one; "one_of_two": whether the solver says that it cannot decide between them}.
+        weights: Bootstrap weights of the pairs.
+
+    Returns:
+        {"acc30" and "acc30_ci": percentage of pairs with the estimate or its first alternative below 30 degrees,
+        "one_of_two": number of estimates with that flag, and of these the percentages "one_of_two_acc30" with one of
+        the two poses below 30 degrees and "one_of_two_first_acc30" with the estimate itself; None without any}.
+    """
+    first = np.array([one["error"] for one in row.values()])
+    either = np.array([min(one["error"], one.get("second_error", 180.0)) for one in row.values()])
+    flagged = np.array([one.get("one_of_two", False) for one in row.values()], dtype=bool)
+    return {
+        "acc30": float(accuracy(either, 30)),
+        "acc30_ci": list(bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), weights)),
+        "one_of_two": int(flagged.sum()),
+        "one_of_two_acc30": float(accuracy(either[flagged], 30)) if flagged.any() else None,
+        "one_of_two_first_acc30": float(accuracy(first[flagged], 30)) if flagged.any() else None,
+    }
 
 
 def category_of(key: str) -> str:

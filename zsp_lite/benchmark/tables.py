@@ -201,6 +201,28 @@ def all_rows(summary: Mapping[str, Any]) -> Table:
     return make_table("all_rows", "All rows", [("", title) for title in columns], rows, note)
 
 
+def best_two_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the table "one of two", of the rows whose estimates have alternatives; none without such rows."""
+    columns = (
+        "pairs", "one of the two best right (%)", 'flagged "one of two"', "of these, one right (%)",
+        "of these, the first right (%)",
+    )  # fmt: skip
+    rows = {}
+    for name, row in summary["methods"].items():
+        if (found := row.get("best_two")) is not None:
+            shares = [found["one_of_two_acc30"], found["one_of_two_first_acc30"]]
+            rows[name] = [
+                Cell(row["n"], decimals=0), Cell(found["acc30"], *found["acc30_ci"]),
+                Cell(found["one_of_two"], decimals=0), *(None if share is None else Cell(share) for share in shares),
+            ]  # fmt: skip
+    note = (
+        "Right: a rotation error below 30°. The two best: the estimate and its first alternative, of every pair. Two "
+        "answers are right more often than one: these values are not comparable with Acc30."
+    )
+    title = "Right if one of the two best poses is right"
+    return [make_table("one_of_two", title, [("", column) for column in columns], rows, note)] if rows else []
+
+
 def category_tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return every row by category: median error, Acc30 and Acc15, a table each."""
     methods = summary["methods"]
@@ -231,7 +253,7 @@ def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
 
 def every_table(summary: Mapping[str, Any]) -> list[Table]:
     """Return all tables of a run."""
-    return [all_rows(summary), *paper_tables(summary), *category_tables(summary)]
+    return [all_rows(summary), *best_two_tables(summary), *paper_tables(summary), *category_tables(summary)]
 
 
 def _cell(row: Mapping[str, Any] | None, figure: str) -> Cell | None:

@@ -82,7 +82,7 @@ def benchmark(
 
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate, plan_run
-    from zsp_lite.benchmark.tables import all_rows, by_category, paper_tables
+    from zsp_lite.benchmark.tables import all_rows, best_two_tables, by_category, paper_tables
     from zsp_lite.cli.terminal import print_tables
     from zsp_lite.data.samples import data_folders, sample_data
 
@@ -115,7 +115,8 @@ def benchmark(
     console = Console(markup=False)  # names may hold brackets
     title = f"{root}, backbone {summary['backbone']}, {targets} target views"
     console.print(title, soft_wrap=True, highlight=False)
-    shown = [all_rows(summary), *(paper_tables(summary) if len(summary["methods"]) > 3 else [])]
+    shown = [all_rows(summary), *best_two_tables(summary)]
+    shown += paper_tables(summary) if len(summary["methods"]) > 3 else []
     print_tables([*shown, by_category(summary, list(summary["methods"])[:_ROWS_SHOWN])])
     if cost := summary.get("cost"):
         console.print(
@@ -181,7 +182,8 @@ def tables(sources: tuple[Path, ...], out: Path | None, by_category: list[str] |
     write = len(sources) == 1 or out
     summary = (write_reports(sources, out) if write else read_runs(sources)).summary
     rows = by_category or list(summary["methods"])[:_ROWS_SHOWN]
-    print_tables([build.all_rows(summary), *build.paper_tables(summary), build.by_category(summary, rows)])
+    shown = [build.all_rows(summary), *build.best_two_tables(summary), *build.paper_tables(summary)]
+    print_tables([*shown, build.by_category(summary, rows)])
     return None
 
 
