@@ -113,6 +113,23 @@ def test_json_has_every_number_of_the_estimates(own):
     assert content["degrees_between_solvers"] == found.result.disagreement < 20
 
 
+def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path):
+    found, out = own
+    doubtful = replace(found.estimates["verified"], one_of_two=True)
+    pair = replace(found, result=replace(found.result, estimates={"verified": doubtful}))
+    assert [path.name for path in pair.write(tmp_path)] == [
+        "report.html", "target.ply", "aligned_verified.ply", "aligned_verified_2.ply",
+    ]  # fmt: skip
+    assert "One of two: both poses of the verified solver" in (tmp_path / "report.html").read_text()
+    (first, _), (second, _) = (read_ply(tmp_path / f"aligned_verified{name}.ply") for name in ("", "_2"))
+    np.testing.assert_array_equal(first, read_ply(out / "aligned_verified.ply")[0])
+    other = doubtful.alternatives[0]
+    points = found.targets[doubtful.view].camera.to_camera(first)
+    expected = found.targets[other.view].camera.to_world(other.sim3.apply(doubtful.sim3.inverse().apply(points)))
+    np.testing.assert_allclose(second, expected, atol=1e-3)
+    assert pair.as_json()["estimates"]["verified"]["one_of_two"] is True
+
+
 def test_two_pictures_without_labels_give_the_true_pose_and_no_error(pictures, tmp_path):
     cup, mug, truth = pictures
     found = zsp_lite.estimate_pose(

@@ -7,6 +7,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from synthetic_views import CoordinateBackbone
@@ -20,8 +21,10 @@ from zsp_lite.points import object_cloud
 from zsp_lite.viz.report import (
     COLUMNS,
     _notebook_link,
+    _two_poses_figure,
     _views_figure,
     render_page,
+    stage_figures,
     table_rows,
     write_overview,
     write_report,
@@ -159,6 +162,26 @@ def test_the_page_shows_both_answers_with_confidence_and_hypotheses(results, tex
     for one in estimate.alternatives:
         cells = (f"{one.rank}", f"{one.angle:.0f}°", f"{one.deficit:.1f}", f"{one.probability:.2f}")
         assert "".join(f"<td>{cell}</td>" for cell in cells) in text
+
+
+def test_two_poses_are_shown_side_by_side_where_the_answer_is_one_of_two(results, text):
+    assert "One of two" not in text  # the features are perfect
+    estimate = results[0].estimates["verified"]
+    doubtful = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
+    first, *others = stage_figures(doubtful, "scene")
+    assert first.title == "One of two: both poses of the verified solver"
+    assert f"turned by {estimate.alternatives[0].angle:.0f} degrees" in first.alt and first.wide
+    assert not any("One of two" in stage.title for stage in others)
+    figure = _two_poses_figure(doubtful, estimate)
+    titles = [axis.get_title() for axis in figure.axes]
+    assert titles[0] == f"probability {estimate.confidence:.2f}"
+    assert titles[1].endswith(f"°, probability {estimate.alternatives[0].probability:.2f}")
+    assert len(titles) == 6  # two poses in three frames
+    # Both columns show the same frames; what is drawn over them differs.
+    for left, right in zip(figure.axes[::2], figure.axes[1::2]):
+        np.testing.assert_array_equal(left.images[0].get_array(), right.images[0].get_array())
+        assert not np.allclose(left.collections[0].get_offsets().mean(0), right.collections[0].get_offsets().mean(0))
+    plt.close(figure)
 
 
 def test_terms_are_explained_and_stages_lead_to_their_notebooks(text):

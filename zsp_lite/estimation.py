@@ -106,8 +106,9 @@ class OwnPair:
 
         Returns:
             `report.html`; `target.ply`, the points of the target object in all its views; and for each solver
-            `aligned_SOLVER.ply`, the points of the reference object after the pose. The clouds are in the world of the
-            target views, which for an image is its camera's frame.
+            `aligned_SOLVER.ply`, the points of the reference object after the pose, and `aligned_SOLVER_2.ply`, after
+            the first alternative, where the answer is one of two. The clouds are in the world of the target views,
+            which for an image is its camera's frame.
         """
         from zsp_lite.viz.report import write_pair_report
 
@@ -120,9 +121,12 @@ class OwnPair:
         points, colours = _coloured_points(self.reference)
         points = self.reference.camera.to_camera(points)
         for solver, estimate in self.estimates.items():
-            moved = self.targets[estimate.view].camera.to_world(estimate.sim3.apply(points))
-            paths.append(out / f"aligned_{solver}.ply")
-            write_ply(paths[-1], moved, colours)
+            poses = {f"aligned_{solver}.ply": estimate}
+            if estimate.one_of_two:
+                poses[f"aligned_{solver}_2.ply"] = estimate.alternatives[0]
+            for name, pose in poses.items():
+                paths.append(out / name)
+                write_ply(paths[-1], self.targets[pose.view].camera.to_world(pose.sim3.apply(points)), colours)
         return [write_pair_report(out / "report.html", self.result, self.backbone, self.masks), *paths]
 
 

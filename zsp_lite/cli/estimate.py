@@ -76,8 +76,9 @@ def estimate(
     NAME_mask.png.
 
     The pose maps points of the reference camera to points of the camera of the chosen target view. OUT gets
-    report.html and point clouds: target.ply, and aligned_SOLVER.ply, the reference after the pose. Where both are
-    labelled sequences of one category, the rotation error is shown too.
+    report.html and point clouds: target.ply, and aligned_SOLVER.ply, the reference after the pose. Where the verified
+    solver cannot decide between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both
+    are labelled sequences of one category, the rotation error is shown too.
     """
     import matplotlib
 

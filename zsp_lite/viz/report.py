@@ -11,13 +11,14 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
@@ -40,6 +41,7 @@ COLUMNS = ("category", "solver", "chosen view", "inliers", "rotation error", "co
 _DPI = 110
 _OVERVIEW_FRAMES = 4
 _OVERVIEW_POINTS = 1500
+_TWO_POSES_FRAMES = 3
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 # Terms of the captions that are explained on hover.
 _TERMS = {
@@ -302,6 +304,21 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
     )
     stages = [
         StageFigure(
+        StageFigure(
+            f"One of two: both poses of the {solver} solver",
+            "The solver cannot decide between these two poses, which explain the views about equally well. Points: the "
+            "reference object under each pose, coloured along its longest axis. Arrows: the axes of the reference "
+            "camera (x right, y down, z forward).",
+            "11_hypotheses_and_evidence",
+            _data_uri(_two_poses_figure(result, one)),
+            f"The same frames of the target sequence with the reference cloud under two poses of the {solver} solver: "
+            f"left the estimate, right its first alternative, turned by {one.alternatives[0].angle:.0f} degrees.",
+            wide=True,
+        )
+        for solver, one in result.estimates.items()
+        if one.one_of_two
+    ]
+    stages += [
             "Reference and target views",
             f"All views are cropped to the object. {scores}",
             "03_best_view" if paper else "11_hypotheses_and_evidence",
@@ -461,16 +478,38 @@ def _in_camera(estimate: PoseEstimate, sim3: Sim3, view: int, camera) -> Sim3:
 
 
 def _sequence_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
-    cloud = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
-    colours = plots.coordinate_colours(cloud)
     frames = result.sequence
     titles = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=3.3)
-    length = 2 * axis_deviation(cloud)
+    _draw_pose(axes, frames, estimate)
+    return figure
+
+
+def _two_poses_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
+    """Draw the estimate (left) and its first alternative (right) in some frames of the target sequence, a row each."""
+    second = estimate.alternatives[0]
+    poses = {
+        f"probability {estimate.confidence:.2f}": estimate,
+        f"turned by {second.angle:.0f}°, probability {second.probability:.2f}": replace(
+            estimate, sim3=second.sim3, view=second.view
+        ),
+    }
+    frames = result.sequence[:: -(-len(result.sequence) // _TWO_POSES_FRAMES)]
+    titles = [title if row == 0 else "" for row in range(len(frames)) for title in poses]
+    images = [frame.rgb for frame in frames for _ in poses]
+    figure, axes = plots.show_images(images, titles, columns=2, size=4.2)
+    for place, one in enumerate(poses.values()):
+        _draw_pose(axes[place::2], frames, one)
+    return figure
+
+
+def _draw_pose(axes: Sequence[Axes], frames: Sequence[Frame], estimate: PoseEstimate) -> None:
+    """Draw the reference cloud and the axes of its camera under the pose over frames of the target sequence."""
+    cloud = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
+    colours, length = plots.coordinate_colours(cloud), 2 * axis_deviation(cloud)
     for axis, frame, pose in zip(axes, frames, estimate.propagate([frame.camera for frame in frames])):
         plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
         plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), length)
-    return figure
 
 
 def _chosen_views(result: PairResult) -> list[View]:
