@@ -1,4 +1,7 @@
-"""Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their sliders."""
+"""Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their sliders.
+
+A self-check gives feedback, and asks nothing of the network.
+"""
 
 import os
 import shutil
@@ -18,7 +21,7 @@ from lab_in_browser import (
     slider_moves_picture,
     slider_outputs,
 )
-from nbformat.v4 import new_code_cell, new_notebook
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = REPOSITORY / "outputs" / "browser"
@@ -82,6 +85,9 @@ def lab(browser, tmp_path_factory):
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     broken = new_notebook(cells=cells, metadata=python)
     nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
+    check = new_code_cell('from zsp_lite.widgets import self_check\nself_check("00", 1)')
+    asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
+    nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
     with serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 
@@ -111,6 +117,20 @@ def test_errors_of_a_broken_notebook_are_found(page, lab):
     ]
     (output,) = slider_outputs(page)
     assert not slider_moves_picture(output, patience=3)
+
+
+def test_a_self_check_gives_feedback_without_a_network(page, lab):
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    open_notebook(page, lab, "asking.ipynb")
+    run_all(page, patience=300)
+    feedback = page.locator(".Feedback").first
+    for answer, words in (("CAD model", "No CAD model is used."), ("one image of the first object", "Yes.")):
+        page.locator(".MCButton", has_text=answer).click()
+        assert feedback.inner_text().startswith(words)
+    page.wait_for_timeout(2000)  # jupyterquiz looks for MathJax after half a second
+    assert page.evaluate("typeof MathJax") == "object"
+    assert asked and not [url for url in asked if not url.startswith((lab.url, "ws://127.0.0.1", "data:", "blob:"))]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
