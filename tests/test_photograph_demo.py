@@ -13,7 +13,13 @@ from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, REPOSITORY
 from zsp_lite.demo import photograph_pair, run_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
+from zsp_lite.viz.photograph import (
+    PHOTOGRAPH_COLUMNS,
+    PHOTOGRAPH_CREDIT,
+    photograph_by_backbone,
+    photograph_figure,
+    photograph_rows,
+)
 from zsp_lite.viz.report import render_page
 
 pytestmark = pytest.mark.slow
@@ -112,6 +118,19 @@ def test_both_motorcycles_of_the_pair_face_the_same_way():
 def test_a_pair_with_the_photograph_needs_its_synthetic_motorcycle(motorcycles):
     with pytest.raises(InputError, match="no sequence motorcycle/scooter, expected sample data"):
         photograph_pair(motorcycles)
+
+
+def test_foregrounds_and_solvers_may_be_chosen_and_have_a_panel_each(motorcycles, photograph, monkeypatch):
+    monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
+    (one,) = run_photograph(motorcycles, CoordinateBackbone(), foregrounds=["mask"], solvers=["paper"])
+    assert (one.foreground, one.solver) == ("mask", "paper")
+    figure = photograph_by_backbone({"first network": one, "second network": one})
+    assert [axis.get_title() for axis in figure.axes] == ["first network", "second network"]
+    assert all([text.get_text() for text in axis.texts if text.get_text()] == ["front", "left", "up"]
+               for axis in figure.axes)  # fmt: skip
+    assert all(len(axis.collections) == 1 for axis in figure.axes)
+    with pytest.raises(InputError, match="solver"):
+        list(run_photograph(motorcycles, CoordinateBackbone(), foregrounds=["mask"], solvers=["nobody's"]))
 
 
 def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):

@@ -8,7 +8,13 @@ from zsp_lite.errors import InputError
 
 pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip install 'zsp-lite[notebooks]'")
 
-from zsp_lite.widgets.metrics import measured_accuracy, order_probabilities, rotated_distance, symmetry_rotation
+from zsp_lite.widgets.metrics import (
+    accuracy_threshold,
+    measured_accuracy,
+    order_probabilities,
+    rotated_distance,
+    symmetry_rotation,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -84,3 +90,17 @@ def test_the_caption_of_the_symmetry_widget_has_both_errors():
 def test_no_cloud_is_an_input_error():
     with pytest.raises(InputError, match="no clouds"):
         symmetry_rotation({})
+
+
+def test_the_bars_are_the_shares_of_pairs_within_the_threshold():
+    widget = accuracy_threshold({"first": np.array([5.0, 20, 40, 170]), "second": np.array([50.0, 60])})
+    bars = widget.figure.axes[0].patches
+    assert [bar.get_width() for bar in bars] == [50, 0]
+    widget.controls["threshold"].value = 55
+    assert [bar.get_width() for bar in bars] == [75, 50]
+    assert "Within 55°: first 75 %, second 50 %" in widget.caption.value
+
+
+def test_no_method_is_an_error():
+    with pytest.raises(InputError, match="no methods"):
+        accuracy_threshold({})

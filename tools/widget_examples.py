@@ -136,6 +136,12 @@ def measured_accuracy() -> "VBox":
     return metrics.measured_accuracy()
 
 
+def accuracy_threshold() -> "VBox":
+    """`metrics.accuracy_threshold` on three methods."""
+    rng = np.random.default_rng(0)
+    return metrics.accuracy_threshold({name: rng.uniform(0, most, 500) for name, most in zip("abc", (60, 120, 180))})
+
+
 def symmetry_rotation() -> "VBox":
     """`metrics.symmetry_rotation` on a plane and a cross."""
     x = np.linspace(-1, 1, 400)
@@ -176,7 +182,7 @@ WIDGETS: dict[str, Callable[[], "VBox"]] = {
     build.__name__: build
     for build in (
         attention, facets, context, saliency, cycle, matches, best_view, ransac_settings, one_outlier,
-        measured_accuracy, symmetry_rotation, ranked_hypotheses, box_to_mask, label_poses,
+        measured_accuracy, accuracy_threshold, symmetry_rotation, ranked_hypotheses, box_to_mask, label_poses,
     )
 }  # fmt: skip
 

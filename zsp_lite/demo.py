@@ -141,7 +141,11 @@ class PhotographResult:
 
 
 def run_photograph(
-    dataset: Co3D, backbone: FeatureExtractor, sequence: str | None = None
+    dataset: Co3D,
+    backbone: FeatureExtractor,
+    sequence: str | None = None,
+    foregrounds: Sequence[str] = PHOTOGRAPH_FOREGROUNDS,
+    solvers: Sequence[str] = PHOTOGRAPH_SOLVERS,
 ) -> Iterator[PhotographResult]:
     """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
 
@@ -150,14 +154,16 @@ def run_photograph(
         backbone: Computes the features.
         sequence: Sequence of the synthetic motorcycle; by default `samples.PHOTOGRAPH_TARGET`, or the first of other
             data. Both are independent of the results.
+        foregrounds: Settings `foreground` of `ZeroShotPose`.
+        solvers: Settings `solver` of `ZeroShotPose`.
 
     Yields:
-        One result for each of `PHOTOGRAPH_FOREGROUNDS` and `PHOTOGRAPH_SOLVERS`.
+        One result for each foreground and solver.
 
     Raises:
-        InputError: The category has no such sequence.
+        InputError: The category has no such sequence, or a setting is unknown.
     """
-    methods = {foreground: ZeroShotPose(backbone, foreground=foreground) for foreground in PHOTOGRAPH_FOREGROUNDS}
+    methods = {foreground: ZeroShotPose(backbone, foreground=foreground) for foreground in foregrounds}
     if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
         return
     poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
@@ -168,7 +174,7 @@ def run_photograph(
     points, _ = dataset.point_cloud(PHOTOGRAPH_CATEGORY, sequence)
     for foreground, method in methods.items():
         reference, *views = method.views([photograph, *targets])
-        for solver in PHOTOGRAPH_SOLVERS:
+        for solver in solvers:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)
             camera, to_photograph = estimate.target_camera, estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R

@@ -1,6 +1,6 @@
 """Figure of the photographed motorcycle, posed by a synthetic one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -55,12 +55,31 @@ def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) ->
     centre = np.median(object_points(photograph), axis=0)
     _draw(axes[1 + columns], photograph.camera, np.stack([front, np.cross(up, front), up], axis=1), centre)
     for index, result in enumerate(results):
-        axis = axes[index // columns * (1 + columns) + 1 + index % columns]
-        chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
-        colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
-        plots.draw_points(axis, photograph.camera, result.cloud[chosen], colours, size=2.5)
-        _draw(axis, photograph.camera, result.axes, result.cloud.mean(axis=0))
+        _draw_result(axes[index // columns * (1 + columns) + 1 + index % columns], result)
     return figure
+
+
+def photograph_by_backbone(results: Mapping[str, PhotographResult], columns: int = 2, size: float = 4.0) -> Figure:
+    """Draw the aligned cloud and the estimated directions on the photograph, one panel per backbone.
+
+    Args:
+        results: A result by the name of its backbone.
+        columns: Panels per row.
+        size: Width of a panel in inches.
+    """
+    pictures = [result.photograph.rgb for result in results.values()]
+    figure, axes = plots.show_images(pictures, list(results), columns=columns, size=size)
+    for axis, result in zip(axes, results.values()):
+        _draw_result(axis, result)
+    return figure
+
+
+def _draw_result(axis: Axes, result: PhotographResult) -> None:
+    """Draw points of the aligned cloud and the estimated directions."""
+    chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
+    colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
+    plots.draw_points(axis, result.photograph.camera, result.cloud[chosen], colours, size=2.5)
+    _draw(axis, result.photograph.camera, result.axes, result.cloud.mean(axis=0))
 
 
 def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray) -> None:

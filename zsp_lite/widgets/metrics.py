@@ -139,5 +139,32 @@ def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
     return interactive_figure(figure, controls, update, alt)
 
 
+def accuracy_threshold(errors: Mapping[str, Real[np.ndarray, " n"]]) -> "VBox":
+    """Show the share of pairs within a rotation error, a bar per method. The control is the threshold.
+
+    Args:
+        errors: Rotation errors in degrees by the name of the method.
+
+    Raises:
+        InputError: There are no methods.
+    """
+    if not errors:
+        raise InputError("no methods, expected the errors of at least one")
+    figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
+    bars = axis.barh(list(errors), np.zeros(len(errors)), color=BLUE)
+    axis.invert_yaxis()
+    axis.set(xlim=(0, 100), xlabel="pairs within the threshold (%)")
+
+    def update(threshold: int) -> str:
+        shares = {name: 100 * float(np.mean(np.asarray(one) < threshold)) for name, one in errors.items()}
+        for bar, share in zip(bars, shares.values(), strict=True):
+            bar.set_width(share)
+        ranked = sorted(shares, key=lambda name: -shares[name])
+        return f"Within {threshold}°: " + ", ".join(f"{name} {shares[name]:.0f} %" for name in ranked)
+
+    alt = "One bar per method: the share of pairs within the threshold"
+    return interactive_figure(figure, {"threshold": slider("threshold (°)", 5, 180, 30, 5)}, update, alt)
+
+
 def _rotate_z(points: np.ndarray, degrees: float) -> np.ndarray:
     return Rotation.from_euler("z", degrees, degrees=True).apply(points)

@@ -1,0 +1,430 @@
+"""Figures of results: estimated poses and their failures, benchmark runs, pose labels, and one's own captures."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Bool, Float, Real, UInt8
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from zsp_lite.data.frames import Frame, mask_to_bbox
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.points import object_cloud
+from zsp_lite.views import View
+from zsp_lite.viz import plots
+from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
+
+_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
+_MARKERS = "osD^vP*X"
+_HALF_WIDTH = 3.5  # of a panel with point clouds, in scene units; a cloud has unit standard deviation
+
+
+def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, points: int = 1500) -> Figure:
+    """Draw the reference with its points, the chosen view, and the points in it after the estimated pose.
+
+    The colour of a point is its position along the reference object.
+
+    Args:
+        estimate: Pose estimate.
+        title: Title of the whole figure.
+        size: Width of a panel in inches.
+        points: Largest number of points.
+    """
+    reference, chosen = estimate.reference_view, estimate.target_views[estimate.view].frame
+    cloud = object_cloud(reference, most=points)
+    colours = plots.coordinate_colours(cloud)
+    titles = ["reference", f"chosen view (target {estimate.view + 1})", "reference, moved"]
+    figure, axes = plots.show_images([reference.frame.rgb, chosen.rgb, chosen.rgb], titles, size=size)
+    plots.draw_points(axes[0], reference.frame.camera, cloud, colours, size=4)
+    plots.draw_points(axes[2], chosen.camera, estimate.sim3.apply(cloud), colours, size=4)
+    if title:
+        figure.suptitle(plots.plain_text(title), fontsize=10, weight="bold")
+    return figure
+
+
+def crop_steps(frame: Frame, crop: Frame, size: float = 3.0) -> Figure:
+    """Draw a frame with the box around its object, the object mask, and the crop.
+
+    Args:
+        frame: Whole frame with a mask.
+        crop: Its object crop.
+        size: Width of a panel in inches.
+    """
+    top, left, height, width = mask_to_bbox(frame.mask)
+    titles = ["frame and box", "object mask", "crop, resized to a square"]
+    figure, axes = plots.show_images([frame.rgb, frame.mask, crop.rgb], titles, size=size)
+    axes[0].add_patch(Rectangle((left, top), width, height, fill=False, edgecolor=ORANGE, linewidth=3))
+    return figure
+
+
+def stage_sheet(
+    views: Sequence[View],
+    maps: Sequence[Real[np.ndarray, "rows cols"]],
+    captions: Sequence[str],
+    chosen: int,
+    size: float = 1.75,
+) -> Figure:
+    """Draw the stages of all views of a pair, a column each: crop, features, foreground, and cyclical distances.
+
+    The features are coloured by principal components that all views share; the foreground shows the saliency; the maps
+    of cyclical distances lie on the reference.
+
+    Args:
+        views: The reference and the N target views.
+        maps: Cyclical distances (negated) of the reference's patches to each target, -inf off the foreground.
+        captions: Title of each column, N + 1.
+        chosen: Index of the chosen target.
+        size: Width of a panel in inches.
+    """
+    crops = [view.frame.rgb for view in views]
+    keys = [np.asarray(view.features.keys) for view in views]
+    colours = plots.pca_colours(keys, [np.asarray(view.foreground) for view in views])
+    figure, axes = plots.show_images(
+        [*crops, *colours, *crops, np.ones_like(crops[0]) * 255, *crops[:1] * len(maps)],
+        [*captions, *[""] * (3 * len(views))], columns=len(views), size=size,
+    )  # fmt: skip
+    figure.set_size_inches(size * len(views) + 1.2, size * 4 + 0.5)
+    rows = np.reshape(np.array(axes, dtype=object), (4, len(views)))
+    for axis, view in zip(rows[2], views):
+        plots.overlay_map(axis, np.where(view.foreground, view.features.saliency, np.nan), limits=(0, 1))
+    for axis, distances in zip(rows[3, 1:], maps):
+        plots.overlay_map(axis, distances, limits=(-10, 0), cmap="cividis", alpha=0.85)
+    names = (
+        "crop",
+        "features\n(3 principal\ncomponents)",
+        "saliency on\nthe foreground",
+        "cyclical distance\nto each target",
+    )
+    for axis, name in zip(rows[:, 0], names):
+        axis.text(-0.06, 0.5, name, transform=axis.transAxes, ha="right", va="center", fontsize=9)
+    for axis in rows[:, 1 + chosen]:
+        plots.mark(axis, "")
+    bar = figure.colorbar(rows[3, 1].images[-1], ax=rows[3, 0], location="bottom", shrink=0.9, aspect=12, pad=-0.6)
+    bar.set_label("− distance (patches)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return figure
+
+
+def matched_points(views: Sequence[View], points: Sequence[Float[np.ndarray, "k 3"]], names: Sequence[str]) -> Figure:
+    """Draw the 3D points of matches on the measured surfaces of both objects, seen from the front.
+
+    Both points of a match have the same colour, by their height on the first object. Points far off the object are
+    outside the panels.
+
+    Args:
+        views: Two views.
+        points: Matched points in the camera frames of both.
+        names: Names of both.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4.4), layout="constrained")
+    order = np.argsort(np.argsort(points[0][:, 1]))
+    for axis, view, matched, name in zip(axes, views, points, names):
+        cloud = object_cloud(view)
+        x, y, _ = np.median(cloud, axis=0)
+        inside = (np.abs(matched[:, :2] - (x, y)) < _HALF_WIDTH).all(axis=1)
+        axis.scatter(*cloud[:, :2].T, s=2, color="0.75", label="measured surface")
+        style = {"cmap": "viridis", "vmin": 0, "vmax": len(matched) - 1, "edgecolors": "black"}
+        axis.scatter(*matched[inside, :2].T, s=50, c=order[inside], label="matches", **style)
+        axis.set(title=f"{name}: {inside.sum()} of {len(matched)} matches", aspect="equal")
+        axis.set(xlabel="x, to the right (scene units)", ylabel="y, down (scene units)")
+        axis.set(xlim=(x - _HALF_WIDTH, x + _HALF_WIDTH), ylim=(y + _HALF_WIDTH, y - _HALF_WIDTH))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def residual_histogram(residuals: Real[np.ndarray, " k"], inliers: Bool[np.ndarray, " k"], threshold: float) -> Figure:
+    """Draw the distribution of the residuals of a fit, inliers and outliers apart.
+
+    Args:
+        residuals: Distance of each moved reference point from its match, in scene units.
+        inliers: Which matches are inliers.
+        threshold: RANSAC's threshold, drawn as a line.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
+    capped = np.minimum(residuals, 1.99)  # the last bar holds everything beyond
+    labels = [f"{inliers.sum()} inliers", f"{(~inliers).sum()} outliers"]
+    bins = np.arange(0, 2.05, 0.1)
+    axis.hist([capped[inliers], capped[~inliers]], bins, stacked=True, color=[BLUE, "0.75"], edgecolor="white",
+              label=labels)  # fmt: skip
+    axis.axvline(threshold, color=VERMILLION, linestyle="--", label="threshold")
+    axis.set(xlabel="distance of the moved point from its match (scene units; last bar: 1.9 and more)")
+    axis.set(ylabel="matches")
+    axis.legend()
+    return figure
+
+
+def aligned_from_two_sides(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, "m 3"]) -> Figure:
+    """Draw both clouds in the target camera's frame, from the front and from above.
+
+    Args:
+        reference: Points of the reference after the pose.
+        target: Points of the target.
+    """
+    middle = np.median(target, axis=0)
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 4.4), layout="constrained")
+    for axis, title, down, flip in zip(axes, ("from the front", "from above"), (1, 2), (-1, 1)):
+        for cloud, name, marker, colour in (
+            (target, "target", "D", ORANGE),
+            (reference, "reference, moved", "o", BLUE),
+        ):
+            style = {"s": 7, "linewidths": 0, "marker": marker, "color": colour, "alpha": 0.8}
+            axis.scatter(*cloud[:, [0, down]].T, label=name, **style)
+        axis.set(title=title, xlabel="x, to the right", ylabel=("y, down", "z, away")[down - 1], aspect="equal")
+        axis.set_xlim(middle[0] - _HALF_WIDTH, middle[0] + _HALF_WIDTH)
+        axis.set_ylim(middle[down] - flip * _HALF_WIDTH, middle[down] + flip * _HALF_WIDTH)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=2.5)
+    return figure
+
+
+def pose_over_sequence(
+    estimate: PoseEstimate,
+    frames: Sequence[Frame],
+    titles: Sequence[str],
+    columns: int = 3,
+    size: float = 2.7,
+    show_axes: bool = True,
+) -> Figure:
+    """Draw the reference's points in frames of the target sequence after the estimated pose.
+
+    Args:
+        estimate: Pose estimate.
+        frames: Whole frames of the target sequence.
+        titles: Title of each.
+        columns: Panels per row.
+        size: Width of a panel in inches.
+        show_axes: Whether to draw the axes of the reference camera as well.
+    """
+    cloud = object_cloud(estimate.reference_view, most=1400)
+    colours = plots.coordinate_colours(cloud)
+    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
+    for axis, frame, pose in zip(axes, frames, estimate.propagate([frame.camera for frame in frames])):
+        plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
+        if show_axes:
+            plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), 2, names=("", "", ""))
+    return figure
+
+
+def points_on_images(
+    frames: Sequence[Frame],
+    clouds: Sequence[Real[np.ndarray, "_ 3"]],
+    colours: Sequence[Real[np.ndarray, "_ 3"]],
+    titles: Sequence[str],
+    columns: int | None = None,
+    size: float = 2.6,
+) -> Figure:
+    """Draw coloured points over images.
+
+    Args:
+        frames: One frame per panel.
+        clouds: For each frame, points in its camera's frame.
+        colours: For each frame, the colours of the points in [0, 1].
+        titles: Title of each panel.
+        columns: Panels per row; default all in one row.
+        size: Width of a panel in inches.
+    """
+    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
+    for axis, frame, cloud, own in zip(axes, frames, clouds, colours):
+        plots.draw_points(axis, frame.camera, cloud, own, size=4)
+    return figure
+
+
+def foregrounds(views: Sequence[View], titles: Sequence[str], columns: int | None = None, size: float = 2.9) -> Figure:
+    """Draw the saliency of foreground patches over each crop, dark (0) to bright (1).
+
+    Args:
+        views: Views.
+        titles: Title of each.
+        columns: Panels per row; default all in one row.
+        size: Width of a panel in inches.
+    """
+    figure, axes = plots.show_images([view.frame.rgb for view in views], titles, columns=columns, size=size)
+    for axis, view in zip(axes, views):
+        plots.overlay_map(axis, np.where(view.foreground, view.features.saliency, np.nan), limits=(0, 1))
+    return figure
+
+
+def errors_against_viewpoint(
+    angles: Sequence[float], errors: Sequence[float], groups: Sequence[str], near: float = 45.0, correct: float = 30.0
+) -> Figure:
+    """Draw rotation errors over the angle between the reference and the chosen view, a marker for each group.
+
+    Args:
+        angles: Angle of each pair in degrees.
+        errors: Rotation error of each pair in degrees.
+        groups: Category of each pair.
+        near: Largest angle of a near view, drawn as a dotted line.
+        correct: Largest error of a correct pose, drawn as a dashed line.
+    """
+    figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
+    styles = zip(dict.fromkeys(groups), cycle(_MARKERS), cycle(_COLOURS))
+    for group, marker, colour in styles:
+        at = [(angle, error) for angle, error, own in zip(angles, errors, groups) if own == group]
+        axis.scatter(*np.transpose(at), marker=marker, color=colour, s=60, edgecolors="black", label=group)
+    axis.axhline(correct, color="0.4", linestyle="--")
+    axis.axvline(near, color="0.4", linestyle=":")
+    axis.plot([0, 180], [0, 180], color="0.8", zorder=0)
+    axis.set(xlabel="angle between reference and chosen view (degrees)", ylabel="rotation error (degrees)")
+    axis.set(xlim=(-6, 186), ylim=(-6, 186), xticks=range(0, 181, 45), yticks=(0, 30, 90, 150, 180))
+    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def label_error_curves(noises: Sequence[float], errors: Mapping[int, Real[np.ndarray, "noises draws"]]) -> Figure:
+    """Draw the error of pose labels over the error of single clicks: medians, and 95th percentiles dotted.
+
+    Args:
+        noises: Errors of the clicks, as shares of the object's length.
+        errors: For each number of keypoints, the errors of random labels in degrees.
+    """
+    figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
+    for (n, draws), marker, colour in zip(errors.items(), cycle(_MARKERS), cycle((VERMILLION, ORANGE, GREEN, BLUE))):
+        middle, high = np.percentile(draws, [50, 95], axis=1)
+        axis.plot(noises, middle, marker=marker, color=colour, label=f"{n} keypoints")
+        axis.plot(noises, high, marker=marker, color=colour, linestyle=":", markerfacecolor="white")
+    axis.plot([], [], color="0.3", linestyle=":", label="95 of 100 are below")
+    axis.xaxis.set_major_formatter("{x:.0%}")
+    axis.set(xlabel="error of a click (share of the object's length)", ylabel="error of the label (degrees)")
+    axis.set(xticks=noises, ylim=(0, None))
+    axis.legend(fontsize=8)
+    return figure
+
+
+def cloud_overlays(
+    overlays: Sequence[tuple[Real[np.ndarray, "n 3"], Real[np.ndarray, "m 3"]]],
+    titles: Sequence[str],
+    seen: Sequence[tuple[int, int]],
+    columns: int,
+    low: float = -1.9,
+) -> Figure:
+    """Draw pairs of clouds over each other: the first as orange discs, the second as blue crosses.
+
+    Args:
+        overlays: For each panel, two clouds in the axes of the object (front +x, left +y, up +z).
+        titles: Title of each panel.
+        seen: For each panel, the object axes to the right and up: (0, 2) from the right side, (0, 1) from above.
+        columns: Panels per row.
+        low: Lower end of the vertical axis.
+    """
+    rows = -(-len(overlays) // columns)
+    size = 9, rows * (0.5 + 9 / columns * (2.3 - low) / 7.4)
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axis, (own, moved), title, shown in zip(axes.flat, overlays, titles, seen, strict=True):
+        axis.scatter(*own[:, shown].T, s=4, c=ORANGE, marker="o", linewidths=0.5)
+        axis.scatter(*moved[:, shown].T, s=6, c=BLUE, marker="x", linewidths=0.5)
+        axis.set(aspect="equal", xticks=[], yticks=[], xlim=(-3.7, 3.7), ylim=(low, 2.3))
+        axis.set_title(plots.plain_text(title), fontsize=9)
+    return figure
+
+
+def accuracy_of_wrong_labels(label_errors: Sequence[float], shares: Mapping[str, Sequence[float]]) -> Figure:
+    """Draw the accuracy that a benchmark measures over the error of its labels.
+
+    Args:
+        label_errors: Errors of the labels in degrees.
+        shares: For each measure, the accuracy in percent at each error.
+    """
+    figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
+    for (name, share), marker, colour in zip(shares.items(), "so", (ORANGE, BLUE)):
+        axis.plot(label_errors, share, marker=marker, color=colour, label=name)
+    axis.set(xlabel="error of the labels (degrees)", ylabel="accuracy that is measured (%)", ylim=(0, None))
+    axis.legend()
+    return figure
+
+
+def landing_points(
+    picture: UInt8[np.ndarray, "h w 3"],
+    other: UInt8[np.ndarray, "h w 3"],
+    pixels: Real[np.ndarray, "n 2"],
+    cases: Mapping[str, Real[np.ndarray, "n 2"]],
+    columns: int = 3,
+    size: float = 3.0,
+) -> tuple[Figure, dict[str, float]]:
+    """Draw pixels of a picture, and where they land in another picture under several readings of its pose and depth.
+
+    A point keeps its colour, which runs from left to right in the first picture.
+
+    Args:
+        picture: Picture that the points are taken from.
+        other: Picture that they land in.
+        pixels: Pixels (x, y) in the first picture.
+        cases: Pixels in the other picture by the name of the reading.
+        columns: Panels per row.
+        size: Width of a panel in inches.
+
+    Returns:
+        The figure, and for each reading the share of points inside the other picture.
+    """
+    titles = ["where the points are taken", *cases]
+    figure, axes = plots.show_images([picture] + [other] * len(cases), titles, columns=columns, size=size)
+    colours = plt.get_cmap("viridis")((pixels[:, 0] - pixels[:, 0].min()) / max(np.ptp(pixels[:, 0]), 1e-9))
+    height, width = other.shape[:2]
+    inside = {name: ((0 < at) & (at < (width, height))).all(axis=1) for name, at in cases.items()}
+    shown = [np.ones(len(pixels), bool), *inside.values()]
+    for axis, at, here in zip(axes, [pixels, *cases.values()], shown):
+        axis.scatter(*at[here].T, c=colours[here], s=16, edgecolors="black", linewidths=0.4)
+    return figure, {name: float(here.mean()) for name, here in inside.items()}
+
+
+def fused_clouds(
+    clouds: Mapping[str, tuple[Real[np.ndarray, "_ 3"], UInt8[np.ndarray, "_ 3"]]], points: int = 3000
+) -> Figure:
+    """Draw coloured point clouds in 3D, one panel each, with +y of the camera's frame downwards.
+
+    Args:
+        clouds: Points and their colours by the title of the panel.
+        points: Largest number of points of a panel.
+    """
+    figure = plt.figure(figsize=(4.5 * len(clouds), 3.6))
+    for place, (title, (cloud, colours)) in enumerate(clouds.items()):
+        keep = np.random.default_rng(0).permutation(len(cloud))[:points]
+        axis = figure.add_subplot(1, len(clouds), 1 + place, projection="3d")
+        x, y, z = cloud[keep].T
+        axis.scatter(x, z, -y, c=colours[keep] / 255, s=3)
+        axis.set(title=title, xlabel="x", ylabel="z", zlabel="-y", aspect="equal")
+        axis.locator_params(nbins=3)
+    return figure
+
+
+def category_heatmap(
+    cells: Real[np.ndarray, "rows categories"], rows: Sequence[str], categories: Sequence[str], label: str
+) -> Figure:
+    """Draw percentages of rows by category as numbers on a colour map from 0 to 100.
+
+    Args:
+        cells: Percentages.
+        rows: Names of the rows.
+        categories: Names of the categories.
+        label: Label of the colour bar.
+    """
+    size = 1.6 + 0.47 * len(categories), 0.9 + 0.5 * len(rows)
+    figure, axis = plt.subplots(figsize=size, layout="constrained")
+    image = axis.imshow(cells, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    for (i, j), value in np.ndenumerate(cells):
+        colour = "white" if value < 55 else "black"
+        axis.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=9, color=colour)
+    axis.set_xticks(range(len(categories)), categories, rotation=55, ha="right", fontsize=9)
+    axis.set_yticks(range(len(rows)), rows, fontsize=9)
+    figure.colorbar(image, label=label)
+    return figure
+
+
+def interval_against_pairs(numbers: Sequence[int], values: Sequence[float], bounds: Real[np.ndarray, "n 2"]) -> Figure:
+    """Draw Acc30 with its interval over the number of pairs, and the rule of thumb for independent pairs dotted.
+
+    Args:
+        numbers: Numbers of pairs, ascending; the last one is all pairs.
+        values: Acc30 of the first n pairs in percent.
+        bounds: Interval of each.
+    """
+    figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
+    axis.fill_between(numbers, *bounds.T, color=BLUE, alpha=0.25, label="95 % interval, objects resampled")
+    axis.plot(numbers, values, "o-", color=BLUE, label="Acc30 of the first n pairs")
+    for sign, label in ((-1, None), (1, "all pairs ± 100 / √n")):
+        axis.plot(numbers, values[-1] + sign * 100 / np.sqrt(numbers), ":", color="0.3", label=label)
+    axis.set(xscale="log", xlabel="pairs n", ylabel="Acc30 (%)")
+    axis.set_xticks(numbers, numbers)
+    axis.minorticks_off()
+    axis.legend(fontsize=8)
+    return figure
