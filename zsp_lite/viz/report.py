@@ -304,7 +304,6 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
     )
     stages = [
         StageFigure(
-        StageFigure(
             f"One of two: both poses of the {solver} solver",
             "The solver cannot decide between these two poses, which explain the views about equally well. Points: the "
             "reference object under each pose, coloured along its longest axis. Arrows: the axes of the reference "
@@ -319,6 +318,7 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
         if one.one_of_two
     ]
     stages += [
+        StageFigure(
             "Reference and target views",
             f"All views are cropped to the object. {scores}",
             "03_best_view" if paper else "11_hypotheses_and_evidence",
