@@ -342,6 +342,7 @@ def show_from_above(
         axis.title.set_fontsize(10)
     for axis in axes[:, 0]:
         axis.set_ylabel("z, away")
+    figure.get_layout_engine().set(h_pad=0.08)  # otherwise the legend covers the labels
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, markerscale=3)
     return figure
