@@ -8,9 +8,11 @@ squeeze-and-excitation, and with ReLU6 instead of Swish. The weights are a file 
 
 from pathlib import Path
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
 from zsp_lite.errors import InputError, check_integer
@@ -45,7 +47,8 @@ class SameConv(nn.Conv2d):
             return super().forward(x)
         before = (self.kernel_size[0] - self.stride[0]) // 2
         after = self.kernel_size[0] - self.stride[0] - before
-        return F.conv2d(F.pad(x, (before, after, before, after)), self.weight, stride=self.stride, groups=self.groups)
+        x = F.pad(x, (before, after, before, after))
+        return F.conv2d(x, self.weight, self.bias, stride=self.stride, groups=self.groups)
 
 
 def batch_norm(channels: int) -> nn.BatchNorm2d:
@@ -80,8 +83,8 @@ class EfficientNetLite0(nn.Module):
     """EfficientNet-Lite0 (4.7 million parameters).
 
     Args:
-        pretrained: Load the ImageNet weights of the installed package, and set evaluation mode: batch normalisation
-            then uses the statistics of the weights file. Otherwise the weights are random.
+        pretrained: Load the ImageNet weights of the installed package, for inference only: batch normalisation with the
+            statistics of the weights file becomes part of the convolutions. Otherwise the weights are random.
 
     Attributes:
         depth: Number of blocks.
@@ -115,7 +118,7 @@ class EfficientNetLite0(nn.Module):
                 )
             weights, _ = read_checkpoint(path)
             load_weights(self, weights, "effnet-lite0")
-            self.eval()
+            self._fold_batch_norms()
 
     def features(
         self, images: Float[Tensor, "batch 3 height width"], block: int = 10
@@ -148,6 +151,19 @@ class EfficientNetLite0(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 1000"]:
         """Return the logits of ImageNet's classes for images with values in [0, 1]."""
         return self._fc(self.extract(images)[1])
+
+    def _fold_batch_norms(self) -> None:
+        """Make every batch normalisation part of the convolution before it. With channels last, a third less time."""
+        pairs = (("_conv_stem", "_bn0"), ("_conv_head", "_bn1")), (
+            ("_expand_conv", "_bn0"), ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2"),
+        )  # fmt: skip
+        self.eval()
+        for module, layers in [(self, pairs[0]), *((block, pairs[1]) for block in self._blocks)]:
+            for convolution, norm in layers:
+                if hasattr(module, convolution):
+                    setattr(module, convolution, fuse_conv_bn_eval(getattr(module, convolution), getattr(module, norm)))
+                    setattr(module, norm, nn.Identity())
+        self.to(memory_format=torch.channels_last)
 
     def _stem(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 32 rows columns"]:
         n = self.stride
