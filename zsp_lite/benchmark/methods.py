@@ -165,7 +165,7 @@ def _union(*names: str) -> tuple[str, ...]:
 GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
 GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
 # The paper's tables and the rows beyond the paper, on data that are not corrupted.
-GROUPS["all"] = _union("paper", "verified-views", "oracle-view", "ours-adaptive")
+GROUPS["all"] = _union("paper", "verified-views", "oracle-view", "ours-adaptive", "photographs")
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:

@@ -69,6 +69,7 @@ PRESETS = {
     "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
     # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
     "paper": Preset(tuple(EVALUATION), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
+    "paper-small": Preset(tuple(EVALUATION), 5, 24, 256, pairs=25, targets=(1, 3, 5, 10, 20)),
 }
 
 
