@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import matplotlib
+import nbformat
 import numpy as np
 import pytest
 from PIL import ImageFont
@@ -63,6 +64,12 @@ def test_every_notebook_has_its_place_in_the_method(stored):
             if element.get("font-weight") == "bold"
         ]
         assert any(words.startswith(f"{number} ") for words in bold) or number in ("00", "06")
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_opens_with_its_place_in_the_method(path):
+    title, picture = nbformat.read(path, as_version=4).cells[0].source.split("\n\n")[:2]
+    assert title.startswith("# ") and re.fullmatch(rf"!\[[^]]{{20,}}\]\(figures/here_{path.stem[:2]}\.svg\)", picture)
 
 
 def test_no_text_is_small_leaves_its_drawing_or_covers_another(stored):

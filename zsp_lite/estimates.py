@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
@@ -17,7 +17,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.io.html import picture_html
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
-from zsp_lite.views import View
+from zsp_lite.views import View, turn_view
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,8 @@ class PoseEstimate:
         hypotheses: Candidate poses of the solver, best first; empty for the paper's solver.
         one_of_two: Whether the solver cannot decide between the estimate and its first alternative: both are nearly
             equally probable and far apart, such as by a half turn (see `verified.confidence.is_one_of_two`).
+        reference_turn: By how many degrees the reference crop was turned counterclockwise for its features (see
+            `ZeroShotPose.upright`). The pose is that of the image as given.
     """
 
     sim3: Sim3
@@ -95,6 +97,7 @@ class PoseEstimate:
     flags: tuple[str, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
     one_of_two: bool = False
+    reference_turn: int = 0
 
     @property
     def target_camera(self) -> Camera:
@@ -224,6 +227,33 @@ def match_points(
     """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
     (source, _), (destination, _) = reference.patch_points, target.patch_points
     return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
+
+
+@checked
+def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) -> PoseEstimate:
+    """Express an estimate for a turned reference in the camera of the reference as it is.
+
+    With Q the rotation from its camera points to those of the turned camera (see `Camera.turn`), the pose T of the
+    turned reference becomes T Q. Feature maps and matches are turned back.
+
+    Args:
+        estimate: Estimate for the reference view turned by `quarters`.
+        reference: Reference view before the turn, for its frame.
+        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
+    """
+    camera = reference.frame.camera
+    turn = Sim3(1.0, camera.turn(quarters).R @ camera.R.T, np.zeros(3))
+    rows, columns = reference.features.grid
+    patches = np.rot90(np.arange(rows * columns).reshape(rows, columns), quarters)
+    matched = np.stack(np.unravel_index(patches[tuple(estimate.matches.reference.T)], (rows, columns)), axis=-1)
+    return replace(
+        estimate,
+        sim3=estimate.sim3 @ turn,
+        matches=replace(estimate.matches, reference=matched),
+        reference_view=replace(turn_view(estimate.reference_view, -quarters), frame=reference.frame),
+        hypotheses=tuple(replace(one, sim3=one.sim3 @ turn) for one in estimate.hypotheses),
+        reference_turn=90 * (quarters % 4),
+    )
 
 
 @contextmanager

@@ -74,6 +74,7 @@ class OwnPair:
                 "scale": float(estimate.sim3.scale),
                 "inliers": int(estimate.inliers.sum()),
                 "matches": len(estimate.matches),
+                "reference_turn_degrees": estimate.reference_turn,
                 "confidence": estimate.confidence,
                 "error_degrees": self.result.errors.get(solver),
                 "flags": list(estimate.flags),
@@ -141,6 +142,7 @@ def estimate_pose(
     intrinsics: tuple[float, float, float, float] | None = None,
     backbone: str | BackboneConfig | FeatureExtractor = "zsp-tiny-photo",
     out: str | Path | None = None,
+    upright: bool = True,
 ) -> OwnPair:
     """Estimate the pose between two objects of one category, each named by a path.
 
@@ -158,6 +160,7 @@ def estimate_pose(
         intrinsics: Camera intrinsics of both, where they are images.
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `OwnPair.write`); None writes nothing.
+        upright: Whether the reference image is upright; False tries its four turns by 90 degrees (see `ZeroShotPose`).
 
     Raises:
         InputError: An input cannot be read, an option is missing, `out` cannot be written, or the pose cannot be
@@ -168,7 +171,9 @@ def estimate_pose(
     check_integer("targets", targets, 1)
     if out is not None:
         with writing(out):  # before the computation: a folder that cannot be written is an error at once
-            pair = estimate_pose(reference, target, solver, reference_frame, targets, mask, intrinsics, backbone)
+            pair = estimate_pose(
+                reference, target, solver, reference_frame, targets, mask, intrinsics, backbone, upright=upright
+            )
             pair.write(out)
         return pair
     options = {"mask": mask, "intrinsics": intrinsics}
@@ -188,7 +193,7 @@ def estimate_pose(
     frames = [loaded[k] for k in positions]
 
     model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-    method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask")
+    method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
     # The method expects objects of about unit standard deviation. Sequences of data folders have it.
     scales = [
         1.0 if source.kind == "sequence" else _unit_scale(some) for source, some in ((first, [frame]), (second, frames))

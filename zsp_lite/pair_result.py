@@ -85,12 +85,6 @@ def solve_pair(
     if solvers is None:
         name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
         return {name: method.estimate(reference, targets)}
-    found: dict[str, PoseEstimate] = {}
-    for name in solvers:
-        solving = replace(method, solver=name)
-        if not found:
-            found[name] = first = solving.estimate(reference, targets)
-        else:
-            shared = {stage: first.timings[stage] for stage in ("crop", "features")}
-            found[name] = solving.estimate_from_views(first.reference_view, first.target_views, shared)
-    return found
+    timings: dict[str, float] = {}
+    turns, views = method.pair_views(reference, targets, timings)
+    return {name: replace(method, solver=name).estimate_from_turns(turns, views, timings) for name in solvers}

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.arguments import checked
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import Frame, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
-from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
+from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match, similarities
@@ -52,6 +52,11 @@ class ZeroShotPose:
         solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
             or a `Solver`. The settings view_selector, trials, sample_size and adaptive_threshold are for "paper" only.
         seed: Seed of k-means and of the solver.
+        upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
+            degrees, because the features of a turned image are others and phones may store images turned. The estimate
+            with the highest score is kept, and its pose is that of the image as given. The score is that of the first
+            hypothesis, or that of the chosen view where a solver has none. Confidence and alternatives are those within
+            the chosen turn. Keep True where images are upright: fewer wrong poses compete.
 
     Raises:
         InputError: A setting is out of range.
@@ -72,6 +77,7 @@ class ZeroShotPose:
     binning: bool = True
     solver: str | Solver = "paper"
     seed: int = 0
+    upright: bool = True
 
     def __post_init__(self):
         for name, allowed in (
@@ -83,6 +89,7 @@ class ZeroShotPose:
             ("kmeans", (True, False)),
             ("adaptive_threshold", (True, False)),
             ("binning", (True, False)),
+            ("upright", (True, False)),
         ):
             value = getattr(self, name)
             if name in ("matcher", "view_selector", "solver") and callable(value):
@@ -117,12 +124,31 @@ class ZeroShotPose:
                 depth.
         """
         timings: dict[str, float] = {}
+        turns, views = self.pair_views(reference, targets, timings)
+        return self.estimate_from_turns(turns, views, timings)
+
+    @checked
+    def pair_views(
+        self, reference: Frame, targets: Sequence[Frame], timings: dict[str, float] | None = None
+    ) -> tuple[list[View], list[View]]:
+        """Crop frames and extract features and foregrounds, all in one batch.
+
+        Args:
+            reference: Frame of the reference object.
+            targets: Frames of the target object.
+            timings: Gets the seconds of both stages.
+
+        Returns:
+            The view of the reference, or the views of its four turns if it is not `upright`; and the target views.
+        """
+        timings = {} if timings is None else timings
         with timed(timings, "crop"):
             size = crop_size(self.backbone)
-            frames = [object_crop(frame, size) for frame in (reference, *targets)]
+            crop, *crops = [object_crop(frame, size) for frame in (reference, *targets)]
+            turns = [turn_frame(crop, quarters) for quarters in range(1 if self.upright else 4)]
         with timed(timings, "features"):
-            views = extract_views(self.backbone, frames, self.foreground, self.saliency_threshold)
-        return self.estimate_from_views(views[0], views[1:], timings)
+            views = extract_views(self.backbone, [*turns, *crops], self.foreground, self.saliency_threshold)
+        return views[: len(turns)], views[len(turns) :]
 
     @checked
     def views(self, frames: Iterable[Frame]) -> list[View]:
@@ -136,12 +162,55 @@ class ZeroShotPose:
     ) -> PoseEstimate:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
+        If the reference is not `upright`, the features of its other three turns are extracted here.
+
         Args:
             reference: Reference view (see `views`).
             targets: Target views.
             timings: Seconds of earlier stages, to include in the estimate's.
         """
-        timings = dict(timings or {})
+        timings, turns = dict(timings or {}), [reference]
+        if not self.upright:
+            with timed(timings, "turns"):
+                crops = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
+                turns += extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
+        return self.estimate_from_turns(turns, targets, timings)
+
+    @checked
+    def estimate_from_turns(
+        self, turns: Sequence[View], targets: Sequence[View], timings: dict[str, float] | None = None
+    ) -> PoseEstimate:
+        """Run the stages after feature extraction for every turn of the reference, and keep the best estimate.
+
+        Turns that do not determine a pose are left out. Timings are the sums over all turns.
+
+        Args:
+            turns: The reference view, or several turned by 0, 1, ... quarter turns (see `pair_views`).
+            targets: Target views.
+            timings: Seconds of earlier stages, to include in the estimate's.
+
+        Raises:
+            InputError: No turn determines a pose; the error is that of the first.
+        """
+        found, failures, total = [], [], dict(timings or {})
+        for quarters, view in enumerate(turns):
+            try:
+                one = self._estimate_matched(view, targets)
+            except InputError as error:
+                failures.append(error)
+                continue
+            for stage, seconds in one.timings.items():
+                total[stage] = total.get(stage, 0.0) + seconds
+            score = one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
+            found.append((score, quarters, one))
+        if not found:
+            raise failures[0]
+        _, quarters, best = max(found, key=lambda one: one[0])
+        return replace(turn_reference_back(best, turns[0], quarters) if quarters else best, timings=total)
+
+    def _estimate_matched(self, reference: View, targets: Sequence[View]) -> PoseEstimate:
+        """Match a reference view with the targets and run the solver."""
+        timings: dict[str, float] = {}
         with timed(timings, "matching"):
             sims = self.similarities(reference, targets)
             pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
@@ -173,7 +242,7 @@ class ZeroShotPose:
         pairs: Sequence[ViewPair],
         timings: dict[str, float] | None = None,
     ) -> PoseEstimate:
-        """Run the solver on the usable target views (see `estimate`).
+        """Run the solver on the usable target views (see `estimate`), for the reference view as it is.
 
         Args:
             reference: Reference view.

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.arguments import checked
 from zsp_lite.data.depth import patch_points
-from zsp_lite.data.frames import Frame, crop_to_object, resize_frame
+from zsp_lite.data.frames import Frame, crop_to_object, resize_frame, turn_frame
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
@@ -149,6 +149,23 @@ def frame_view(
         return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device), frame.mask)
     soft = soft_saliency(features, frame.camera.size, saliency_threshold)
     return View(frame, features, features.foreground(saliency_threshold), soft)
+
+
+@checked
+def turn_view(view: View, quarters: int) -> View:
+    """Turn a view with its feature maps and masks by quarter turns; features are not computed again.
+
+    Args:
+        view: The view.
+        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
+    """
+    keys, saliency, foreground = (
+        torch.rot90(values, quarters, (0, 1))
+        for values in (view.features.keys, view.features.saliency, view.foreground)
+    )
+    mask = None if view.object_mask is None else np.ascontiguousarray(np.rot90(view.object_mask, quarters))
+    features = FeatureMap(keys, saliency, view.features.global_feature)
+    return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 
 @checked

@@ -38,10 +38,14 @@ class FeedbackPage(HTMLExporter):
             if heading := re.match(r"## (Task .*?) \(\d+ points", cell.source):
                 name = heading[1]
             names[cell.metadata.get("nbgrader", {}).get("grade_id")] = name
-        link = r'(<a href="#(\w+)">)(?:Test cell|Written response)(?=</a>)'
-        return re.sub(
-            link, lambda found: found[1] + escape(names[found[2]]), page
-        ), resources
+
+        def with_name(link):
+            name = escape(names[link["cell"]])
+            return link["start"] + (f"{name}: comment" if link["comment"] else name)
+
+        link = r'(?P<start><a href="#(?P<comment>comment-)?(?P<cell>\w+)">)'
+        text = "(?:Test cell|Written response|Comment)(?=</a>)"
+        return re.sub(link + text, with_name, page), resources
 
 
 c.GenerateFeedback.exporter_class = FeedbackPage

@@ -204,6 +204,8 @@ class Problem:
         targets = list(zip(self.keys[1:], views))
         if target is not None:
             targets = [targets[target]]
+        if not solver.upright:
+            return solver.estimate_from_views(reference, [view for _, view in targets])
         settings = tuple(getattr(solver, name) for name in _MATCH_SETTINGS)
         pairs, seconds = [], 0.0
         for key, view in targets:

@@ -61,13 +61,17 @@ _TWICE = "May be given twice: for REFERENCE, then for TARGET."
     "--depth-unit", type=positive, metavar="M", multiple=True, show_default="0.001",
     help=f"World units per stored depth value of an image, or of a capture given as lists. Once for both. {_TWICE}",
 )  # fmt: skip
+@click.option(
+    "--not-upright", is_flag=True,
+    help="The reference image may be turned, as phones store pictures: try its four turns by 90 degrees.",
+)  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @out_option("outputs/estimate", "Folder for the report and the point clouds.")
 def estimate(
     reference: Path, target: Path, solver: str, reference_frame: int | None, targets: int, mask: tuple[str, ...],
     box: tuple[tuple[int, ...], ...], intrinsics: tuple[tuple[float, ...], ...], depth: tuple[Path, ...],
-    depth_unit: tuple[float, ...], as_json: bool, out: Path, **backbone,
+    depth_unit: tuple[float, ...], not_upright: bool, as_json: bool, out: Path, **backbone,
 ) -> None:  # fmt: skip
     """Estimate the pose between two objects of one category; no label is needed.
 
@@ -94,7 +98,7 @@ def estimate(
     with writing(out):
         sources = open_pair(reference, target, options)
         model = load_backbone(backbone_config(**backbone))
-        found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model)
+        found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model, upright=not not_upright)
         files = found.write(out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
@@ -127,6 +131,8 @@ def _print_tables(found) -> None:
         console.print(f"{solver}: reference-camera points to camera points of view {one.view + 1} ({view})")
         for line in one.sim3.matrix:
             console.print("  " + " ".join(f"{value:10.5f}" for value in line))
+        if one.reference_turn:
+            console.print(f"  features of the reference turned by {one.reference_turn}° counterclockwise")
         for other in one.alternatives:
             console.print(
                 f"  hypothesis {other.rank}: turned by {other.angle:.0f}° from the best, "

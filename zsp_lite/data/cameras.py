@@ -19,6 +19,8 @@ Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 
+# Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: right becomes up.
+_QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
 # Largest entry of |R @ R.T - I|: a matrix above the first is refused, one above the second (rounded to a few
@@ -211,6 +213,25 @@ class Camera:
         return replace(
             self, focal_length=self.focal_length * scale, principal_point=self.principal_point * scale, size=size
         )
+
+    @checked
+    def turn(self, quarters: int) -> "Camera":
+        """Return the camera of the image turned by quarter turns: the camera rotates about its optical axis.
+
+        One quarter turn takes pixel (x, y) of an image of width w to (y, w - x), and the camera point (X, Y, Z) to
+        (Y, -X, Z). Points, depths and pixels keep their relation exactly.
+
+        Args:
+            quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
+        """
+        camera = self
+        for _ in range(quarters % 4):
+            x, y = camera.principal_point
+            camera = Camera(
+                _QUARTER_TURN @ camera.R, _QUARTER_TURN @ camera.t, camera.focal_length[::-1].copy(),
+                np.array([y, camera.size[1] - x]), camera.size[::-1],
+            )  # fmt: skip
+        return camera
 
 
 def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:

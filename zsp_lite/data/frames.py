@@ -144,6 +144,23 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
 
 
 @checked
+def turn_frame(frame: Frame, quarters: int) -> Frame:
+    """Turn a frame and its camera by quarter turns; depths and points in the world stay the same.
+
+    Args:
+        frame: The frame.
+        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`; 0 gives the frame itself.
+    """
+    if quarters % 4 == 0:
+        return frame
+    rgb, depth, mask = (
+        None if image is None else np.ascontiguousarray(np.rot90(image, quarters))
+        for image in (frame.rgb, frame.depth, frame.mask)
+    )
+    return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=frame.camera.turn(quarters))
+
+
+@checked
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio.
 

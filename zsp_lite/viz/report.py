@@ -173,6 +173,7 @@ def _answer(solver: str, estimate: PoseEstimate, result: PairResult) -> dict:
         "matrix": estimate.sim3.matrix,
         "scale": estimate.sim3.scale,
         "view": estimate.view + 1,
+        "turn": estimate.reference_turn,
         "alternatives": estimate.alternatives,
         "flags": estimate.flags,
         "timings": estimate.timings,

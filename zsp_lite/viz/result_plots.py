@@ -101,7 +101,8 @@ def stage_sheet(
         axis.text(-0.06, 0.5, name, transform=axis.transAxes, ha="right", va="center", fontsize=9)
     for axis in rows[:, 1 + chosen]:
         plots.mark(axis, "")
-    bar = figure.colorbar(rows[3, 1].images[-1], ax=rows[3, 0], location="bottom", shrink=0.9, aspect=12, pad=-0.6)
+    bar = figure.colorbar(rows[3, 1].images[-1], ax=rows[3, 0], location="bottom", shrink=0.7, aspect=12, pad=-0.6)
+    bar.set_ticks([-10, -5, 0])
     bar.set_label("− distance (patches)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     return figure

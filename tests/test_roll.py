@@ -1,0 +1,200 @@
+"""A reference turned in the image: `upright=False` finds the turn, and the pose is that of the image as given."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
+
+from zsp_lite.backbones.load import load_backbone
+from zsp_lite.benchmark.methods import Method
+from zsp_lite.benchmark.run import evaluate
+from zsp_lite.cli import main as cli
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import turn_frame
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.samples import sample_data
+from zsp_lite.demo import demo_pairs
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pair_result import label_error, solve_pair
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.views import object_crop, turn_view
+
+TURNS = (1, 2, 3)
+
+
+class UprightBackbone(CoordinateBackbone):
+    """Coordinates of the object in upright images, noise in turned ones. The object's z is blue and points up."""
+
+    images = 0  # that features were computed of
+
+    def features(self, image):
+        UprightBackbone.images += 1
+        found = super().features(image)
+        rows, columns = np.nonzero(image.any(axis=-1))
+        height = image[rows, columns, 2].astype(float) - image[rows, columns, 2].mean()
+        down, right = (height * (rows - rows.mean())).sum(), (height * (columns - columns.mean())).sum()
+        if down < 0 and -down > abs(right):
+            return found
+        noise = torch.from_numpy(np.random.default_rng(5).normal(size=found.keys.shape)).float()
+        return FeatureMap(noise, found.saliency, found.global_feature)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:3]]
+    reference = render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
+    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+
+
+@pytest.mark.parametrize("quarters", range(-1, 5))
+def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(frames, quarters):
+    frame = frames[0]
+    turned_frame = turn_frame(frame, quarters)
+    row, column = np.nonzero(frame.mask > 0.5)
+    points = frame.camera.unproject(np.stack([column, row], -1) + 0.5, frame.depth[row, column])
+    pixels, depth = turned_frame.camera.project(points)
+    there = tuple(np.floor(pixels).astype(int).T[::-1])
+    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-6)
+    np.testing.assert_array_equal(turned_frame.rgb[there], frame.rgb[row, column])
+    np.testing.assert_array_equal(turned_frame.depth[there], frame.depth[row, column])
+    np.testing.assert_allclose(depth, frame.depth[row, column], rtol=1e-6)
+    assert turned_frame.camera.size == turned_frame.rgb.shape[:2]
+    np.testing.assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
+
+
+@pytest.mark.parametrize("solver", ["paper", "verified"])
+@pytest.mark.parametrize("quarters", TURNS)
+def test_the_pose_of_a_turned_reference_is_that_of_the_image_as_given(frames, solver, quarters):
+    rolled = turn_frame(frames[0], quarters)
+    method = ZeroShotPose(UprightBackbone(), solver=solver, upright=False)
+    found = method.estimate(rolled, frames[1:])
+    truth = true_pose(rolled.camera, AT_HOME, found.target_camera, ELSEWHERE)
+    assert found.reference_turn == 90 * (4 - quarters)
+    assert rotation_error(found.sim3.R, truth.R) < 10
+    centre = rolled.camera.to_camera(np.zeros(3))
+    np.testing.assert_allclose(found.sim3.apply(centre), truth.apply(centre), atol=0.2)
+    # The estimate is expressed for the image as given: its crop, its patches, its points.
+    crop = method.views([rolled])[0].frame
+    np.testing.assert_array_equal(found.reference_view.frame.rgb, crop.rgb)
+    assert found.reference_view.frame.camera.size == crop.camera.size
+    np.testing.assert_array_equal(found.reference_view.frame.camera.matrix, crop.camera.matrix)
+    first, second = found.points
+    at_home = rolled.camera.to_world(first)
+    elsewhere = ELSEWHERE.inverse().apply(found.target_camera.to_world(second))
+    assert np.median(np.linalg.norm(at_home - elsewhere, axis=1)) < 0.15
+    assert np.median(np.linalg.norm(found.sim3.apply(first) - second, axis=1)[found.inliers]) < 0.2
+    if solver == "verified":
+        assert (found.hypotheses[0].sim3.matrix == found.sim3.matrix).all()
+    else:  # without the turns, the features are noise
+        upright = replace(method, upright=True).estimate(rolled, frames[1:])
+        assert rotation_error(upright.sim3.R, truth.R) > 20
+
+
+def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames):
+    plain = ZeroShotPose(UprightBackbone()).estimate(frames[0], frames[1:])
+    tried = ZeroShotPose(UprightBackbone(), upright=False).estimate(frames[0], frames[1:])
+    assert (tried.sim3.matrix == plain.sim3.matrix).all() and tried.reference_turn == plain.reference_turn == 0
+    assert (tried.matches.reference == plain.matches.reference).all()
+    assert list(tried.timings) == list(plain.timings)
+
+
+def test_features_of_the_four_turns_are_computed_once_for_both_solvers(frames):
+    UprightBackbone.images = 0
+    rolled = turn_frame(frames[0], 1)
+    method = ZeroShotPose(UprightBackbone(), upright=False)
+    found = solve_pair(method, rolled, frames[1:], ("paper", "verified"))
+    assert UprightBackbone.images == 4 + 3
+    assert [one.reference_turn for one in found.values()] == [270, 270]
+    turns, targets = method.pair_views(rolled, frames[1:])
+    again = method.estimate_from_views(turns[0], targets)
+    assert (again.sim3.matrix == found["paper"].sim3.matrix).all()
+
+
+def test_a_view_turned_back_and_forth_is_the_same(frames):
+    view = ZeroShotPose(CoordinateBackbone()).views(frames[:1])[0]
+    back = turn_view(turn_view(view, 1), -1)
+    assert torch.equal(back.features.keys, view.features.keys) and torch.equal(back.foreground, view.foreground)
+    assert (back.frame.depth == view.frame.depth).all() and (back.object_mask == view.object_mask).all()
+    np.testing.assert_allclose(back.frame.camera.K, view.frame.camera.K, rtol=1e-12)
+
+
+def test_without_a_usable_target_the_error_is_that_of_the_upright_method(frames):
+    blind = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames[1:]]
+    with pytest.raises(InputError, match="all 3 target views were left out"):
+        ZeroShotPose(CoordinateBackbone(), upright=False).estimate(frames[0], blind)
+    with pytest.raises(InputError, match="upright is 'no', expected one of True, False"):
+        ZeroShotPose(CoordinateBackbone(), upright="no")
+
+
+@pytest.fixture(scope="module")
+def sample():
+    """A pair of the sample data that the upright method solves: frames, method, and labels of both sequences."""
+    dataset = Co3D(sample_data())
+    (pair,) = [one for one in demo_pairs(dataset) if one.category == "car"]
+    reference, targets = dataset.load_pair(pair)
+    labels = read_labels(dataset.root, pair.category)
+    method = ZeroShotPose(load_backbone("zsp-tiny"), solver="verified")
+    return reference, targets[:3], method, (labels[pair.reference_sequence], labels[pair.target_sequence])
+
+
+@pytest.fixture(scope="module")
+def upright(sample):
+    """The crop of the reference, which is not cropped or resized again, and its upright estimate."""
+    reference, targets, method, _ = sample
+    crop = replace(object_crop(reference), mask=None)
+    return crop, method.estimate(crop, targets)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quarters", TURNS)
+def test_a_sample_pair_has_the_same_pose_however_its_reference_is_turned(sample, upright, quarters):
+    (_, targets, method, _), (crop, estimate) = sample, upright
+    rolled = turn_frame(crop, quarters)
+    found = replace(method, upright=False).estimate(rolled, targets)
+    assert found.reference_turn == 90 * (4 - quarters)
+    # Both poses map points of the world of the reference to the world of the targets.
+    first, second = (one.world_rotation() @ frame.camera.R for one, frame in ((estimate, crop), (found, rolled)))
+    assert rotation_error(first, second) < 1
+    assert found.sim3.scale == pytest.approx(estimate.sim3.scale, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_pose_of_a_turned_image_with_its_surroundings_is_right(sample):
+    """Cropping and resizing a turned image rounds its colours differently, which changes the pose by some degrees."""
+    reference, targets, method, (first, second) = sample
+    rolled = turn_frame(reference, 1)
+    found = replace(method, upright=False).estimate(rolled, targets)
+    assert found.reference_turn == 270
+    assert label_error(found, first, rolled, second, targets) < 30
+
+
+@pytest.mark.slow
+def test_a_row_of_the_benchmark_may_try_the_turns(ellipsoids, tmp_path):
+    rows = {"plain": Method(), "turns": Method(settings={"upright": False})}
+    backbone = UprightBackbone()
+    UprightBackbone.images = 0
+    summary = evaluate(ellipsoids.root, backbone, {"plain": Method()}, pairs=1, targets=2, out=tmp_path / "a")
+    alone = UprightBackbone.images
+    both = evaluate(ellipsoids.root, backbone, rows, pairs=1, targets=2, out=tmp_path / "b")
+    assert UprightBackbone.images == 2 * alone + 3
+    assert both["methods"]["plain"]["median"] == summary["methods"]["plain"]["median"]
+
+
+@pytest.mark.slow
+def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path, capsys):
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
+    folder = ellipsoids.root / "ellipsoid"
+    words = ["estimate", str(folder / "a"), str(folder / "b"), "--targets", "2", "--json", "--out", str(tmp_path)]
+    turns = []
+    for option in ([], ["--not-upright"]):
+        UprightBackbone.images = 0
+        assert cli.main([*words, *option]) == 0
+        turns.append(UprightBackbone.images)
+        content = json.loads(capsys.readouterr().out)
+        assert content["estimates"]["verified"]["reference_turn_degrees"] in (0, 90, 180, 270)
+    assert turns == [3, 6]
