@@ -143,15 +143,15 @@ CONTINUATION = TrainingConfig(
     ),
 )
 
-# With models from files and photographs as backgrounds; run twice, from the weights of `CONTINUATION` and from its own.
+# From the weights of `CONTINUATION`, with models from files and photographs as backgrounds.
 PHOTO_INFORMED = TrainingConfig(
     objects=2400,
     learning_rate=3e-4,
     average=0.995,
     photo_share=0.65,
     stages=(
-        Stage(700, 128, 3, 8, (0.6, 1.0), helpers=0.6, view=2.0),
-        Stage(300, 192, 2, 8, (0.75, 1.0), helpers=0.6, radius=0.12, view=2.0),
-        Stage(140, 224, 2, 8, (0.85, 1.0), helpers=0.6, radius=0.12, view=2.0),
+        Stage(900, 128, 3, 8, (0.6, 1.0), helpers=0.6, view=2.0),
+        Stage(170, 192, 2, 8, (0.75, 1.0), helpers=0.6, radius=0.12, view=2.0),
+        Stage(80, 224, 2, 8, (0.85, 1.0), helpers=0.6, radius=0.12, view=2.0),
     ),
 )
