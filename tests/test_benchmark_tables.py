@@ -219,7 +219,7 @@ def test_the_tables_of_the_documentation_are_those_of_the_stored_run():
     text = (repository / "docs" / "results.md").read_text()
     assert insert_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
     assert set(GROUPS["all"]) <= summary["methods"].keys() and len(summary["data"]["categories"]) == 20
-    assert {row["n"] for row in summary["methods"].values()} == {2000}
+    assert {row["n"] for row in summary["methods"].values()} == {299}
 
 
 def test_the_papers_figures_were_copied_right():
