@@ -158,9 +158,8 @@ def mix(first: str, second: str, share: float) -> str:
 
 
 def number(value: float) -> str:
-    return (
-        f"{value:.1f}".removesuffix(".0").replace("-0", "0") if abs(value) < 0.05 else f"{value:.1f}".removesuffix(".0")
-    )
+    """Return a number with at most one decimal."""
+    return f"{round(value, 1) + 0.0:.1f}".removesuffix(".0")  # + 0.0: no "-0"
 
 
 def attributes(**values: object) -> str:
@@ -173,15 +172,9 @@ def element(tag: str, content: str | None = None, **values: object) -> str:
 
 
 def rect(
-    x: float,
-    y: float,
-    width: float,
-    height: float,
-    fill: str,
-    stroke: str | None = None,
-    thick: float = 1,
+    x: float, y: float, width: float, height: float, fill: str, stroke: str | None = None, thick: float = 1,
     corner: float = 0,
-) -> str:
+) -> str:  # fmt: skip
     line = {} if stroke is None else {"stroke": stroke, "stroke_width": thick}
     return element("rect", x=x, y=y, width=width, height=height, rx=corner or None, fill=fill, **line)
 
@@ -198,15 +191,9 @@ def dot(place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", 
 
 def ring(place: np.ndarray, stroke: str, radius: float = 6.5, thick: float = 2, dash: str | None = None) -> str:
     return element(
-        "circle",
-        cx=place[0],
-        cy=place[1],
-        r=radius,
-        fill="none",
-        stroke=stroke,
-        stroke_width=thick,
+        "circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick,
         stroke_dasharray=dash,
-    )
+    )  # fmt: skip
 
 
 def curve(path: str, stroke: str = INK, thick: float = 1.6, dash: str | None = None, head: bool = False) -> str:
@@ -334,13 +321,9 @@ def draw_features(words: bool = True) -> str:
     return photo.draw(BLUE) + draw_grid(4, 13, 84, cells) + arrow + found + draw_grid(116, 13, 84, cells)
 
 
-def cycle_photos(size: float = 84) -> tuple[Photo, Photo]:
-    return Photo(REFERENCE, 35, 4, 13, size), Photo(TARGET, 30, 116, 13, size)
-
-
 @cache
 def draw_cycle(words: bool = True) -> str:
-    first, second = cycle_photos()
+    first, second = Photo(REFERENCE, 35, 4, 13, 84), Photo(TARGET, 30, 116, 13, 84)
     u, v = first.place("front left"), second.place("front left")
     drawn = first.draw(BLUE) + second.draw(ORANGE) + draw_walk(u, v, u + [9, 11])
     if words:
@@ -617,10 +600,8 @@ def draw_query_key_value() -> str:
     return svg(
         drawn, width, height, "Query, key and value",
         "Three matrices turn the token of a patch i into its query, its key and its value. The query is compared with "
-        "the "
-        "keys of all patches. The softmax of these products gives weights, and patch i receives the weighted sum of "
-        "the "
-        "values.",
+        "the keys of all patches. The softmax of these products gives weights, and patch i receives the weighted sum "
+        "of the values.",
     )  # fmt: skip
 
 
@@ -657,10 +638,9 @@ def draw_cycles() -> str:
     )  # fmt: skip
     return svg(
         drawn, width, height, "The cycle",
-        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the target, a dashed arrow "
-        "leads back to u', close to u, and the match is kept. Right: the dashed arrow ends far from u, and the match "
-        "is "
-        "dropped.",
+        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the target, a dashed "
+        "arrow leads back to u', close to u, and the match is kept. Right: the dashed arrow ends far from u, and the "
+        "match is dropped.",
     )  # fmt: skip
 
 
@@ -703,20 +683,13 @@ def draw_frames() -> str:
         drawn += "".join(text(line, place, y + 62 + 18 * i, 13, anchor="middle") for i, line in enumerate(lines))
     foot = y + 98
     drawn += curve(f"M{x[0]} {foot}v12q0 10 10 10H{x[4] - 10}q10 0 10 -10V{foot + 4}", INK, 2.2, head=True)
-    drawn += text(
-        "the pose: *T* = *T*^{cam}_{bj} *T*_{0b} *T*_{0a}^{−1} (*T*^{cam}_{ai})^{−1}",
-        width / 2,
-        foot + 48,
-        15,
-        anchor="middle",
-    )
+    formula = "the pose: *T* = *T*^{cam}_{bj} *T*_{0b} *T*_{0a}^{−1} (*T*^{cam}_{ai})^{−1}"
+    drawn += text(formula, width / 2, foot + 48, 15, anchor="middle")
     return svg(
         drawn, width, height, "The chain of frames",
         "Five frames in a row: the camera of the reference image, the world of the reference sequence, the frame of "
-        "the "
-        "category, the world of the target sequence, and the camera of the target view. Arrows between them are the "
-        "known "
-        "cameras and the labels; one arrow from the first to the last is the pose.",
+        "the category, the world of the target sequence, and the camera of the target view. Arrows between them are "
+        "the known cameras and the labels; one arrow from the first to the last is the pose.",
     )  # fmt: skip
 
 
