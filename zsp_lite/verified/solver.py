@@ -182,8 +182,8 @@ def tied_hypotheses(score: Float[Tensor, " m"], rotation: Float[Tensor, "m 3 3"]
     Returns:
         Indices, best score first.
     """
-    modes = non_maximum_suppression(rotation, score, MODE_ANGLE, len(score))
-    return [int(i) for i in modes if score[modes[0]] - score[i] < TIE_MARGIN]
+    distinct = non_maximum_suppression(rotation, score, MODE_ANGLE, len(score))
+    return [int(i) for i in distinct if score[distinct[0]] - score[i] < TIE_MARGIN]
 
 
 def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses, one_of_two: bool = False) -> tuple[str, ...]:
