@@ -56,6 +56,24 @@ def test_stride_two_samples_the_windows_of_tensorflow():
     assert found.flatten().tolist() == [45.0, 39.0, 66.0, 50.0]
 
 
+def test_folded_batch_norms_give_the_same_maps():
+    network = EfficientNetLite0(pretrained=False).eval()
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, std=0.1)
+    images = torch.rand(1, 3, 64, 96)
+    with torch.inference_mode():
+        expected = network.extract(images)
+        network._fold_batch_norms()
+        found = network.extract(images)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4 * float(other.abs().max()), rtol=1e-3)
+
+
 def test_gradients_reach_images_and_weights():
     network = EfficientNetLite0()
     images = torch.rand(1, 3, 32, 32, requires_grad=True)

@@ -144,6 +144,14 @@ def test_training_moves_the_photo_input_and_leaves_the_photo_network(renders):
     assert {"held_out_iou", "photo_held_out_iou", "photo_held_out_view_accuracy"} <= evaluated.keys()
 
 
+def test_another_batch_seed_gives_other_batches_of_the_same_objects(renders):
+    figures = [
+        BackboneTraining(replace(SMALL, photo_share=0.0, batch_seed=seed), renders, renders).step()
+        for seed in (0, 0, 1)
+    ]
+    assert figures[0] == figures[1] != figures[2]
+
+
 def test_crops_for_the_photo_network_show_the_same_in_more_detail(renders):
     """The transformer's crop is the mean of 2 x 2 pixels of the larger one."""
     one, two = (

@@ -153,15 +153,16 @@ class EfficientNetLite0(nn.Module):
         return self._fc(self.extract(images)[1])
 
     def _fold_batch_norms(self) -> None:
-        """Make every batch normalisation part of the convolution before it. With channels last, a third less time."""
-        pairs = (("_conv_stem", "_bn0"), ("_conv_head", "_bn1")), (
-            ("_expand_conv", "_bn0"), ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2"),
-        )  # fmt: skip
+        """Make every batch normalisation part of the convolution before it; store the weights with channels last."""
+        norms = {
+            "_conv_stem": "_bn0", "_conv_head": "_bn1",
+            "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2",
+        }  # fmt: skip
         self.eval()
-        for module, layers in [(self, pairs[0]), *((block, pairs[1]) for block in self._blocks)]:
-            for convolution, norm in layers:
-                if hasattr(module, convolution):
-                    setattr(module, convolution, fuse_conv_bn_eval(getattr(module, convolution), getattr(module, norm)))
+        for module in (self, *self._blocks):
+            for name, norm in norms.items():
+                if hasattr(module, name):
+                    setattr(module, name, fuse_conv_bn_eval(getattr(module, name), getattr(module, norm)))
                     setattr(module, norm, nn.Identity())
         self.to(memory_format=torch.channels_last)
 

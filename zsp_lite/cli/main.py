@@ -299,7 +299,9 @@ def verify(name: str) -> None:
         "train --out outputs/first",
         "train --out outputs/second --start-from outputs/first/checkpoint.pt",
         "train --out outputs/further --start-from zsp-tiny --seed 1 --objects 2400",
-        "train --out outputs/photo --start-from zsp-tiny-photo --photo --batch-seed 2 "
+        "train --out outputs/photo --start-from zsp-tiny --photo --models outputs/training_models "
+        "--backgrounds outputs/backgrounds.npz",
+        "train --out outputs/longer --start-from outputs/photo/checkpoint.pt --photo --batch-seed 1 "
         "--models outputs/training_models --backgrounds outputs/backgrounds.npz",
         "train --out outputs/try --shorten 0.02 --objects 60",
         "train --self-distillation --out outputs/dino --renders outputs/first/renders",
