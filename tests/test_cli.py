@@ -101,7 +101,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--preset", "samples", "--frames", "3", "--out", "x"], "--category"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["train", "--start-from", "lost.pt", "--out", "x"], "or the name of an embedded transformer"),
+        (["train", "--start-from", "lost.pt", "--out", "x"], "or the name of embedded weights"),
         (["train", "--start-from", ".", "--out", "x"], ".: is a folder, expected a checkpoint of `train`"),
         (["train", "--shorten", "1e308", "--out", "x"], "1e+308"),
         (["train", "--self-distillation", "--start-from", "a", "--out", "x"], "--start-from"),
