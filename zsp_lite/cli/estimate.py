@@ -113,11 +113,11 @@ def _print_tables(found) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from zsp_lite.viz.report import COLUMNS, table_rows
+    from zsp_lite.viz.report import COLUMNS, legend, table_rows
 
     console, result = Console(markup=False, highlight=False), found.result
     labelled = bool(result.errors)
-    kept = [k for k, name in enumerate(COLUMNS) if k > 0 and (labelled or name != "rotation error")]
+    kept = [k for k, name in enumerate(COLUMNS) if k > 0 and (labelled or name != "error")]
     table = Table(title=f"Pose from {result.title}, backbone {found.backbone}")
     for column in [*(COLUMNS[k] for k in kept), "scale"]:
         table.add_column(column, justify="left" if column == "solver" else "right")
@@ -126,6 +126,7 @@ def _print_tables(found) -> None:
     console.print(f"Reference: {result.reference} (mask: {found.masks[0]})", soft_wrap=True)
     console.print(f"Target: {result.target} (masks: {found.masks[1]})", soft_wrap=True)
     console.print(table)
+    console.print(legend([COLUMNS[k] for k in kept]))
     for solver, one in found.estimates.items():
         view = found.targets[one.view].name
         console.print(f"{solver}: reference-camera points to camera points of view {one.view + 1} ({view})")

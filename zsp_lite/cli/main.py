@@ -120,7 +120,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     from zsp_lite.synthetic.export import SETTINGS_FILE
     from zsp_lite.synthetic.model_export import RENDERED_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
-    from zsp_lite.viz.report import COLUMNS, table_rows, write_overview, write_report
+    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
 
     console = Console(markup=False)  # names may hold brackets
     folder = data or sample_data()
@@ -152,6 +152,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
         for row in table_rows(result):
             table.add_row(*row)
     console.print(table)
+    console.print(legend(), highlight=False)
     console.print(f"Data: {note}", highlight=False)
     console.print(f"Report with pictures of every stage: {path}", soft_wrap=True)
 

@@ -37,7 +37,13 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
 
-COLUMNS = ("category", "solver", "chosen view", "inliers", "rotation error", "confidence", "time")
+COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
+_MEANINGS = {
+    "view": "the target view that the pose leads to",
+    "inliers": "matches of that view that agree with the pose, which the verified solver does not need",
+    "error": "angle to the labelled rotation",
+    "confidence": "probability of an error below 30°",
+}
 _DPI = 110
 _OVERVIEW_FRAMES = 4
 _OVERVIEW_POINTS = 1500
@@ -252,6 +258,11 @@ def table_rows(result: PairResult) -> list[tuple[str, ...]]:
     return rows
 
 
+def legend(columns: Sequence[str] = COLUMNS) -> str:
+    """Explain the columns of a table of estimates in one line of text."""
+    return "; ".join(f"{name}: {_MEANINGS[name]}" for name in columns if name in _MEANINGS) + "."
+
+
 def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     """Write a JPEG with one row per result: reference, chosen target view, and the pose in the target sequence.
 
@@ -345,7 +356,12 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
         StageFigure(
             "Correspondences",
             f"{len(estimate.matches)} matches: {inliers} inliers of the pose (solid), "
-            f"{len(estimate.matches) - inliers} outliers (dashed).",
+            f"{len(estimate.matches) - inliers} outliers (dashed)."
+            + (
+                ""
+                if paper
+                else " The verified solver starts from matches of all views; few need to agree with its pose."
+            ),
             "04_umeyama_ransac",
             _data_uri(_matches_figure(result)),
             f"Lines between matched patches of the reference and {chosen}; inliers solid, outliers dashed.",
