@@ -10,6 +10,7 @@ from zsp_lite.viz.plots import CHOSEN
 
 IMAGE = np.zeros((40, 40, 3), np.uint8)
 RNG = np.random.default_rng(0)
+MOVED = np.arange(3), np.arange(3) * 4  # displacements, and the rotation errors they cause
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +36,10 @@ def test_the_ring_frames_the_view_of_highest_score_and_has_the_reference_below()
     # View 2 stands on the reference's side, which is below; view 1 is the next one in clockwise order seen from above.
     np.testing.assert_allclose(bars[1][-1], [0, -1], atol=1e-9)
     np.testing.assert_allclose(bars[4][-1], [0, 1], atol=1e-9)
+    (left, right), (low, high) = figure.axes[0].get_xlim(), figure.axes[0].get_ylim()
+    for x, y, wide, tall in (axis.get_position().bounds for axis in figure.axes[0].child_axes):
+        assert x >= 0 and y >= 0 and x + wide <= 1 and y + tall <= 1
+    assert right - left == pytest.approx((high - low) * np.divide(*figure.get_size_inches()))
 
 
 def test_each_score_rings_its_own_best_view():
@@ -89,6 +94,35 @@ def test_points_off_the_object_are_counted_and_crossed():
     np.testing.assert_allclose(figure.axes[0].collections[1].get_offsets(), points[off][:, [0, 2]])
 
 
+@pytest.mark.parametrize("shift", [0.0, 25.0])
+def test_the_limits_lie_around_the_points_on_the_object_wherever_they_are(shift):
+    points, off = RNG.normal(size=(5, 3)) + shift, np.array([False, False, False, False, True])
+    far = points + [0, 0, 1000] * off[:, None]
+    figure = alignment_plots.points_from_above({"a": far, "b": points}, {"a": off, "b": off}, 0.2)
+    for axis in figure.axes:
+        (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+        assert ((left < points[~off, 0]) & (points[~off, 0] < right)).all() and high - low < 20
+        assert ((low < points[~off, 2]) & (points[~off, 2] < high)).all()
+    assert panel_sizes(figure).min() >= 300
+
+
+@pytest.mark.parametrize("move", [1.0, 12.0])
+def test_a_far_outlier_is_inside_its_panel(move):
+    target = RNG.normal(size=(4, 3))
+    target[-1, 0] += move
+    figure = alignment_plots.fits_with_one_outlier({"a": target, "b": target}, {"a": target, "b": target}, *MOVED)
+    for axis in figure.axes[:1] + figure.axes[2:]:
+        (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+        assert ((left < target[:, 0]) & (target[:, 0] < right)).all()
+        assert ((high < target[:, 1]) & (target[:, 1] < low)).all()
+
+
+def panel_sizes(figure):
+    """Width and height of each panel in pixels."""
+    figure.draw_without_rendering()
+    return np.array([axis.get_window_extent().size for axis in figure.axes])
+
+
 def test_filled_depths_of_each_part_are_counted_beyond_the_axis_too():
     figure = alignment_plots.filled_depth_errors({"in": np.array([0.0, 0.1]), "out": np.array([0.5])}, 0.2)
     assert [sum(bar.get_height() for bar in axis.patches) for axis in figure.axes] == [2, 1]
@@ -108,7 +142,7 @@ def test_residuals_join_fitted_points_to_their_targets():
 
 def test_one_outlier_is_joined_to_the_point_that_was_fitted_to_it():
     target, fitted = RNG.normal(size=(4, 3)), RNG.normal(size=(4, 3))
-    figure = alignment_plots.fits_with_one_outlier({"moved": fitted}, {"moved": target}, np.arange(3), np.arange(3) * 4)
+    figure = alignment_plots.fits_with_one_outlier({"moved": fitted}, {"moved": target}, *MOVED)
     assert len(figure.axes[0].collections[0].get_segments()) == 4
     assert figure.axes[1].lines[0].get_ydata().tolist() == [0, 4, 8]
 
@@ -149,7 +183,7 @@ def test_the_chain_of_poses_draws_points_in_five_frames():
     camera = Camera(np.eye(3), np.zeros(3), np.array([40.0, 40.0]), np.array([20.0, 20.0]), (40, 40))
     points = RNG.normal(size=(6, 3)) + [0, 0, 10]
     worlds = {name: (points + shift, points) for shift, name in enumerate(("world of a", "cloud", "world of b"))}
-    figure = alignment_plots.pose_chain((IMAGE, IMAGE), (camera, camera), (points, points), worlds, np.ones((6, 3)))
+    figure = alignment_plots.pose_chain((IMAGE, IMAGE), (camera, camera), (points, points), worlds)
     titles = [axis.get_title() for axis in figure.axes]
     assert titles == ["1  camera of a", "2  world of a", "3  cloud", "4  world of b", "5  camera of b", ""]
     moved = figure.axes[3].collections[1].get_offsets()
@@ -167,6 +201,12 @@ def test_measured_accuracies_are_drawn_per_method():
     values, density = np.array([40.0, 50.0]), np.array([0.1, 0.2])
     figure = alignment_plots.measured_accuracies({"100 pairs": [(values, density), (values, 2 * density)]}, ["a", "b"])
     assert [line.get_ydata().tolist() for line in figure.axes[0].lines] == [[0.1, 0.2], [0.2, 0.4]]
+
+
+def test_measured_accuracies_are_shown_where_they_are_likely():
+    values, density = np.array([70.0, 80, 90, 100]), np.array([1e-6, 0.1, 0.3, 0.1])
+    figure = alignment_plots.measured_accuracies({"a": [(values, density)], "b": [(values, density)]}, ["one"])
+    assert [axis.get_xlim() for axis in figure.axes] == [(80, 100), (80, 100)]
 
 
 def test_each_accuracy_lies_on_its_own_interval():

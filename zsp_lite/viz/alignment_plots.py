@@ -13,11 +13,22 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.viz.plots import BLUE, CHOSEN, GREEN, ORANGE, VERMILLION, draw_points, overlay_map, show_images
+from zsp_lite.viz.plots import (
+    BLUE,
+    CHOSEN,
+    GREEN,
+    ORANGE,
+    VERMILLION,
+    coordinate_colours,
+    draw_points,
+    overlay_map,
+    show_images,
+)
 
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
 _LINES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "D")
+_RING, _PICTURE = 1.22, 0.26  # of `view_ring`: distance of the pictures' centres, and half their width
 
 
 def view_ring(
@@ -40,15 +51,18 @@ def view_ring(
     """
     side = places[1][0]
     turned = places[0] @ np.stack([side[[1, 0]] * [-1, 1], -side], axis=1)
-    figure = plt.figure(figsize=(6.6, 6.4))
-    axis = figure.add_axes([0, 0, 1, 1], xlim=(-1.62, 1.62), ylim=(-1.56, 1.62))
+    middles = np.vstack([_RING * turned, [0, 0]])
+    low, high = middles.min(axis=0) - _PICTURE - 0.1, middles.max(axis=0) + _PICTURE + [0.1, 0.22]  # titles above
+    figure = plt.figure(figsize=(6.6, 6.6 * (high - low)[1] / (high - low)[0]))
+    axis = figure.add_axes([0, 0, 1, 1], xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axis.set_axis_off()
     colours = plt.get_cmap("cividis")((scores - scores.min()) / max(np.ptp(scores), 1e-9))
     axis.text(0, 0.05, "object", ha="center", va="center", color="0.3")
     best = int(np.argmax(scores))
     for i, (place, image) in enumerate(zip(turned, targets)):
         axis.plot(*np.transpose([0.2 * place, place]), color=colours[i], linewidth=5, zorder=0)
-        picture = axis.inset_axes([*(1.22 * place - 0.26), 0.52, 0.52], transform=axis.transData)
+        corner = _RING * place - _PICTURE
+        picture = axis.inset_axes([*corner, 2 * _PICTURE, 2 * _PICTURE], transform=axis.transData)
         title = f"{i + 1}: {scores[i]:.1f}, {angles[i]:.0f}°" + (" chosen" if i == best else "")
         picture.set_title(title, fontsize=10, weight="bold" if i == best else "normal", pad=5)
         _framed(picture, image, CHOSEN if i == best else colours[i], 6 if i == best else 4)
@@ -194,11 +208,13 @@ def filled_depth_errors(errors: Mapping[str, Real[np.ndarray, " n"]], tolerance:
         errors: Name of the part to absolute errors in scene units.
         tolerance: Error to mark by a line.
     """
-    figure, axes = plt.subplots(1, len(errors), figsize=(9, 3.2), layout="constrained", sharex=True, squeeze=False)
+    figure, axes = plt.subplots(1, len(errors), figsize=(9, 3.4), layout="constrained", sharex=True, squeeze=False)
+    bins = np.geomspace(1e-3, max(1, *(np.max(values, initial=0) for values in errors.values())), 40)
     for axis, (name, values), colour in zip(axes.flat, errors.items(), _COLOURS):
-        axis.hist(np.clip(values, 1e-3, None), np.geomspace(1e-3, 10, 40), color=colour, edgecolor="white")
+        axis.hist(np.clip(values, 1e-3, None), bins, color=colour, edgecolor="white")
         axis.axvline(tolerance, color=VERMILLION, linestyle="--", label=f"{tolerance:g} scene units")
-        axis.set(xscale="log", title=name, xlabel="error of a filled depth (scene units)", ylabel="pixels")
+        axis.set(xscale="log", title=name, ylabel="pixels")
+        axis.set_xlabel("error (scene units; first bar: 0.001 and less)")
     axes[0, 0].legend(fontsize=9)
     return figure
 
@@ -208,22 +224,24 @@ def points_from_above(
 ) -> Figure:
     """Show camera-frame points from above, a panel for each way to compute them; points off the object are crosses.
 
+    The panels share their limits, which lie around the points on the object: crosses far off are cut.
+
     Args:
-        panels: Title to points. The limits are set around the median of the last panel's points.
+        panels: Title to points.
         beside: Title to the points that are off the object's surface.
         tolerance: Largest distance of a point on the object, in scene units; for the legend.
     """
-    figure, axes = plt.subplots(1, len(panels), figsize=(9, 4.2), layout="constrained", sharex=True, sharey=True)
+    low, high = _around(np.concatenate([points[~beside[title]] for title, points in panels.items()])[:, [0, 2]])
+    figure, axes = _equal_panels(len(panels), low, high, extra=1.5)
     for axis, (title, points) in zip(axes, panels.items()):
         off = beside[title]
         axis.scatter(*points[~off][:, [0, 2]].T, s=10, color=BLUE, label="on the object")
         crosses = {"s": 24, "marker": "x", "color": VERMILLION}
         axis.scatter(*points[off][:, [0, 2]].T, label=f"off it by more than {tolerance:g}", **crosses)
         axis.set_title(f"{title}\n{off.sum()} of {len(off)} points are off the object")
-        axis.set(xlabel="x, to the right (scene units)", ylabel="z, away (scene units)", aspect="equal")
-    middle = np.median(points, axis=0)
-    axes[0].set(xlim=middle[0] + np.array([-4, 4]), ylim=middle[2] + np.array([-2, 4]))
-    axes[0].legend(fontsize=9, loc="upper left")
+        axis.set(xlabel="x, to the right (scene units)")
+    axes[0].set_ylabel("z, away (scene units)")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
@@ -241,18 +259,22 @@ def fits_with_one_outlier(
         moves: Displacements in scene units.
         turned: Rotation error for each displacement, in degrees.
     """
-    figure, axes = plt.subplots(1, len(fitted) + 1, figsize=(10.5, 3.4), layout="constrained")
-    for axis, (title, points) in zip(axes, fitted.items()):
+    low, high = _around(np.concatenate([*fitted.values(), *targets.values()])[:, :2], margin=0.1)
+    names, ratio = [f"fit {number}" for number in range(len(fitted))], (high - low)[1] / (high - low)[0]
+    figure = plt.figure(figsize=(10, len(fitted) * (5.2 * ratio + 0.7)), layout="constrained")
+    axes = figure.subplot_mosaic([[name, "error"] for name in names], width_ratios=(1.5, 1))
+    for axis, (title, points) in zip((axes[name] for name in names), fitted.items()):
         target = targets[title]
         axis.add_collection(LineCollection(np.stack([points, target], axis=1)[:, :, :2], colors="0.5", linewidths=0.8))
         axis.scatter(*target[:, :2].T, s=70, facecolors="none", edgecolors=ORANGE, linewidths=1.8, label="target")
         axis.scatter(*points[:, :2].T, s=25, marker="x", color=BLUE, label="source, fitted")
-        axis.set(title=title, aspect="equal", xlabel="x (scene units)", ylabel="y, down (scene units)")
-        axis.set(xlim=(-3, 8), ylim=(4, -4))
-    axes[0].legend(fontsize=9, loc="upper right")
-    axes[-1].plot(moves, turned, color=BLUE)
-    axes[-1].set(title="effect on the rotation", ylabel="rotation error (degrees)")
-    axes[-1].set_xlabel("last point moved by (scene units)")
+        axis.set(title=title, ylabel="y, down (scene units)", xlim=(low[0], high[0]), ylim=(high[1], low[1]))
+        axis.set_aspect("equal")
+    axis.set_xlabel("x (scene units)")
+    axes[names[0]].legend(fontsize=9, loc="upper right")
+    axes["error"].plot(moves, turned, color=BLUE)
+    axes["error"].set(title="effect on the rotation", ylabel="rotation error (degrees)")
+    axes["error"].set_xlabel("last point moved by (scene units)")
     return figure
 
 
@@ -291,7 +313,7 @@ def matched_points_after_fits(
     """Show matched points in the target camera's frame after several fits, a panel each, seen from the camera.
 
     A line joins each moved reference point (cross) to its target point (circle): the residual. Residuals above the
-    threshold are thin and grey.
+    threshold are thin and grey. The limits lie around the object: points far off are cut.
 
     Args:
         fitted: Title to the matched reference points after the fit.
@@ -299,21 +321,22 @@ def matched_points_after_fits(
         inliers: Title to the matches whose residual is below the threshold.
         surface: Points of the target object, the background.
     """
-    x, y, _ = np.median(surface, axis=0)
-    figure, axes = plt.subplots(1, len(fitted), figsize=(9.4, 4.9), layout="constrained", sharex=True, sharey=True)
+    low, high = _around(surface[:, :2])
+    figure, axes = _equal_panels(len(fitted), low, high, extra=1.9)
     for axis, (title, points) in zip(axes, fitted.items()):
         good = inliers[title]
         axis.scatter(*surface[:, :2].T, s=2, color="0.85", label="target object")
         for where, colour, width, label in (
-            (~good, "0.55", 0.7, "residual above the threshold"), (good, BLUE, 2, "below it"),
+            (~good, "0.55", 0.7, "residual above the threshold"), (good, BLUE, 2, "residual below it"),
         ):  # fmt: skip
             lines = np.stack([points[where], target[where]], axis=1)[:, :, :2]
             axis.add_collection(LineCollection(lines, colors=colour, linewidths=width, label=label))
         axis.scatter(*target[:, :2].T, s=36, facecolors="none", edgecolors=ORANGE, linewidths=1.6, label="target point")
         axis.scatter(*points[:, :2].T, s=22, marker="x", color=BLUE, label="reference point, moved")
-        axis.set(title=f"{title}\n{good.sum()} of {len(good)} residuals below the threshold", aspect="equal")
-        axis.set(xlabel="x, to the right (scene units)", ylabel="y, down (scene units)")
-    axes[0].set(xlim=(x - 2.8, x + 2.8), ylim=(y + 2.8, y - 2.8))
+        axis.set_title(f"{title}\n{good.sum()} of {len(good)} residuals below the threshold")
+        axis.set_xlabel("x, to the right (scene units)")
+    axes[0].set_ylabel("y, down (scene units)")
+    axes[0].invert_yaxis()
     figure.legend(
         *axes[0].get_legend_handles_labels(), fontsize=9, ncols=3, loc="outside lower center", markerscale=1.5
     )
@@ -330,18 +353,21 @@ def ransac_sweeps(
             degrees) of the draws, and the inliers for shuffled matches.
         matches: Number of matches.
     """
-    figure, axes = plt.subplots(2, len(sweeps), figsize=(10.4, 6.6), layout="constrained", sharex="col", sharey="row",
+    figure, axes = plt.subplots(2, len(sweeps), figsize=(10.4, 7.2), layout="constrained", sharex="col", sharey="row",
                                 squeeze=False)  # fmt: skip
+    largest = max(max(errors) for _, results in sweeps.values() for _, errors, _ in results.values())
     for (above, below), (title, (setting, results)) in zip(axes.T, sweeps.items()):
+        step = (max(results) / min(results)) ** 0.012 if len(results) > 1 else 1.02  # of dots beside each other
         for value, (counts, errors, chance) in results.items():
-            above.plot([value] * len(counts), counts, "o", color=BLUE, label="matches, one dot per draw")
+            at = value * step ** (np.arange(len(counts)) - (len(counts) - 1) / 2)
+            above.plot(at, counts, "o", color=BLUE, markersize=5, label="matches, one dot per draw")
             above.plot(value, chance, "s", color="0.6", label="shuffled matches")
-            below.plot([value] * len(errors), errors, "o", color=VERMILLION)
-        above.set(title=title, ylim=(0, matches + 2))
-        below.set(xlabel=setting, xscale="log", ylim=(-5, 185))
+            below.plot(at, errors, "o", color=VERMILLION, markersize=5)
+        above.set(title=title, ylim=(-1, matches + 2))
+        below.set(xlabel=setting, xscale="log", ylim=(-0.04 * largest, 1.06 * largest))
+        below.margins(x=0.08)
         below.set_xticks([*results], [f"{value:g}" for value in results])
         below.minorticks_off()
-    axes[1, 0].set_yticks(range(0, 181, 45))
     axes[0, 0].set_ylabel(f"inliers (of {matches})")
     axes[1, 0].set_ylabel("rotation error (degrees)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -379,14 +405,16 @@ def angle_errors_of_formulas(
         errors: Name of the formula and precision to its errors near 0 and near 180 degrees, for each distance; names
             with "arccos" have one colour, and names with "single" have dashed lines.
     """
-    figure, panels = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharey=True)
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4.8), layout="constrained", sharey=True)
     for end, (panel, middle) in enumerate(zip(panels, (0, 180))):
         for name, values in errors.items():
             colour, line = VERMILLION if "arccos" in name else BLUE, "--" if "single" in name else "-"
             panel.plot(offsets, values[end], line, color=colour, label=name)
         panel.plot(offsets, offsets, ":", color="0.6", label="as large as the distance itself")
         panel.set(xscale="log", yscale="log", ylim=(1e-17, 1), title=f"near {middle}°")
-        panel.set(xlabel=f"distance from {middle}° (degrees)", ylabel="largest error (degrees)")
+        panel.set(xlabel=f"distance from {middle}° (degrees)")
+        panel.minorticks_off()
+    panels[0].set_ylabel("largest error (degrees)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     return figure
 
@@ -396,29 +424,32 @@ def pose_chain(
     cameras: tuple[Camera, Camera],
     in_cameras: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     in_worlds: Mapping[str, tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]],
-    colours: Float[np.ndarray, "n 3"],
 ) -> Figure:
     """Show points on their way from one camera to the other: over two images, and in the worlds between them.
+
+    A point keeps its colour, its position along the first object.
 
     Args:
         images: Images of the first and the last camera.
         cameras: The first and the last camera.
         in_cameras: The points in the frames of both cameras.
         in_worlds: Name of a world to the points in it and the cloud of the object whose world it is.
-        colours: Colour of each point.
     """
-    figure, axes = plt.subplots(2, 3, figsize=(10.2, 7), layout="constrained")
-    panels = list(axes.flat)
-    panels.pop(5).set_axis_off()
+    figure, axes = plt.subplots(2, 3, figsize=(10.2, 6.6), layout="constrained")
+    panels, colours = list(axes.flat), coordinate_colours(in_cameras[0])
+    panels[5].set_axis_off()
     for number, panel, image, camera, points in zip((1, 5), (panels[0], panels[4]), images, cameras, in_cameras):
         panel.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
         draw_points(panel, camera, points, colours, size=2)
         panel.set(title=f"{number}  camera of {'a' if number == 1 else 'b'}", xticks=[], yticks=[])
+        panel.set_anchor("S")
     for number, panel, (name, (points, cloud)) in zip((2, 3, 4), panels[1:4], in_worlds.items()):
-        panel.scatter(*cloud[:, :2].T, s=2, color="0.8")
-        panel.scatter(*points[:, :2].T, s=3, c=colours)
-        panel.set(title=f"{number}  {name}", xlabel="x (scene units)", ylabel="y (scene units)", aspect="equal")
+        panel.scatter(*cloud[:, :2].T, s=2, color="0.7", label="object of this world")
+        panel.scatter(*points[:, :2].T, s=3, c=colours, label="points measured by camera a")
+        panel.set(title=f"{number}  {name}", xlabel="x (scene units)", ylabel="y (scene units)")
         panel.invert_yaxis()
+        panel.set_aspect("equal", adjustable="datalim")
+    panels[5].legend(*panels[1].get_legend_handles_labels(), loc="center", markerscale=4)
     return figure
 
 
@@ -434,8 +465,9 @@ def share_of_benchmarks(gains: Real[np.ndarray, " n"], curves: Mapping[str, Real
     for row, (panel, title) in enumerate(zip(panels, titles)):
         for (name, shares), colour, line, marker in zip(curves.items(), _COLOURS, _LINES, _MARKERS):
             panel.plot(gains, shares[row], line, marker=marker, color=colour, label=name)
-        panel.set(title=title, xlabel="true gain (points of Acc30)", ylabel="share of benchmarks (%)")
-    panels[0].legend(fontsize=9)
+        panel.set(title=title, xlabel="true gain (points of Acc30)", xticks=gains[::2])
+    panels[0].set_ylabel("share of benchmarks (%)")
+    panels[1].legend(fontsize=9, loc="lower right")
     return figure
 
 
@@ -448,11 +480,14 @@ def measured_accuracies(
         distributions: Title to the accuracies (percent) and densities of each method.
         labels: Name of each method.
     """
-    figure, axes = plt.subplots(1, len(distributions), figsize=(10.5, 3.5), layout="constrained")
+    figure, axes = plt.subplots(1, len(distributions), figsize=(10.2, 4), layout="constrained", sharex=True)
+    likely = [values[density > 0.01 * density.max()] for one in distributions.values() for values, density in one]
     for axis, (title, methods) in zip(np.atleast_1d(axes), distributions.items()):
         for (values, density), label, colour, line in zip(methods, labels, _COLOURS, _LINES):
             axis.plot(values, density, line, color=colour, label=label)
-        axis.set(xlim=(30, 66), title=title, xlabel="measured Acc30 (%)", ylabel="probability density (1/%)")
+        axis.set(xlim=(np.concatenate(likely).min(), np.concatenate(likely).max()), title=title)
+        axis.set_xlabel("measured Acc30 (%)")
+    np.atleast_1d(axes)[0].set_ylabel("probability density (1/%)")
     figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=len(labels), fontsize=9)
     return figure
 
@@ -546,8 +581,8 @@ def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]], limit: float = 3
         limit: Error to mark by lines, in degrees.
     """
     (first, x), (second, y) = errors.items()
-    figure, axis = plt.subplots(figsize=(4.8, 4.6), layout="constrained")
-    axis.scatter(x, y, s=32, color=BLUE, alpha=0.7)
+    figure, axis = plt.subplots(figsize=(5.6, 5.4), layout="constrained")
+    axis.scatter(x, y, s=36, color=BLUE, alpha=0.6, edgecolors="black", linewidths=0.5)
     axis.plot([0, 180], [0, 180], color="0.8", zorder=0)
     for draw in (axis.axvline, axis.axhline):
         draw(limit, color="0.5", linestyle="--", linewidth=1)
@@ -555,6 +590,27 @@ def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]], limit: float = 3
     axis.set(xlabel=f"error, {first} (degrees)", ylabel=f"error, {second} (degrees)", xticks=ticks, yticks=ticks)
     axis.set_aspect("equal")
     return figure
+
+
+def _around(points: Real[np.ndarray, "n 2"], margin: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits around points, with a margin on all sides as a share of the larger extent."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return low - margin * np.max(high - low), high + margin * np.max(high - low)
+
+
+def _equal_panels(number: int, low: np.ndarray, high: np.ndarray, extra: float) -> tuple[Figure, np.ndarray]:
+    """Panels in a row with the same limits and equal scales, at least 0.72 times as high as wide.
+
+    `extra` inches above and below hold the titles and the legend.
+    """
+    wide, high_now = high - low
+    missing = np.array([0, max(0, 0.72 * wide - high_now) / 2])
+    low, high = low - missing, high + missing
+    size = 4.8 * number, 4.2 * (high[1] - low[1]) / wide + extra
+    figure, axes = plt.subplots(1, number, figsize=size, layout="constrained", sharex=True, sharey=True, squeeze=False)
+    for axis in axes[0]:
+        axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    return figure, axes[0]
 
 
 def _framed(axis: Axes, image: np.ndarray, colour: object, width: float) -> None:
