@@ -59,12 +59,13 @@ def test_the_box_of_the_crop_is_drawn_on_the_frame(frames):
     assert box.get_y() <= rows.min() and box.get_y() + box.get_height() > rows.max()
 
 
-def test_the_sheet_has_a_column_per_view_and_frames_the_chosen_one(estimate):
+def test_the_sheet_has_a_row_per_view_and_frames_the_chosen_one(estimate):
     views = [estimate.reference_view, *estimate.target_views]
     maps = [np.full(views[0].features.grid, -float(i)) for i in range(5)]
-    figure = result_plots.stage_sheet(views, maps, [f"column {i}" for i in range(6)], estimate.view)
-    panels = np.reshape(figure.axes[:24], (4, 6))
-    assert [axis.get_title() for axis in panels[0]] == [f"column {i}" for i in range(6)]
+    figure = result_plots.stage_sheet(views, maps, [f"row {i}" for i in range(6)], estimate.view)
+    panels = np.reshape(figure.axes[:24], (6, 4)).T
+    assert [axis.get_title() for axis in panels[:, 0]] == ["crop", "features", "saliency", "cyclical distance"]
+    assert [axis.texts[0].get_text() for axis in panels[0]] == [f"row {i}" for i in range(6)]
     assert [len(axis.patches) for axis in panels[0]] == [int(i == 1 + estimate.view) for i in range(6)]
     assert [float(axis.images[-1].get_array().mean()) for axis in panels[3, 1:]] == [0, -1, -2, -3, -4]
     saliency = panels[2, 0].images[-1].get_array()
@@ -120,6 +121,16 @@ def test_points_on_images_keep_their_colours(frames):
     for axis in figure.axes:
         shown = axis.collections[0].get_facecolors()[:, :3]
         np.testing.assert_allclose(shown, colours[np.argsort(-cloud[:, 2])])
+
+
+def test_a_zoomed_panel_is_a_square_around_the_object(frames):
+    frame, cloud = frames[0], np.array([[0.0, 0, 4]])
+    (axis,) = result_plots.points_on_images([frame], [cloud], [np.ones((1, 3))], ["a"], zoom=True).axes
+    rows, cols = np.nonzero(frame.mask > 0.4)
+    left, right, low, high = *axis.get_xlim(), *axis.get_ylim()
+    assert left < cols.min() and cols.max() < right and high < rows.min() and rows.max() < low
+    assert right - left == pytest.approx(low - high)
+    assert right - left < 1.4 * max(np.ptp(rows) + 1, np.ptp(cols) + 1)
 
 
 def test_the_foreground_is_transparent_elsewhere(estimate):

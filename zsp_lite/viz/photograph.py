@@ -78,7 +78,7 @@ def _draw_result(axis: Axes, result: PhotographResult) -> None:
     """Draw points of the aligned cloud and the estimated directions."""
     chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
     colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
-    plots.draw_points(axis, result.photograph.camera, result.cloud[chosen], colours, size=2.5)
+    plots.draw_points(axis, result.photograph.camera, result.cloud[chosen], colours, size=6)
     _draw(axis, result.photograph.camera, result.axes, result.cloud.mean(axis=0))
 
 
@@ -92,6 +92,8 @@ def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray
         artist.set_in_layout(False)
         if artist.get_text():
             artist.set_position(np.clip(artist.get_position(), 0.08 * size, 0.92 * size))
+        else:
+            artist.arrow_patch.set_clip_path(axis.patch)
 
 
 def _title(result: PhotographResult) -> str:

@@ -18,7 +18,6 @@ from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
 
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
 _MARKERS = "osD^vP*X"
-_HALF_WIDTH = 3.5  # of a panel with point clouds, in scene units; a cloud has unit standard deviation
 
 
 def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, points: int = 1500) -> Figure:
@@ -64,9 +63,9 @@ def stage_sheet(
     maps: Sequence[Real[np.ndarray, "rows cols"]],
     captions: Sequence[str],
     chosen: int,
-    size: float = 1.75,
+    size: float = 2.0,
 ) -> Figure:
-    """Draw the stages of all views of a pair, a column each: crop, features, foreground, and cyclical distances.
+    """Draw the stages of all views of a pair, a row each: crop, features, foreground, and cyclical distances.
 
     The features are coloured by principal components that all views share; the foreground shows the saliency; the maps
     of cyclical distances lie on the reference.
@@ -74,37 +73,32 @@ def stage_sheet(
     Args:
         views: The reference and the N target views.
         maps: Cyclical distances (negated) of the reference's patches to each target, -inf off the foreground.
-        captions: Title of each column, N + 1.
+        captions: Name of each row, N + 1.
         chosen: Index of the chosen target.
         size: Width of a panel in inches.
     """
     crops = [view.frame.rgb for view in views]
     keys = [np.asarray(view.features.keys) for view in views]
     colours = plots.pca_colours(keys, [np.asarray(view.foreground) for view in views])
+    under_maps = [np.ones_like(crops[0]) * 255, *crops[:1] * len(maps)]
+    names = "crop", "features", "saliency", "cyclical distance"
     figure, axes = plots.show_images(
-        [*crops, *colours, *crops, np.ones_like(crops[0]) * 255, *crops[:1] * len(maps)],
-        [*captions, *[""] * (3 * len(views))], columns=len(views), size=size,
+        [image for row in zip(crops, colours, crops, under_maps) for image in row],
+        [*names, *[""] * (4 * len(maps))], columns=4, size=size,
     )  # fmt: skip
-    figure.set_size_inches(size * len(views) + 1.2, size * 4 + 0.5)
-    rows = np.reshape(np.array(axes, dtype=object), (4, len(views)))
-    for axis, view in zip(rows[2], views):
+    figure.set_size_inches(4 * size + 1.1, size * len(views) + 0.3)
+    rows = np.reshape(np.array(axes, dtype=object), (len(views), 4))
+    for axis, view in zip(rows[:, 2], views):
         plots.overlay_map(axis, np.where(view.foreground, view.features.saliency, np.nan), limits=(0, 1))
-    for axis, distances in zip(rows[3, 1:], maps):
+    for axis, distances in zip(rows[1:, 3], maps):
         plots.overlay_map(axis, distances, limits=(-10, 0), cmap="cividis", alpha=0.85)
-    names = (
-        "crop",
-        "features\n(3 principal\ncomponents)",
-        "saliency on\nthe foreground",
-        "cyclical distance\nto each target",
-    )
-    for axis, name in zip(rows[:, 0], names):
-        axis.text(-0.06, 0.5, name, transform=axis.transAxes, ha="right", va="center", fontsize=9)
-    for axis in rows[:, 1 + chosen]:
+    for axis, caption in zip(rows[:, 0], captions):
+        axis.text(-0.06, 0.5, caption, transform=axis.transAxes, ha="right", va="center")
+    for axis in rows[1 + chosen]:
         plots.mark(axis, "")
-    bar = figure.colorbar(rows[3, 1].images[-1], ax=rows[3, 0], location="bottom", shrink=0.7, aspect=12, pad=-0.6)
-    bar.set_ticks([-10, -5, 0])
-    bar.set_label("− distance (patches)", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+    bar = figure.colorbar(rows[1, 3].images[-1], cax=rows[0, 3].inset_axes([0.1, 0.45, 0.8, 0.08]),
+                          orientation="horizontal", ticks=[-10, -5, 0])  # fmt: skip
+    bar.set_label("− distance (patches)")
     return figure
 
 
@@ -119,18 +113,20 @@ def matched_points(views: Sequence[View], points: Sequence[Float[np.ndarray, "k 
         points: Matched points in the camera frames of both.
         names: Names of both.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4.4), layout="constrained")
+    clouds = [object_cloud(view)[:, :2] for view in views]
+    middles = [(cloud.min(axis=0) + cloud.max(axis=0)) / 2 for cloud in clouds]
+    half = 1.2 * np.max([np.ptp(cloud, axis=0) for cloud in clouds], axis=0) / 2
+    half = np.maximum(half, 0.75 * half.max())  # panels at least three quarters as high as wide, and the reverse
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.5 * half[1] / half[0] + 0.9), layout="constrained")
     order = np.argsort(np.argsort(points[0][:, 1]))
-    for axis, view, matched, name in zip(axes, views, points, names):
-        cloud = object_cloud(view)
-        x, y, _ = np.median(cloud, axis=0)
-        inside = (np.abs(matched[:, :2] - (x, y)) < _HALF_WIDTH).all(axis=1)
-        axis.scatter(*cloud[:, :2].T, s=2, color="0.75", label="measured surface")
+    for axis, cloud, (x, y), matched, name in zip(axes, clouds, middles, points, names):
+        inside = (np.abs(matched[:, :2] - (x, y)) < half).all(axis=1)
+        axis.scatter(*cloud.T, s=2, color="0.75", label="measured surface")
         style = {"cmap": "viridis", "vmin": 0, "vmax": len(matched) - 1, "edgecolors": "black"}
         axis.scatter(*matched[inside, :2].T, s=50, c=order[inside], label="matches", **style)
         axis.set(title=f"{name}: {inside.sum()} of {len(matched)} matches", aspect="equal")
         axis.set(xlabel="x, to the right (scene units)", ylabel="y, down (scene units)")
-        axis.set(xlim=(x - _HALF_WIDTH, x + _HALF_WIDTH), ylim=(y + _HALF_WIDTH, y - _HALF_WIDTH))
+        axis.set(xlim=(x - half[0], x + half[0]), ylim=(y + half[1], y - half[1]))
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
@@ -163,8 +159,9 @@ def aligned_from_two_sides(reference: Real[np.ndarray, "n 3"], target: Real[np.n
         reference: Points of the reference after the pose.
         target: Points of the target.
     """
-    middle = np.median(target, axis=0)
-    figure, axes = plt.subplots(1, 2, figsize=(8.4, 4.4), layout="constrained")
+    low, high = np.percentile(np.concatenate([reference, target]), [0.5, 99.5], axis=0)
+    middle, half = (low + high) / 2, 0.55 * np.max(high - low)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4.9), layout="constrained")
     for axis, title, down, flip in zip(axes, ("from the front", "from above"), (1, 2), (-1, 1)):
         for cloud, name, marker, colour in (
             (target, "target", "D", ORANGE),
@@ -173,8 +170,8 @@ def aligned_from_two_sides(reference: Real[np.ndarray, "n 3"], target: Real[np.n
             style = {"s": 7, "linewidths": 0, "marker": marker, "color": colour, "alpha": 0.8}
             axis.scatter(*cloud[:, [0, down]].T, label=name, **style)
         axis.set(title=title, xlabel="x, to the right", ylabel=("y, down", "z, away")[down - 1], aspect="equal")
-        axis.set_xlim(middle[0] - _HALF_WIDTH, middle[0] + _HALF_WIDTH)
-        axis.set_ylim(middle[down] - flip * _HALF_WIDTH, middle[down] + flip * _HALF_WIDTH)
+        axis.set_xlim(middle[0] - half, middle[0] + half)
+        axis.set_ylim(middle[down] - flip * half, middle[down] + flip * half)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=2.5)
     return figure
 
@@ -214,6 +211,7 @@ def points_on_images(
     titles: Sequence[str],
     columns: int | None = None,
     size: float = 2.6,
+    zoom: bool = False,
 ) -> Figure:
     """Draw coloured points over images.
 
@@ -224,10 +222,17 @@ def points_on_images(
         titles: Title of each panel.
         columns: Panels per row; default all in one row.
         size: Width of a panel in inches.
+        zoom: Show only a square around the object mask, a third wider than the object.
     """
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
     for axis, frame, cloud, own in zip(axes, frames, clouds, colours):
         plots.draw_points(axis, frame.camera, cloud, own, size=4)
+        if zoom:
+            top, left, height, width = mask_to_bbox(frame.mask, padding=0)
+            middle, half = np.array([left + width / 2, top + height / 2]), 2 / 3 * max(height, width)
+            axis.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([half, -half]))
+    if zoom:
+        figure.set_figheight((size + 0.3) * len(frames) / (columns or len(frames)))
     return figure
 
 
