@@ -53,7 +53,7 @@ def test_each_patch_receives_the_features_of_its_place():
     network = PhotoInformedViT(VisionTransformer(64, 8, 48, 2, 2)).eval()
     torch.nn.init.normal_(network.photo_input.projection.linear.weight)
     images = torch.rand(1, 3, 128, 128)
-    small, added = network.inputs(images)
+    small, added, _ = network.inputs(images)
     features = network.photo_network.features(images)  # (1, 112, 8, 8)
     assert small.shape == (1, 3, 64, 64) and features.shape[2:] == (8, 8)
     expected = network.photo_input.projection.linear(F.layer_norm(features[0, :, 3, 5], (112,)))

@@ -8,22 +8,21 @@ import pytest
 from synthetic_views import CoordinateBackbone
 
 from tools import tuning
+from tools.concepts import check_sides
 from tools.tuning import (
     Outcome,
-    calibrate,
-    check_training_categories,
     collect_outcomes,
     fit_calibration,
     fit_weights,
     leave_one_out,
-    report,
-    tie_statistics,
+    report_calibration,
+    report_weights,
 )
 from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import Calibration, reliability
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 
-TRUE_WEIGHTS = ScoreWeights(6, 0, -4, -2, 0, 3, 0, -1, 0)
+TRUE_WEIGHTS = ScoreWeights(6, 0, -4, -2, 0, 3, 0, -1, 0, 2)
 
 
 def sample_outcomes(n: int, rng: np.random.Generator, m: int = 6) -> list[Outcome]:
@@ -60,36 +59,41 @@ def test_pairs_without_a_correct_hypothesis_do_not_change_the_weights():
         fit_weights(wrong)
 
 
-def test_the_parameters_of_a_logistic_function_are_recovered():
-    rng = np.random.default_rng(0)
-    margin, view_std = rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000)
-    true = Calibration(-1.0, 0.8, 0.6)
-    correct = rng.random(4000) < true.confidence(margin, view_std)
-    fitted = fit_calibration(margin, view_std, correct, ridge=1e-9)
-    assert astuple(fitted) == pytest.approx(astuple(true), abs=0.2)
-    with pytest.raises(InputError, match="all 4000 estimates are correct"):
-        fit_calibration(margin, view_std, np.ones(4000, dtype=bool))
+def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[Outcome]:
+    """Pairs of three different poses, scored by the first term alone, of which one or none is right as `true` says."""
+    outcomes = []
+    for index in range(n):
+        n_views, view_std, terms = int(rng.integers(1, 11)), float(rng.uniform(0, 0.2)), np.zeros((3, len(TERM_NAMES)))
+        terms[:, 0] = np.sort(rng.uniform(0, 6, 3))[::-1]
+        p = true.probabilities(terms[0, 0] - terms[:, 0], n_views, view_std)
+        errors = np.full(4, 120.0)
+        errors[rng.choice(4, p=[*p, 1 - p.sum()])] = 5
+        outcomes.append(Outcome(f"category {index % 4}", terms, errors[:3], 90 * (1 - np.eye(3)), view_std, n_views))
+    return outcomes
 
 
-def test_the_logistic_regression_satisfies_its_optimality_conditions():
-    """At the optimum the residuals sum to 0, and their products with each input balance the penalty."""
-    rng = np.random.default_rng(7)
-    margin, view_std = rng.uniform(0, 6, 300), rng.uniform(0, 0.1, 300)
-    correct = rng.random(300) < 0.7
-    fitted = fit_calibration(margin, view_std, correct, ridge=1e-3)
-    residual = correct - fitted.confidence(margin, view_std)
-    assert residual.sum() == pytest.approx(0, abs=1e-3)
-    for x, coefficient in ((margin, fitted.margin), (view_std, fitted.view_std)):
-        penalty = 1e-3 * 300 * coefficient * x.std()
-        assert residual @ (x / x.std()) == pytest.approx(penalty, abs=1e-3)
+FIRST_TERM = ScoreWeights(*[1.0, *[0.0] * (len(TERM_NAMES) - 1)])
+TRUE_CALIBRATION = Calibration(-0.4, 0.2, 0.5, -0.4, -6.0)
 
 
-def test_calibrated_confidences_are_frequencies_on_new_pairs():
-    calibration = calibrate(sample_outcomes(700, np.random.default_rng(2)), TRUE_WEIGHTS)
-    margin, error = np.array([one.best(TRUE_WEIGHTS) for one in sample_outcomes(700, np.random.default_rng(3))]).T
-    confidence = calibration.confidence(margin, np.zeros(700))
-    assert reliability(confidence, error < 30, 5).calibration_error < 0.08
-    assert confidence.mean() == pytest.approx((error < 30).mean(), abs=0.05)
+def test_the_coefficients_of_the_calibration_are_recovered():
+    outcomes = sample_ranked(6000, TRUE_CALIBRATION, np.random.default_rng(0))
+    found = fit_calibration(outcomes, FIRST_TERM, ridge=0)
+    assert astuple(found)[:4] == pytest.approx(astuple(TRUE_CALIBRATION)[:4], abs=0.2)
+    assert found.none_std == pytest.approx(TRUE_CALIBRATION.none_std, abs=1.5)
+    right = [one for one in outcomes if one.errors.min() < 30]
+    with pytest.raises(InputError, match="all have a right pose or none has"):
+        fit_calibration(right, FIRST_TERM)
+
+
+def test_calibrated_probabilities_are_frequencies_on_new_pairs():
+    fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERM)
+    new = sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(3))
+    ranked = [one.ranked(FIRST_TERM) for one in new]
+    found = [fitted.probabilities(deficit, one.n_views, one.view_std) for one, (deficit, _) in zip(new, ranked)]
+    for k in range(3):
+        confidence, right = np.array([p[k] for p in found]), np.array([error[k] < 30 for _, error in ranked])
+        assert reliability(confidence, right, 5).calibration_error < 0.05
 
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():
@@ -98,46 +102,37 @@ def test_no_fit_sees_the_category_it_is_evaluated_on():
     assert all(one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen))
 
 
-def test_tie_statistics_count_pairs_with_a_rival_within_the_margin():
-    def pair(margin, error):
-        terms = np.zeros((2, len(TERM_NAMES)))
-        terms[0, 0] = margin
-        return Outcome("x", terms, np.array([error, 100.0]), np.array([[0.0, 90], [90, 0]]))
-
-    first_term_only = ScoreWeights(1, 0, 0, 0, 0, 0, 0, 0, 0)
-    rows = tie_statistics([pair(0.2, 5.0), pair(0.8, 170.0), pair(3.0, 5.0)], first_term_only, (0.5, 1.0))
-    assert rows == [(0.5, 1, 1.0), (1.0, 2, 0.5)]
-
-
 @pytest.mark.slow
 def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog):
     with caplog.at_level(logging.INFO):
         outcomes = collect_outcomes(str(ellipsoids.root), 2, CoordinateBackbone(), n_targets=3)
     correct = sum(one.errors[0] < 30 for one in outcomes)
-    assert len(outcomes) == 2 and f"ellipsoid: 2 pairs, Acc30 {50 * correct} %" in caplog.messages
+    assert len(outcomes) == 2 and f"ellipsoid: 2 pairs of 3 views, Acc30 {50 * correct} %" in caplog.messages
     assert min(one.errors[0] for one in outcomes) < 5
     for one in outcomes:
         m = len(one.errors)
         assert one.terms.shape == (m, len(TERM_NAMES)) and one.angles.shape == (m, m)
-        assert one.best(ScoreWeights())[1] == one.errors[0]  # the solver ranks by the default weights
+        assert one.ranked(ScoreWeights())[1][0] == one.errors[0]  # the solver ranks by the default weights
+        assert one.n_views == 3
         np.testing.assert_allclose(np.diag(one.angles), 0, atol=1e-3)
         assert one.angles[~np.eye(m, dtype=bool)].min() > 14.9
 
 
-def test_the_report_has_all_fits():
-    text = "\n".join(report(sample_outcomes(60, np.random.default_rng(5))))
-    assert "60 pairs of 4 categories" in text and "AUROC" in text and "held-out category" in text
+def test_the_reports_have_all_fits():
+    text = "\n".join(report_weights(sample_outcomes(60, np.random.default_rng(5))))
+    assert "60 pairs of 4 categories" in text and "held-out category" in text and "best 2 different poses" in text
     assert all(name in text for name in TERM_NAMES)
+    text = "\n".join(report_calibration(sample_ranked(200, TRUE_CALIBRATION, np.random.default_rng(5)), FIRST_TERM))
+    assert "AUROC" in text and "10 views:" in text and "probabilities of the other poses" in text
 
 
-def test_validation_and_evaluation_categories_are_refused(tmp_path, capsys):
-    check_training_categories(["camera", "ellipsoid"])
-    with pytest.raises(InputError, match="category drill is for validation"):
-        check_training_categories(["camera", "drill"])
-    folder = tmp_path / "toyplane"
-    folder.mkdir()
-    (folder / "frame_annotations.jgz").write_bytes(b"")
-    with pytest.raises(InputError, match="category toyplane is for evaluation"):
-        collect_outcomes(str(tmp_path), 2, None)
-    assert tuning.main([str(tmp_path), "--pairs", "2"]) == 2
-    assert "category toyplane is for evaluation" in capsys.readouterr().err
+def test_categories_of_another_side_are_refused(tmp_path, capsys):
+    for name in ("camera", "drill"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "frame_annotations.jgz").write_bytes(b"")
+    with pytest.raises(InputError, match="category drill is for validation, expected training"):
+        check_sides([tmp_path], "training")
+    with pytest.raises(InputError, match="category camera is for training, expected validation"):
+        check_sides([tmp_path], "validation")
+    assert tuning.main(["weights", str(tmp_path), "--pairs", "2"]) == 2
+    assert "category drill is for validation" in capsys.readouterr().err

@@ -14,8 +14,6 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.poses import rotation_matrices
-from zsp_lite.verified.solver import tied_hypotheses
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 from zsp_lite.views import extract_views, object_crop
 
@@ -311,10 +309,3 @@ def test_a_symmetric_object_is_flagged_as_ambiguous(method, symmetry):
     best = np.min(errors, axis=1)
     assert min(error[0] for error in errors) < 10
     assert (best < 15).sum() >= 2
-
-
-def test_hypotheses_are_tied_if_distinct_and_within_one_nat():
-    rotation = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 0, angle] for angle in (0, 20, 180, 190, 90)])))
-    assert tied_hypotheses(torch.tensor([5.0, 4.9, 4.5, 4.4, 3.9]), rotation) == [0, 2]  # 20 is 0's, 190 is 180's
-    assert tied_hypotheses(torch.tensor([5.0, 4.9, 3.5, 4.4, 4.2]), rotation) == [0, 3, 4]
-    assert tied_hypotheses(torch.tensor([5.0, 3.9, 3.5, 3.4, 3.2]), rotation) == [0]

@@ -18,12 +18,11 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import (
     Calibration,
     auroc,
-    calibration_for,
     hypothesis_probabilities,
     is_one_of_two,
     modes,
+    nearly_as_probable,
     reliability,
-    score_margins,
 )
 from zsp_lite.verified.maps import build_maps, project_points
 from zsp_lite.verified.poses import (
@@ -37,13 +36,14 @@ from zsp_lite.verified.poses import (
 )
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, propose_poses
 from zsp_lite.verified.refinement import SearchSchedule, refine
-from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
+from zsp_lite.verified.scene import build_scene, double_centre, object_axes, surface_weights
 from zsp_lite.verified.soft_icp import evenly_spaced_indices, soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
     ScoreTerms,
     ScoreWeights,
     forward_terms,
+    orientation_term,
     reverse_terms,
     score_terms,
     viewpoint_term,
@@ -455,7 +455,7 @@ def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
 def test_the_score_is_the_weighted_sum_of_the_terms():
     rng = np.random.default_rng(4)
     terms = ScoreTerms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERM_NAMES))
-    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
+    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0, 1.5)
     by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERM_NAMES)
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
 
@@ -470,6 +470,32 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
     expected = 0.3 * (1 - np.exp(-((apart / 45) ** 2)))
     np.testing.assert_allclose(viewpoint_term(scene, sides), [expected, -expected], atol=1e-3)
     np.testing.assert_allclose(score_terms(scene, sides).viewpoint, viewpoint_term(scene, sides))
+
+
+def test_the_axes_of_an_object_are_those_of_its_exact_positions(views):
+    reference, *_ = views
+    assert object_axes(reference) is None
+    points = reference.patch_points[0]
+    turn = some_rotation(np.random.default_rng(4))
+    positions = torch.from_numpy(0.7 * points @ turn.T).float()
+    found = object_axes(replace(reference, features=replace(reference.features, positions=positions)))
+    np.testing.assert_allclose(found, turn, atol=1e-5)
+
+
+def test_the_orientation_term_compares_the_axes_of_both_objects_under_the_pose(views):
+    """Of two target views, one predicts the axes of the reference's object under the first pose, one a quarter turn."""
+    scene = build_scene(views[0], views[1:3], [torch.zeros(784, 784)] * 2)
+    assert (orientation_term(scene, poses_from_views(scene)) == 0).all()  # no positions
+    rng = np.random.default_rng(5)
+    axes, turn = some_rotation(rng), rotation_matrices(torch.tensor([[0.0, 0, np.pi / 2]]))[0]
+    rotation = torch.from_numpy(some_rotation(rng)).float()
+    axes = torch.from_numpy(axes).float()
+    exact = axes @ rotation.T  # from the targets' frame to the axes, if the rotation is right
+    scene = replace(scene, reference_axes=axes, target_axes=torch.stack([exact, turn @ exact]))
+    poses = Poses(torch.ones(2), torch.stack([rotation, rotation @ axes.T @ turn.T @ axes]), torch.zeros(2, 3))
+    expected = [(1 + np.exp(-((90 / 50) ** 2))) / 2, (np.exp(-((90 / 50) ** 2)) + 1) / 2]
+    np.testing.assert_allclose(orientation_term(scene, poses), expected, atol=1e-4)
+    np.testing.assert_allclose(score_terms(scene, poses).orientation, expected, atol=1e-4)
 
 
 def test_with_one_view_the_viewpoint_term_is_zero(views):
@@ -558,21 +584,6 @@ def test_surface_weights_do_not_depend_on_the_sampling_density():
 # Confidence
 
 
-def test_confidence_is_lower_with_fewer_views():
-    margin = np.array([0.5, 1.0, 3.0, 8.0])
-    found = [calibration_for(n).confidence(margin, 0.04) for n in (1, 2, 3, 4, 5, 20)]
-    assert all((fewer <= more).all() for fewer, more in zip(found, found[1:]))
-    assert calibration_for(1).confidence(margin, 0.0).max() < 0.5
-    np.testing.assert_allclose(calibration_for(20).confidence(margin, 0.04), 1 / (1 + np.exp(-margin)))
-    between = calibration_for(2)
-    assert (between.bias, between.margin, between.view_std) == pytest.approx((-1.25, 0.45, 0))
-
-
-def test_confidence_rises_with_the_spread_of_view_similarities():
-    margin = np.array([0.5, 3.0])
-    assert (Calibration().confidence(margin, 0.08) > Calibration().confidence(margin, 0.02)).all()
-
-
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():
     confidence, right = np.array([0.9, 0.6, 0.6, 0.2]), np.array([True, True, False, False])
     assert auroc(confidence, right) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
@@ -591,13 +602,6 @@ def test_reliability_by_hand():
         reliability(confidence, right)
 
 
-def test_a_score_margin_is_over_the_best_distinct_rival():
-    score = np.array([5.0, 4.5, 3.0])
-    apart = np.array([[0.0, 20, 90], [20, 0, 100], [90, 100, 0]])
-    np.testing.assert_allclose(score_margins(score, apart), [2, 1.5, -2])
-    np.testing.assert_allclose(score_margins(score[:1], apart[:1, :1]), [8])  # without a rival
-
-
 # Angles between five rotations about one axis, of 0, 20, 180, 190 and 90 degrees.
 TURNS = np.array([0.0, 20, 180, 190, 90])
 APART = np.abs((TURNS[:, None] - TURNS + 180) % 360 - 180)
@@ -610,24 +614,18 @@ def test_hypotheses_within_30_degrees_of_a_better_one_are_the_same_pose():
     np.testing.assert_array_equal(modes(np.abs(line[:, None] - line)), [0, 1, 1])
 
 
+MODE = np.array([0, 0, 2, 2, 4])
+
+
 def test_probabilities_of_hypotheses_by_hand():
-    # The second pose is 0.5 nats below the first, the third 2. The first leaves enough for their odds.
-    score, calibration = np.array([5.0, 4.9, 4.5, 4.4, 3.0]), Calibration(-0.5, 1.0, 0.0)
-    best = 1 / (1 + np.exp(0.5 - 0.5))
-    second, third = best * np.exp(-0.5), best * np.exp(-2.0)
-    assert best + second + third <= 1
-    found = hypothesis_probabilities(score, APART, calibration, 0.03)
-    np.testing.assert_allclose(found, [best, best, second, second, third])
-
-
-def test_probabilities_are_divided_where_the_best_pose_leaves_less_than_the_odds_say():
-    score, calibration = np.array([5.0, 4.9, 4.5, 4.4, 3.0]), Calibration(1.0, 1.0, 0.0)
-    best = 1 / (1 + np.exp(-1.5))
-    none = np.exp(-9.0)  # odds of a wrong pose without a rival
-    odds = np.exp([-0.5, -2.0])
-    found = hypothesis_probabilities(score, APART, calibration, 0.0)[[0, 2, 4]]
-    np.testing.assert_allclose(found, [best, *((1 - best) * odds / (none + odds.sum()))])
-    assert 0 < 1 - found.sum() < 1e-4
+    # Of four views: a = exp(0.2 - 0.5 log 4), odds of "none" exp(0.3 - 0.1 log 4 - 2 * 0.03).
+    calibration = Calibration(0.2, -0.5, 0.3, -0.1, -2.0)
+    a, none = np.exp(0.2) / 2, np.exp(0.3 - 0.06) * 4**-0.1
+    odds = np.exp(-a * np.array([0.0, 0.5, 2.0]))
+    first, second, third = odds / (none + odds.sum())
+    score = np.array([5.0, 4.9, 4.5, 4.4, 3.0])
+    found = hypothesis_probabilities(score, MODE, 4, 0.03, calibration)
+    np.testing.assert_allclose(found, [first, first, second, second, third])
 
 
 @given(
@@ -637,27 +635,28 @@ def test_probabilities_are_divided_where_the_best_pose_leaves_less_than_the_odds
 )
 def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, n_views, view_std):
     score = 10 - np.cumsum([0.0, *deficits])
-    turns = 60.0 * np.arange(len(score))
-    apart = np.abs((turns[:, None] - turns + 180) % 360 - 180)
-    calibration = calibration_for(n_views)
-    found = hypothesis_probabilities(score, apart, calibration, view_std)
-    assert found[0] == calibration.confidence(score_margins(score, apart), view_std)[0]
+    found = hypothesis_probabilities(score, np.arange(len(score)), n_views, view_std, Calibration())
     assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
 
 
-def test_with_one_view_most_of_the_mass_is_left_for_none_of_the_poses():
+def test_with_fewer_views_more_of_the_mass_is_left_for_none_of_the_poses():
     score = np.array([5.0, 4.0])
-    apart = np.array([[0.0, 180], [180, 0]])
-    assert hypothesis_probabilities(score, apart, calibration_for(1), 0.03).sum() < 0.5
-    assert hypothesis_probabilities(score, apart, calibration_for(5), 0.03).sum() > 0.7
+    left = [1 - hypothesis_probabilities(score, np.arange(2), n, 0.03, Calibration()).sum() for n in (1, 2, 3, 5, 10)]
+    assert (np.diff(left) < 0).all() and left[0] > 2 * left[-1]
+
+
+def test_poses_are_nearly_as_probable_above_a_fraction_of_the_best_ones_probability():
+    assert nearly_as_probable(np.array([0.5, 0.5, 0.3, 0.3, 0.18]), MODE).tolist() == [0, 2]
+    assert nearly_as_probable(np.array([0.4, 0.4, 0.3, 0.3, 0.2]), MODE).tolist() == [0, 2, 4]
+    assert nearly_as_probable(np.array([0.8, 0.8, 0.1, 0.1, 0.1]), MODE).tolist() == [0]
 
 
 def test_an_answer_is_one_of_two_if_two_poses_far_apart_are_nearly_equally_probable():
     probability = np.array([0.45, 0.45, 0.35, 0.35, 0.1])
-    assert is_one_of_two(probability, APART)
-    assert not is_one_of_two(np.array([0.6, 0.6, 0.2, 0.2, 0.1]), APART)  # the second is too improbable
-    assert not is_one_of_two(np.array([0.4, 0.4, 0.3, 0.3, 0.2]), APART)  # one of three
-    assert not is_one_of_two(np.array([0.25, 0.25, 0.2, 0.2, 0.05]), APART)  # probably none
-    assert not is_one_of_two(probability, APART / 3.01)  # 59.8 degrees apart: a third rotation may be near both
-    assert is_one_of_two(probability[[0, 2]], np.array([[0.0, 61], [61, 0]]))
-    assert not is_one_of_two(np.array([0.9]), np.zeros((1, 1)))
+    assert is_one_of_two(probability, MODE, APART)
+    assert not is_one_of_two(np.array([0.6, 0.6, 0.2, 0.2, 0.1]), MODE, APART)  # the second is too improbable
+    assert not is_one_of_two(np.array([0.4, 0.4, 0.3, 0.3, 0.2]), MODE, APART)  # one of three
+    assert not is_one_of_two(np.array([0.25, 0.25, 0.2, 0.2, 0.05]), MODE, APART)  # probably none
+    assert not is_one_of_two(probability, MODE, APART / 3.01)  # 59.8 degrees apart: a third rotation may be near both
+    assert is_one_of_two(probability[[0, 2]], np.arange(2), np.array([[0.0, 61], [61, 0]]))
+    assert not is_one_of_two(np.array([0.9]), np.arange(1), np.zeros((1, 1)))

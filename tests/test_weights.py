@@ -24,13 +24,13 @@ from zsp_lite.views import object_crop, patch_mask
 
 
 def test_the_files_are_small_and_in_half_precision():
-    """The default backbone has at most 30 MB of weights, those of the photo network included."""
+    """The default backbone has at most 30 MiB of weights, with the photo network and the position head."""
     for path in EMBEDDED.values():
         assert path.stat().st_size <= 12e6
         with safe_open(path, "pt") as file:
             assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
-    parts = EMBEDDED["zsp-tiny-photo"], TINY, weights_file()
-    assert sum(path.stat().st_size for path in parts) <= 30e6
+    parts = EMBEDDED["zsp-tiny-photo"], WEIGHTS / "zsp-tiny-photo-positions.safetensors", TINY, weights_file()
+    assert sum(path.stat().st_size for path in parts) <= 30 * 2**20
 
 
 def test_the_digests_of_all_shipped_weights_are_those_of_the_files():

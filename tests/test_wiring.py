@@ -21,7 +21,7 @@ from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
 from zsp_lite.points import standard_deviation
 from zsp_lite.verified import VerifiedSolver, proposals, refinement, soft_icp, solver
-from zsp_lite.verified.confidence import Calibration, calibration_for
+from zsp_lite.verified.confidence import Calibration
 from zsp_lite.views import extract_views, object_crop
 
 
@@ -179,10 +179,9 @@ def test_the_weights_and_the_calibration_reach_the_verified_solver(views, verifi
     weights = replace(VerifiedSolver().weights, viewpoint=-3.0, forward_similarity=7.0)
     for one in verify(views, VERIFIED, weights=weights).hypotheses:
         assert one.score == pytest.approx(sum(w * t for w, t in zip(astuple(weights), one.terms.values())), abs=1e-3)
-    certain = verify(views, VERIFIED, calibration=Calibration(bias=3.0, margin=0.0, view_std=0.0))
+    certain = verify(views, VERIFIED, calibration=Calibration(20.0, 0.0, -3.0, 0.0, 0.0))  # rivals do not count
     assert certain.confidence == pytest.approx(1 / (1 + np.exp(-3)))
-    by_default = verify(views, VERIFIED, calibration=calibration_for(len(views) - 1))
-    assert by_default.confidence == verified.confidence
+    assert certain.confidence != verified.confidence
 
 
 def test_the_seed_reaches_the_verified_proposals(views):

@@ -1,12 +1,13 @@
-"""Fit the constants of the verified solver: score weights, calibration of the confidence and tie margin.
+"""Fit the constants of the verified solver: the weights of its score, and the calibration of its probabilities.
 
-Run from the root of the repository, on objects of training categories:
+Run from the root of the repository. The weights are fitted on training categories, the calibration on validation
+categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
-    zsp-lite synth --category training --out outputs/training
-    python -m tools.tuning outputs/training --pairs 30
+    python -m tools.tuning weights outputs/training outputs/training_poses
+    python -m tools.tuning calibration outputs/validation outputs/validation_poses
 
-The tool prints the fitted values; the constants in `zsp_lite/verified` are these, rounded. Folders with validation or
-evaluation categories are refused, because the solver could then not be evaluated on them.
+Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values; the constants
+in `zsp_lite/verified` are these, rounded.
 
 The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability that one
 is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
@@ -16,34 +17,34 @@ weights; if the fitted ones differ much, run the tool again with these as defaul
 import argparse
 import logging
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from sklearn.linear_model import LogisticRegression
+from jaxtyping import Float
 
+from tools.concepts import check_sides
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.pretrained import DEFAULT
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import Pair, sample_pairs
+from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.synthetic.export import SPLITS
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import MODE_ANGLE, Calibration, reliability, score_margins
+from zsp_lite.verified.confidence import Calibration, different_poses, modes, reliability
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
-from zsp_lite.views import extract_views, object_crop, usable_targets
+from zsp_lite.views import View, usable_targets
 
 CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
 _CALIBRATION_RIDGE = 1e-3
-_TIE_MARGINS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
+_VIEWS = (1, 2, 3, 5, 7, 10)  # of the calibration
 _log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
@@ -58,6 +59,7 @@ class Outcome:
         errors: (m,) rotation errors in degrees.
         angles: (m, m) angles between the hypotheses' rotations in degrees.
         view_std: Standard deviation of the target views' similarity to the reference.
+        n_views: Number of usable target views.
     """
 
     category: str
@@ -65,64 +67,62 @@ class Outcome:
     errors: Float[np.ndarray, " m"]
     angles: Float[np.ndarray, "m m"]
     view_std: float = 0.0
+    n_views: int = 5
 
-    def best(self, weights: ScoreWeights) -> tuple[float, float]:
-        """Return the score margin in nats and the error in degrees of the hypothesis with the highest score."""
+    def ranked(self, weights: ScoreWeights) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Return by how many nats each different pose is below the best under the weights, and its error."""
         scores = self.terms @ np.array(astuple(weights))
-        index = int(scores.argmax())
-        return float(score_margins(scores, self.angles)[index]), float(self.errors[index])
+        order = np.argsort(-scores, kind="stable")
+        different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
+        return scores[order[0]] - scores[different], self.errors[different]
 
 
-def collect_outcomes(root: str, pairs: int, backbone: Any, n_targets: int = 5, seed: int = 0) -> list[Outcome]:
+def collect_outcomes(
+    root: str, pairs: int, backbone: Any, n_targets: int = 5, seed: int = 0, solver: VerifiedSolver | None = None
+) -> list[Outcome]:
     """Run the verified solver on `pairs` pairs of each category of a folder.
 
     Raises:
-        InputError: The folder has a validation or evaluation category, or a sequence has no pose label.
+        InputError: A sequence has no pose label.
     """
-    dataset = Co3D(root)
-    categories = dataset.categories()
-    check_training_categories(categories)
-    outcomes = []
-    for category in categories:
+    dataset, outcomes = Co3D(root), []
+    for category in dataset.categories():
         labels = read_labels(root, category)
-        sampled = sample_pairs(dataset, category, pairs, n_targets, seed)
-        found = [solve_pair(dataset, pair, backbone, labels) for pair in sampled]
+        found = []
+        for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
+            method = ZeroShotPose(backbone, seed=pair.seed)
+            reference, targets = dataset.load_pair(pair)
+            reference, *targets = method.views([reference, *targets])
+            ends = labels[pair.reference_sequence], labels[pair.target_sequence]
+            found.append(solve_views(method, category, reference, targets, ends, solver or VerifiedSolver()))
         outcomes += found
         accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
-        _log.info("%s: %d pairs, Acc30 %.0f %%", category, len(found), 100 * accuracy)
+        _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)
     return outcomes
 
 
-def check_training_categories(categories: Sequence[str]) -> None:
-    """Raise InputError if one of the categories is a validation or evaluation category."""
-    for category in categories:
-        for split in ("validation", "evaluation"):
-            if category in SPLITS[split]:
-                raise InputError(f"category {category} is for {split}, expected only training categories")
-
-
-def solve_pair(dataset: Co3D, pair: Pair, backbone: Any, labels: Mapping[str, PoseLabel]) -> Outcome:
-    """Run the verified solver on one pair and compute the errors of its hypotheses."""
-    method = ZeroShotPose(backbone, seed=pair.seed)
-    reference, targets = dataset.load_pair(pair)
-    reference, *targets = extract_views(backbone, [object_crop(frame) for frame in (reference, *targets)])
+def solve_views(
+    method: ZeroShotPose, category: str, reference: View, targets: Sequence[View], labels: tuple[PoseLabel, PoseLabel],
+    solver: VerifiedSolver,
+) -> Outcome:  # fmt: skip
+    """Run the verified solver on the views of a pair and compute the errors of its hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
     similarities = method.similarities(reference, targets)
     pairs = [method.match_pair(reference, target, sim) for target, sim in zip(targets, similarities)]
-    solution = VerifiedSolver().solve(reference, targets, pairs, pair.seed)
+    solution = solver.solve(reference, targets, pairs, method.seed)
 
     cameras = [target.frame.camera for target in targets]
-    ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-    true = [relative_pose(ends[0], reference.frame.camera, ends[1], camera)[:3, :3] for camera in cameras]
+    true = [relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3] for camera in cameras]
     hypotheses = solution.hypotheses
     # Rotations to the targets' world, which hypotheses in different target views have in common.
     in_world = np.stack([cameras[one.view].R.T @ one.sim3.R for one in hypotheses])
     return Outcome(
-        pair.category,
+        category,
         np.array([[one.terms[name] for name in TERM_NAMES] for one in hypotheses]),
         np.array([rotation_error(one.sim3.R, true[one.view]) for one in hypotheses]),
         rotation_error(in_world[:, None], in_world[None]),
         solution.scene.view_similarity_std,
+        len(targets),
     )
 
 
@@ -171,36 +171,50 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
 
 
 def fit_calibration(
-    margin: Float[np.ndarray, " n"],
-    view_std: Float[np.ndarray, " n"],
-    correct: Bool[np.ndarray, " n"],
-    ridge: float = _CALIBRATION_RIDGE,
+    outcomes: Sequence[Outcome], weights: ScoreWeights, ridge: float = _CALIBRATION_RIDGE
 ) -> Calibration:
-    """Fit the calibration by logistic regression.
+    """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
     Args:
-        margin: Score margins of n estimates, nats.
-        view_std: Standard deviations of their view similarities.
-        correct: Which of the estimates were correct.
-        ridge: Penalty on the coefficients per standard deviation of their inputs.
+        outcomes: Outcomes for several numbers of views.
+        weights: Weights of the score.
+        ridge: Penalty on the squared coefficients of log N and of the view similarities' standard deviation, per
+            standard deviation of these.
 
     Raises:
-        InputError: All estimates are correct, or all are wrong.
+        InputError: All estimates are right, or none is.
     """
-    if correct.min() == correct.max():
-        raise InputError(
-            f"all {len(correct)} estimates are {'correct' if correct[0] else 'wrong'}, expected both kinds"
-        )
-    inputs = np.stack([margin, view_std], axis=1)
-    std = inputs.std(axis=0) + 1e-9
-    model = LogisticRegression(C=1 / (ridge * len(correct)), tol=1e-8).fit(inputs / std, correct)
-    return Calibration(float(model.intercept_[0]), *(float(value) for value in model.coef_[0] / std))
+    ranked = [one.ranked(weights) for one in outcomes]
+    right = [np.flatnonzero(error < CORRECT_ANGLE) for _, error in ranked]
+    if min(map(len, right)) > 0 or max(map(len, right)) == 0:
+        raise InputError(f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds")
+    most = max(len(deficit) for deficit, _ in ranked)
+    deficits = torch.full((len(outcomes), most), 1e3, dtype=torch.float64)
+    for row, (deficit, _) in zip(deficits, ranked):
+        row[: len(deficit)] = torch.from_numpy(deficit)
+    target = torch.tensor([int(found[0]) if len(found) else most for found in right])
+    inputs = np.array([(np.log(one.n_views), one.view_std) for one in outcomes])
+    mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
+    x = torch.from_numpy((inputs - mean) / std)
+    theta = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([theta], max_iter=300, line_search_fn="strong_wolfe")
 
+    def loss() -> Float[torch.Tensor, ""]:
+        optimiser.zero_grad()
+        scale = torch.exp(theta[0] + theta[1] * x[:, 0])
+        none = theta[2] + x @ theta[3:]
+        logits = torch.cat([-scale[:, None] * deficits, none[:, None]], dim=1)
+        value = torch.nn.functional.cross_entropy(logits, target) + ridge * theta[[1, 3, 4]].square().sum()
+        value.backward()
+        return value
 
-def calibrate(outcomes: Sequence[Outcome], weights: ScoreWeights) -> Calibration:
-    """Fit the calibration of the hypotheses with the highest score under the weights."""
-    margin, error = np.array([one.best(weights) for one in outcomes]).T
-    return fit_calibration(margin, _view_stds(outcomes), error < CORRECT_ANGLE)
+    with torch.enable_grad():
+        optimiser.step(loss)
+    scale, scale_n, none, *slopes = theta.detach().numpy()
+    slopes = np.array(slopes) / std
+    return Calibration(
+        *map(float, (scale - scale_n * mean[0] / std[0], scale_n / std[0], none - slopes @ mean, *slopes))
+    )
 
 
 def leave_one_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit]) -> list[_Fit]:
@@ -210,48 +224,57 @@ def leave_one_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]]
     return [fitted[one.category] for one in outcomes]
 
 
-def tie_statistics(
-    outcomes: Sequence[Outcome], weights: ScoreWeights, margins: Sequence[float]
-) -> list[tuple[float, int, float]]:
-    """For each margin in nats: the margin, the number of pairs below it, and the fraction of them that is correct."""
-    margin, error = np.array([one.best(weights) for one in outcomes]).T
-    rows = []
-    for limit in margins:
-        correct = error[margin < limit] < CORRECT_ANGLE
-        rows.append((limit, len(correct), float(correct.mean()) if len(correct) else float("nan")))
-    return rows
-
-
-def report(outcomes: Sequence[Outcome]) -> list[str]:
-    """Format the fits and their accuracy. Accuracies of fits are on categories that the fit has not seen."""
-    weights, present = fit_weights(outcomes), ScoreWeights()
-    present_margin, present_error = np.array([one.best(present) for one in outcomes]).T
-    fits = leave_one_out(outcomes, lambda some: (w := fit_weights(some), calibrate(some, w)))
-    margin, error = np.array([one.best(w) for one, (w, _) in zip(outcomes, fits)]).T
-    view_std = _view_stds(outcomes)
-    confidence = np.array([c.confidence(m, std) for (_, c), m, std in zip(fits, margin, view_std)])
-    calibration = calibrate(outcomes, present)
-    margin_only = fit_calibration(present_margin, np.zeros(len(outcomes)), present_error < CORRECT_ANGLE)
-    lines = [
+def report_weights(outcomes: Sequence[Outcome]) -> list[str]:
+    """Format the fit of the weights and its accuracy on categories that the fit has not seen."""
+    present, fitted = ScoreWeights(), fit_weights(outcomes)
+    held_out = leave_one_out(outcomes, fit_weights)
+    rows = (
+        ("present weights", [one.ranked(present)[1][0] for one in outcomes]),
+        ("fitted weights, held-out category", [one.ranked(w)[1][0] for one, w in zip(outcomes, held_out)]),
+        ("most accurate hypothesis", [one.errors.min() for one in outcomes]),
+    )
+    return [
         f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",
-        f"present weights                    {_accuracy(present_error)}",
-        f"fitted weights, held-out category  {_accuracy(error)}",
-        f"most accurate hypothesis           {_accuracy(np.array([one.errors.min() for one in outcomes]))}",
-        "weights: " + ", ".join(f"{name} {value:.1f}" for name, value in asdict(weights).items()),
-        f"calibration of the present weights: bias {calibration.bias:.2f}, margin {calibration.margin:.3f}, "
-        f"view_std {calibration.view_std:.1f}",
-        f"calibration from the margin only: bias {margin_only.bias:.2f}, margin {margin_only.margin:.3f}",
-        "confidence, held-out category:",
-        str(reliability(confidence, error < CORRECT_ANGLE, min(10, len(outcomes)))),
-        f"pairs with a rival more than {MODE_ANGLE:.0f} degrees away within a margin (nats), and their accuracy:",
+        *(f"{name:35s}{_accuracy(np.array(errors))}" for name, errors in rows),
+        "fitted weights: " + ", ".join(f"{name} {value:.1f}" for name, value in asdict(fitted).items()),
+        *(f"  best {k} different poses: one is right in {_share(outcomes, present, k):.1f} %" for k in (1, 2, 3, 6)),
     ]
-    for limit, count, accuracy in tie_statistics(outcomes, present, _TIE_MARGINS):
-        lines.append(f"{limit:6.2f} {count:5d}" + (f" {100 * accuracy:5.0f} %" if count else ""))
+
+
+def report_calibration(outcomes: Sequence[Outcome], weights: ScoreWeights) -> list[str]:
+    """Format the fit of the calibration, and how well it holds on categories that the fit has not seen."""
+    fitted = fit_calibration(outcomes, weights)
+    held_out = leave_one_out(outcomes, lambda some: fit_calibration(some, weights))
+    first, others = [], []
+    for one, calibration in zip(outcomes, held_out):
+        deficit, error = one.ranked(weights)
+        probability = calibration.probabilities(deficit, one.n_views, one.view_std)
+        pairs = list(zip(probability, error < CORRECT_ANGLE))
+        first.append((one.n_views, *pairs[0]))
+        others += pairs[1:]
+    views, confidence, right = map(np.array, zip(*first))
+    lines = [
+        f"{len(outcomes)} outcomes of {len({one.category for one in outcomes})} categories",
+        "fitted: " + ", ".join(f"{name} {value:.3f}" for name, value in asdict(fitted).items()),
+        "confidence, held-out category:",
+        str(reliability(confidence, right, min(10, len(right)))),
+    ]
+    for n in np.unique(views):
+        chosen = views == n
+        found = reliability(confidence[chosen], right[chosen], min(5, int(chosen.sum())))
+        lines.append(
+            f"  {n} views: {chosen.sum()} outcomes, mean confidence {100 * confidence[chosen].mean():.0f} %, right "
+            f"{100 * right[chosen].mean():.0f} %, expected calibration error {100 * found.calibration_error:.1f} points"
+        )
+    if others:
+        probability, right = map(np.array, zip(*others))
+        found = reliability(probability, right, min(10, len(right)))
+        lines += ["probabilities of the other poses, held-out category:", str(found)]
     return lines
 
 
-def _view_stds(outcomes: Sequence[Outcome]) -> Float[np.ndarray, " n"]:
-    return np.array([one.view_std for one in outcomes])
+def _share(outcomes: Sequence[Outcome], weights: ScoreWeights, k: int) -> float:
+    return 100 * float(np.mean([(one.ranked(weights)[1][:k] < CORRECT_ANGLE).any() for one in outcomes]))
 
 
 def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
@@ -264,19 +287,24 @@ def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
-    parser.add_argument("root", nargs="+", help="folder of training categories in CO3D's layout, with pose labels")
+    parser.add_argument("constants", choices=("weights", "calibration"), help="what to fit")
+    parser.add_argument("root", nargs="+", help="folder of categories in CO3D's layout, with pose labels")
     parser.add_argument("--pairs", type=int, default=30, metavar="N", help="pairs per category (default 30)")
-    parser.add_argument("--targets", type=int, default=5, metavar="N", help="target views per pair (default 5)")
-    parser.add_argument("--backbone", default="zsp-tiny", help="name or checkpoint (default zsp-tiny)")
+    parser.add_argument("--backbone", action="append", metavar="NAME", help=f"may be repeated (default {DEFAULT})")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    calibrate = given.constants == "calibration"
     try:
-        for root in given.root:
-            check_training_categories(Co3D(root).categories())
-        backbone = load_backbone(given.backbone)
+        check_sides(given.root, "validation" if calibrate else "training")
         with torch.no_grad():
-            outcomes = [o for root in given.root for o in collect_outcomes(root, given.pairs, backbone, given.targets)]
-        print("\n".join(report(outcomes)))
+            outcomes = [
+                one
+                for backbone in map(load_backbone, given.backbone or [DEFAULT])
+                for root in given.root
+                for n in (_VIEWS if calibrate else (5,))
+                for one in collect_outcomes(root, given.pairs, backbone, n)
+            ]
+        print("\n".join(report_calibration(outcomes, ScoreWeights()) if calibrate else report_weights(outcomes)))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

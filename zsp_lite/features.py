@@ -33,6 +33,8 @@ class FeatureMap:
         keys: (H, W, D) key of each patch.
         saliency: (H, W) saliency of each patch, in [0, 1].
         global_feature: (E,) feature of the whole image.
+        positions: (H, W, 3) predicted coordinates of each patch on its object (see `backbones.positions`); None for
+            backbones that do not predict them.
 
     Raises:
         InputError: Shapes do not fit together.
@@ -42,6 +44,7 @@ class FeatureMap:
     keys: Float[Tensor, "h w d"]
     saliency: Float[Tensor, "h w"]
     global_feature: Float[Tensor, " e"]
+    positions: Float[Tensor, "h w 3"] | None = None
 
     def __post_init__(self):
         for name in ("keys", "saliency", "global_feature"):
@@ -55,8 +58,13 @@ class FeatureMap:
             raise InputError(
                 f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
-        if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
-            raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
+        positions = () if self.positions is None else (self.positions,)
+        if positions and self.positions.shape != (*self.grid, 3):
+            raise InputError(
+                f"FeatureMap: positions have shape {tuple(self.positions.shape)}, expected {(*self.grid, 3)}"
+            )
+        if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature, *positions)):
+            raise FatalError("FeatureMap: keys, saliency, global feature or positions hold values that are not finite")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape

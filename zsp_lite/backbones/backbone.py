@@ -11,10 +11,11 @@ from torch import Tensor
 
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import nearest_multiple
+from zsp_lite.backbones.positions import PositionHead, patch_places
 from zsp_lite.backbones.precision import Precision, autocast, supported_precision
 from zsp_lite.backbones.vit import Tokens
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.features import FeatureMap
+from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 
@@ -58,6 +59,7 @@ class Backbone:
         image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size, or of the
             model's `multiple`. Default: the model's.
         mean, std: Normalisation of RGB values in [0, 1].
+        position_head: Predicts the positions of the feature maps, for a photo-informed transformer; None for none.
 
     Attributes:
         layer: Index of the block, counted from 0.
@@ -83,6 +85,7 @@ class Backbone:
         image_size: int | None = None,
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
+        position_head: PositionHead | None = None,
     ):
         check_integer("batch_size", batch_size, 1)
         if saliency_heads is None:
@@ -103,6 +106,7 @@ class Backbone:
         self.device = choose_device(device)
         self.precision = supported_precision(precision, self.device.type)
         self.model = model.to(self.device).eval().requires_grad_(False)
+        self.position_head = None if position_head is None else position_head.to(self.device)
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Compute the features of images.
@@ -128,7 +132,12 @@ class Backbone:
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
-            grids = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
+            grids = [tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls]
+            if self.position_head is not None:
+                places = patch_places(tokens.grid).to(self.device).expand(len(batch), -1, -1)
+                salient = saliency > SALIENCY_THRESHOLD
+                positions = self.position_head(tokens.keys, tokens.photo, places, tokens.cls, salient)
+                grids.append(positions.unflatten(1, tokens.grid))
         # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
         # batch in memory.
         return [FeatureMap(*(x.to(torch.float32, copy=True) for x in one)) for one in zip(*grids)]

@@ -76,7 +76,8 @@ class CombinedBackbone:
         grid, salient = maps[0].grid, maps[self._salient]
         keys = [w * F.normalize(_resize(one.keys, grid), dim=-1) for w, one in zip(self.weights, maps)]
         saliency = _resize(salient.saliency[..., None], grid)[..., 0]
-        return FeatureMap(torch.cat(keys, dim=-1), saliency, salient.global_feature)
+        positions = None if salient.positions is None else _resize(salient.positions, grid)
+        return FeatureMap(torch.cat(keys, dim=-1), saliency, salient.global_feature, positions)
 
 
 def is_combination(name: str) -> bool:

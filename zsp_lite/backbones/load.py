@@ -15,7 +15,8 @@ from zsp_lite.backbones.convolutional import ConvolutionalBackbone, Convolutiona
 from zsp_lite.backbones.efficientnet import EfficientNetLite0
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
-from zsp_lite.backbones.photo_informed import TRANSFORMER, PhotoInformedViT
+from zsp_lite.backbones.photo_informed import CHANNELS, TRANSFORMER, PhotoInformedViT
+from zsp_lite.backbones.positions import SUFFIX, load_position_head
 from zsp_lite.backbones.precision import Precision
 from zsp_lite.backbones.pretrained import (
     DEFAULT,
@@ -168,6 +169,12 @@ def load_backbone(
     block = metadata_integer(metadata, "key_block", path) if layer is None else layer
     if saliency_heads is None:
         saliency_heads = metadata_integers(metadata, "saliency_heads", path)
+    if photo_input is not None and layer is None and facet == "key" and image_size is None:
+        head = photo_path.with_name(photo_path.stem + SUFFIX)
+        if head.is_file():
+            if photo_path in EMBEDDED.values():
+                check_shipped(head)
+            options["position_head"] = load_position_head(head, model.embed_dim, CHANNELS)
     return Backbone(model, full_name(label, model.depth), block, saliency_heads, image_size=image_size, **options)
 
 

@@ -73,18 +73,19 @@ class PhotoInformedViT(nn.Module):
 
     def inputs(
         self, images: Float[Tensor, "batch 3 height width"]
-    ) -> tuple[Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"]]:
-        """Return the transformer's images, and the features to add to its patch tokens."""
-        added = self.photo_input.projection(self.photo_network.features(images, BLOCK))
-        return normalize(F.avg_pool2d(images, DETAIL)), added
+    ) -> tuple[Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"], Float[Tensor, "batch n channels"]]:
+        """Return the transformer's images, what is added to its patch tokens, and the photo network's features."""
+        features = self.photo_network.features(images, BLOCK)
+        added = self.photo_input.projection(features)
+        return normalize(F.avg_pool2d(images, DETAIL)), added, features.flatten(2).transpose(1, 2)
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
-        """Compute what `VisionTransformer.extract` does.
+        """Compute what `VisionTransformer.extract` does, and the features of the photo network.
 
         Args:
             images: RGB images with values in [0, 1]; height and width are multiples of `multiple`.
             layer, facet: Block and activation that describe the patches.
         """
-        small, added = self.inputs(images)
-        tokens = self.vit.extract(small, layer, facet, added)
+        small, added, photo = self.inputs(images)
+        tokens = replace(self.vit.extract(small, layer, facet, added), photo=photo)
         return replace(tokens, keys=tokens.keys - self.photo_input.key_mean[layer]) if facet == "key" else tokens

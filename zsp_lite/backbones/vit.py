@@ -27,12 +27,14 @@ class Tokens:
         attention: Attention of the last block from CLS to the patches; softmax over all 1 + n tokens.
         cls: CLS output token after the final normalisation.
         grid: (rows, columns) of the patch grid; rows * columns = n.
+        photo: Features of a photo network (see `photo_informed`); None without one.
     """
 
     keys: Float[Tensor, "batch n dim"]
     attention: Float[Tensor, "batch heads n"]
     cls: Float[Tensor, "batch dim"]
     grid: tuple[int, int]
+    photo: Float[Tensor, "batch n channels"] | None = None
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,10 @@ def backbone_digest(backbone: Backbone) -> str:
         backbone.precision,
     )  # fmt: skip
     digest = hashlib.sha256(repr(chosen).encode())
-    for key, weight in sorted(backbone.model.state_dict().items()):
+    weights = backbone.model.state_dict()
+    if backbone.position_head is not None:
+        weights |= {f"positions.{key}": weight for key, weight in backbone.position_head.state_dict().items()}
+    for key, weight in sorted(weights.items()):
         digest.update(key.encode() + _bytes(weight))
     return digest.hexdigest()[:16]
 

@@ -64,10 +64,11 @@ def _verified_rows() -> dict[str, Method]:
         "nosilhouette": VerifiedSolver(weights.without("forward_silhouette", "reverse_silhouette")),
         "nofreespace": VerifiedSolver(weights.without("forward_free_space", "reverse_free_space")),
         "noview": VerifiedSolver(weights.without("viewpoint")),
+        "noorientation": VerifiedSolver(weights.without("orientation")),
         "simonly": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "similarity" not in name))),
         "forward": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "forward" not in name))),
         "nofeatures": VerifiedSolver(
-            weights.without("forward_similarity", "reverse_similarity", "viewpoint"), feature_weight=0.0
+            weights.without("forward_similarity", "reverse_similarity", "viewpoint", "orientation"), feature_weight=0.0
         ),
         "noicp": VerifiedSolver(icp=False),
         "norefinement": VerifiedSolver(refinement=False),

@@ -63,7 +63,7 @@ def export_photo_input(model: Trainee, renders: RenderSet, backbone: Path, path:
     network.photo_input.projection.load_state_dict(model.photo_projection.state_dict())
     parts = _export_images(renders, network.image_size).split(8)
     for part in parts:
-        x, _ = network.vit.embed(*network.inputs(part))
+        x, _ = network.vit.embed(*network.inputs(part)[:2])
         for mean, activations in zip(network.photo_input.key_mean, network.vit.run_blocks(x), strict=True):
             mean += activations.key[:, 1:].mean((0, 1)) / len(parts)
     weights = {name: value.half() for name, value in network.photo_input.state_dict().items()}

@@ -1,12 +1,14 @@
-r"""Calibrated confidence: the probability that a hypothesis's rotation is within 30 degrees of the truth.
+r"""Calibrated probabilities: how likely is the rotation of each hypothesis within 30 degrees of the truth?
 
-That of the best hypothesis is a logistic function of two numbers: the margin of its score over the best one with
-another rotation, and the standard deviation of the target views' feature similarity to the reference. If that is small,
-the features hardly distinguish the sides of the object. `hypothesis_probabilities` derives those of the other
-hypotheses from it, and `reliability` measures how well confidences are calibrated.
+The score S is a conditional logit (McFadden 1974), with one more alternative: that none of the poses is right. Of the
+different poses (see `modes`) of an estimate from N target views, pose k has the probability
 
-The coefficients were fitted with the backbone zsp-tiny-primitives on synthetic objects. They are not calibrated for
-other backbones.
+    p_k = \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
+    a = \exp(\alpha_0 + \alpha_1 \log N),   b = \beta_0 + \beta_1 \log N + \beta_2 s,
+
+where s is the standard deviation of the target views' feature similarity to the reference. If it is small, the features
+hardly distinguish the sides of the object. What the p_k leave of 1 is the probability of none of these. The
+confidence of an estimate is p_1. `reliability` measures how well such probabilities are calibrated.
 """
 
 from dataclasses import dataclass
@@ -18,60 +20,43 @@ from zsp_lite.errors import InputError
 
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
 MODE_ANGLE = 30.0
-# Hypotheses are tied if their scores differ by less than this many nats. On ellipsoids whose features have the same
-# symmetry, seen from all sides, the scores of equally correct poses differ by 0.6 nats in the median and by less than
-# 1 in three of four cases. Of training pairs with a margin below 1, the best hypothesis was correct in 62 %
-# (tools/tuning.py). Ties are not detected if the views show more of the object under one pose than under the other:
-# then scores of equally correct poses differ by several nats.
-TIE_MARGIN = 1.0
-# Margins are clipped at this many nats. It is also the margin of a hypothesis without a distinct rival.
-_MAX_MARGIN = 8.0
+# Another pose is nearly as probable as the best one above this fraction of its probability.
+TIE_RATIO = float(np.exp(-1))
 
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""Logistic calibration: confidence = 1 / (1 + \exp(-(bias + margin * x_1 + view_std * x_2))).
-
-    The defaults are for five target views, rounded from a fit on objects of training categories (-1.07, 0.97, 25.6).
-    Scores are in nats, so a coefficient of 1 for the margin means that the score itself is calibrated.
+    r"""The five coefficients, fitted on validation categories for N = 1 to 10 (`tools/tuning.py`).
 
     Attributes:
-        bias: Intercept.
-        margin: Coefficient of the score margin in nats, x_1 (see `score_margins`).
-        view_std: Coefficient of the standard deviation of view similarities, x_2 (see `Scene.view_similarity_std`).
+        scale: \alpha_0.
+        scale_views: \alpha_1.
+        none: \beta_0.
+        none_views: \beta_1.
+        none_std: \beta_2.
     """
 
-    bias: float = -1.0
-    margin: float = 1.0
-    view_std: float = 25.0
+    scale: float = -1.15
+    scale_views: float = 0.23
+    none: float = 0.83
+    none_views: float = -0.56
+    none_std: float = -58.0
 
-    def confidence(
-        self, margin: float | Float[np.ndarray, " m"], view_std: float | Float[np.ndarray, " m"]
-    ) -> float | Float[np.ndarray, " m"]:
-        """Return confidences in [0, 1] from score margins in nats and standard deviations of view similarities."""
-        return 1 / (1 + np.exp(-(self.bias + self.margin * margin + self.view_std * view_std)))
+    def probabilities(
+        self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
+        view_std: float | Float[np.ndarray, "*batch 1"],
+    ) -> Float[np.ndarray, "*batch m"]:  # fmt: skip
+        """Return the probabilities of different poses.
 
-
-# By number of target views. With fewer views poses are tested less, and a given margin means less: with one view
-# the most confident hypotheses are correct in two of five cases. For one and three views only the margin is used.
-CALIBRATIONS = {1: Calibration(-1.8, 0.2, 0.0), 3: Calibration(-0.7, 0.7, 0.0), 5: Calibration()}
-
-
-def calibration_for(n_views: int) -> Calibration:
-    """Return the calibration for a number of target views, interpolated between those in `CALIBRATIONS`."""
-    columns = ([getattr(one, name) for one in CALIBRATIONS.values()] for name in ("bias", "margin", "view_std"))
-    return Calibration(*(float(np.interp(n_views, list(CALIBRATIONS), column)) for column in columns))
-
-
-def score_margins(score: Float[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]) -> Float[np.ndarray, " m"]:
-    """Return each hypothesis's score minus the best score more than 30 degrees away, clipped to [-8, 8] nats.
-
-    Args:
-        score: Scores of the hypotheses, nats.
-        angle: Angles between their rotations, degrees.
-    """
-    rivals = np.where(angle > MODE_ANGLE, score, -np.inf)
-    return np.clip(score - rivals.max(axis=1), -_MAX_MARGIN, _MAX_MARGIN)
+        Args:
+            deficit: S_1 - S_k, nats; infinite for no pose.
+            n_views: Number N of target views.
+            view_std: Standard deviation s of view similarities (see `Scene.view_similarity_std`).
+        """
+        log_n = np.log(n_views)
+        odds = np.exp(-np.exp(self.scale + self.scale_views * log_n) * deficit)
+        none = np.exp(self.none + self.none_views * log_n + self.none_std * view_std)
+        return odds / (none + odds.sum(axis=-1, keepdims=True))
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
@@ -91,59 +76,53 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
     return np.array(found)
 
 
+def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
+    """Return the indices of the hypotheses that stand for themselves (see `modes`), best first."""
+    return np.flatnonzero(mode == np.arange(len(mode)))
+
+
 def hypothesis_probabilities(
-    score: Float[np.ndarray, " m"], angle: Float[np.ndarray, "m m"], calibration: Calibration, view_std: float
+    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], n_views: int, view_std: float, calibration: Calibration
 ) -> Float[np.ndarray, " m"]:
-    r"""Return the probability of each hypothesis; over different poses (see `modes`) they sum to at most 1.
-
-    The best hypothesis has its calibrated confidence c. The score is a conditional logit (McFadden 1974), so that pose
-    k, of score S_k, has the odds o_k against the best one, with the calibrated coefficient a of the margin. The odds
-    that none of the poses is right, o_0, are those of a best hypothesis without any rival, whose margin is 8 nats:
-
-        o_k = \exp(-a (S_1 - S_k)),   o_0 = (1 - c_8) / c_8,   c_8 = confidence(8, view_std)
-
-        p_1 = c,   p_k = o_k \min(c, (1 - c) / (o_0 + \sum_{j \geq 2} o_j))   for k \geq 2.
-
-    The second argument of the minimum divides what the best pose leaves among the others and "none of these" by their
-    odds; the first keeps a pose from being more probable, relative to the best, than their scores say. The rest,
-    1 - \sum_k p_k, is the probability of none of these. It has not been measured how well the p_k below the first are
-    calibrated.
+    """Return the probability of each hypothesis; over different poses they sum to at most 1.
 
     Args:
         score: Scores of the hypotheses in nats, best first.
-        angle: Angles between their rotations, degrees.
-        calibration: Calibration of the best one's confidence.
+        mode: The hypothesis that stands for each (see `modes`).
+        n_views: Number of target views.
         view_std: Standard deviation of view similarities.
+        calibration: Coefficients.
 
     Returns:
         Probabilities that the rotation error is below 30 degrees. A hypothesis has that of the one that stands for it.
     """
-    mode = modes(angle)
-    best = calibration.confidence(score_margins(score, angle), view_std)[0]
-    probability = np.full(len(score), best)
-    others = np.flatnonzero(mode == np.arange(len(mode)))[1:]
-    if len(others):
-        odds = np.exp(-calibration.margin * (score[0] - score[others]))
-        without_rival = calibration.confidence(_MAX_MARGIN, view_std)
-        none = (1 - without_rival) / without_rival
-        probability[others] = odds * min(best, (1 - best) / (none + odds.sum()))
+    different, probability = different_poses(mode), np.empty(len(score))
+    probability[different] = calibration.probabilities(score[0] - score[different], n_views, view_std)
     return probability[mode]
 
 
-def is_one_of_two(probability: Float[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]) -> bool:
-    """Tell whether the answer is one of two poses that are nearly equally probable and far apart.
+def nearly_as_probable(probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
+    """Return the indices of the best pose and of the others whose probability is above 1/e of its, best first."""
+    different = different_poses(mode)
+    return different[probability[different] > TIE_RATIO * probability[0]]
 
-    Three conditions: the probability of the second pose, and of no other, is above 1/e of the first's (one nat less,
-    see `TIE_MARGIN`); together they are more probable than not; and their rotations differ by more than 60 degrees, so
-    that no rotation is within 30 degrees of both.
+
+def is_one_of_two(
+    probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]
+) -> bool:
+    """Tell whether the answer is one of two poses that are nearly equally probable and far apart.
 
     Args:
         probability: Probabilities of the hypotheses, best first (see `hypothesis_probabilities`).
+        mode: The hypothesis that stands for each (see `modes`).
         angle: Angles between their rotations, degrees.
+
+    Returns:
+        Whether three conditions hold: the second pose, and no other, is nearly as probable as the first (see
+        `nearly_as_probable`); together they are more probable than not; and their rotations differ by more than 60
+        degrees, so that no rotation is within 30 degrees of both.
     """
-    mode = modes(angle)
-    distinct = np.flatnonzero(mode == np.arange(len(mode)))
-    likely = distinct[probability[distinct] > probability[0] * np.exp(-TIE_MARGIN)]
+    likely = nearly_as_probable(probability, mode)
     return bool(len(likely) == 2 and probability[likely].sum() > 0.5 and angle[likely[0], likely[1]] > 2 * MODE_ANGLE)
 
 

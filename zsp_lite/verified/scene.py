@@ -20,7 +20,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.maps import ViewMaps, build_maps
-from zsp_lite.verified.poses import Poses
+from zsp_lite.verified.poses import Poses, nearest_rotation
 from zsp_lite.views import View
 
 # Points farther from the median point than this many median distances are outliers: patches at a silhouette may have
@@ -51,6 +51,9 @@ class Scene:
         matches: Per target, the matched points of reference and target, working units.
         view_similarity: (v,) feature similarity of each target view to the reference less their mean (see
             `view_similarity`).
+        reference_axes: Rotation from the working frame of the reference to its object's axes, as predicted from the
+            reference view (see `object_axes`); None if the features have no positions.
+        target_axes: (v,) the same of each target view, from the working frame of the targets; None if one has none.
     """
 
     reference_points: Float[Tensor, "n 3"]
@@ -66,6 +69,8 @@ class Scene:
     target_cameras: tuple[Camera, ...]
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     view_similarity: Float[Tensor, " v"]
+    reference_axes: Float[Tensor, "3 3"] | None = None
+    target_axes: Float[Tensor, "v 3 3"] | None = None
 
     @property
     def view_similarity_std(self) -> float:
@@ -127,6 +132,11 @@ def build_scene(
     for target, cloud, match in zip(targets, clouds, matches):
         u, v = _matched_patches(reference, target, match)
         matched.append((_tensor(reference_to_working.apply(source[u])), _tensor(target_to_working.apply(cloud[v]))))
+    axes = [object_axes(view) for view in (reference, *targets)]
+    reference_axes = target_axes = None
+    if all(one is not None for one in axes):
+        reference_axes = axes[0]
+        target_axes = torch.stack([one @ _tensor(R) for one, (R, _) in zip(axes[1:], to_camera)])
     target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
     return Scene(
         reference_points=_tensor(reference_to_working.apply(source[source_valid])),
@@ -144,6 +154,8 @@ def build_scene(
         target_cameras=tuple(target.frame.camera for target in targets),
         matches=tuple(matched),
         view_similarity=view_similarities - view_similarities.mean(),
+        reference_axes=reference_axes,
+        target_axes=target_axes,
     )
 
 
@@ -171,6 +183,22 @@ def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
     if not similarity.numel():
         return similarity.new_tensor(-1.0)
     return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
+
+
+def object_axes(view: View) -> Float[Tensor, "3 3"] | None:
+    """Fit the axes of a view's object to the positions that its features predict (orthogonal Procrustes).
+
+    Returns:
+        Rotation from the camera's frame to the object's (front +x, left +y, up +z); None if the features have no
+        positions, or the view fewer than MIN_POINTS foreground patches of known depth.
+    """
+    known = view.known_foreground
+    if view.features.positions is None or known.sum() < MIN_POINTS:
+        return None
+    positions = view.features.positions.cpu()[torch.from_numpy(known)]
+    points = _tensor(view.patch_points[0][known])
+    points = points - points.mean(dim=0)
+    return nearest_rotation((positions.T @ points)[None])[0]
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:

@@ -7,19 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from zsp_lite.best_view import ViewPair
 from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, match_points, timed
 from zsp_lite.verified.confidence import (
-    MODE_ANGLE,
-    TIE_MARGIN,
     Calibration,
-    calibration_for,
     hypothesis_probabilities,
     is_one_of_two,
     modes,
+    nearly_as_probable,
 )
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
@@ -74,14 +71,14 @@ class VerifiedSolver:
 
     Attributes:
         weights: Weights of the score's terms.
-        calibration: Calibration of the confidences; None for the default one for the number of target views.
+        calibration: Coefficients of the probabilities.
         feature_weight: Weight of the feature similarity in the soft ICP; 0 aligns by shape alone.
         icp: Whether to run the soft ICP.
         refinement: Whether to run the refinement.
     """
 
     weights: ScoreWeights = ScoreWeights()
-    calibration: Calibration | None = None
+    calibration: Calibration = Calibration()
     feature_weight: float = FEATURE_WEIGHT
     icp: bool = True
     refinement: bool = True
@@ -147,8 +144,7 @@ class VerifiedSolver:
                 poses, terms = poses[best], terms[best]
                 hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)
         angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
-        one_of_two = is_one_of_two(np.array([one.confidence for one in hypotheses]), angle)
-        flags = reliability_flags(hypotheses, poses, one_of_two)
+        flags, one_of_two = reliability_flags(hypotheses, angle)
         return Solution(hypotheses, view_angles, flags, one_of_two, timings, scene, order, poses)
 
     def _hypotheses(
@@ -157,9 +153,8 @@ class VerifiedSolver:
         """Build the hypotheses of ranked poses, and return them with the view angles of the best one."""
         score = self.weights.score(terms).double().numpy()
         angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
-        calibration = self.calibration or calibration_for(len(order))
-        confidence = hypothesis_probabilities(score, angle, calibration, scene.view_similarity_std)
         mode = modes(angle)
+        confidence = hypothesis_probabilities(score, mode, len(order), scene.view_similarity_std, self.calibration)
         view_angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
         hypotheses = []
         for i, view in enumerate(view_angle.argmin(axis=1)):
@@ -172,48 +167,35 @@ class VerifiedSolver:
         return tuple(hypotheses), view_angles
 
 
-def tied_hypotheses(score: Float[Tensor, " m"], rotation: Float[Tensor, "m 3 3"]) -> list[int]:
-    """Select the best hypothesis and those tied with it: within `TIE_MARGIN` nats, more than 30 degrees apart.
-
-    Args:
-        score: Scores of the hypotheses, nats.
-        rotation: Rotations of the hypotheses.
-
-    Returns:
-        Indices, best score first.
-    """
-    distinct = non_maximum_suppression(rotation, score, MODE_ANGLE, len(score))
-    return [int(i) for i in distinct if score[distinct[0]] - score[i] < TIE_MARGIN]
-
-
-def reliability_flags(hypotheses: Sequence[Hypothesis], poses: Poses, one_of_two: bool = False) -> tuple[str, ...]:
-    """Say why the best hypothesis may be wrong, one line per reason.
+def reliability_flags(
+    hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
+) -> tuple[tuple[str, ...], bool]:
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses.
 
     Args:
         hypotheses: Hypotheses, best first.
-        poses: The same in working units.
-        one_of_two: Whether the answer is one of two poses.
+        angle: Angles between their rotations, degrees.
     """
     terms, flags = hypotheses[0].terms, []
-    tied = tied_hypotheses(torch.tensor([one.score for one in hypotheses]), poses.rotation)
+    probability = np.array([one.confidence for one in hypotheses])
+    mode = np.array([one.mode for one in hypotheses])
+    tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
+    shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
     if one_of_two:
-        second = next(i for i, one in enumerate(hypotheses) if i > 0 and one.mode == i)
-        angle = float(rotation_angles(poses.rotation[:1], poses.rotation[second : second + 1]))
         flags.append(
-            f"one of two: poses {angle:.0f} degrees apart explain the views about equally well (probabilities "
-            f"{hypotheses[0].confidence:.2f} and {hypotheses[second].confidence:.2f}): the object may be symmetric"
+            f"one of two: poses {angle[tied[0], tied[1]]:.0f} degrees apart explain the views about equally well "
+            f"(probabilities {shown}): the object may be symmetric"
         )
     elif len(tied) > 1:
-        scores = ", ".join(f"{hypotheses[i].score:.1f}" for i in tied)
         flags.append(
-            f"{len(tied)} poses more than 30 degrees apart explain the views equally well (scores {scores}): "
-            "the object may be symmetric"
+            f"{len(tied)} poses more than 30 degrees apart explain the views about equally well (probabilities "
+            f"{shown}): the object may be symmetric"
         )
     if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
         flags.append("no view confirms the pose: nearly no point lies on an observed surface")
     if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
         flags.append("no view confirms the pose: features of points that coincide are not similar")
-    return tuple(flags)
+    return tuple(flags), one_of_two
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:

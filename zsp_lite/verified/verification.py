@@ -1,9 +1,9 @@
-r"""The score of a pose: a weighted sum of nine terms that compare it with everything that the views show.
+r"""The score of a pose: a weighted sum of ten terms that compare it with everything that the views show.
 
     S(T) = \sum_k w_k \phi_k(T)
 
 Four terms project the n reference points into the V target views (`forward_*`), four project the target points into
-the reference view (`reverse_*`, then V = 1), and one compares views as a whole.
+the reference view (`reverse_*`, then V = 1), and two compare views as a whole.
 
 Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth d of weight m (the
 soft mask, 0 where the depth is unknown), at distance r from the silhouette. With \delta = z - d (positive behind the
@@ -31,6 +31,15 @@ and the ninth, with l_v the feature similarity of target view v to the reference
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
+The tenth needs a backbone that predicts where on its object each patch lies (`backbones.positions`). From these
+positions and the measured points, every view gives the axes of its object by itself (`scene.object_axes`): the rotation
+A_0 from the reference's frame and A_v from the targets', both to the axes of their object. With R the rotation of T and
+\psi_v the angle between A_0 and A_v R,
+
+    orientation = (1/V) \sum_v \exp(-(\psi_v / 50 degrees)^2),
+
+and 0 without such a backbone. Axes that are wrong in the same way in both objects do not matter.
+
 The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
 probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
 """
@@ -49,6 +58,7 @@ from zsp_lite.verified.scene import Scene
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
+ORIENTATION_SIGMA = 50.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
 # Projected points at a time, so that intermediate results stay in the processor's cache.
 _CHUNK = 250_000
@@ -67,6 +77,7 @@ class ScoreTerms:
     reverse_silhouette: Float[Tensor, " m"]
     reverse_free_space: Float[Tensor, " m"]
     viewpoint: Float[Tensor, " m"]
+    orientation: Float[Tensor, " m"]
 
     def __getitem__(self, index) -> "ScoreTerms":
         """Select the terms of some poses by an index array, slice or mask."""
@@ -97,6 +108,7 @@ class ScoreWeights:
     reverse_silhouette: float = -10.0
     reverse_free_space: float = -30.0
     viewpoint: float = 20.0
+    orientation: float = 6.5
 
     def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
@@ -168,7 +180,9 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         some = poses[first : first + size]
         forward, reverse = forward_terms(scene, some, rows), reverse_terms(scene, some, indices)
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
-    return ScoreTerms(*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses))
+    return ScoreTerms(
+        *(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses), orientation_term(scene, poses)
+    )
 
 
 def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
@@ -179,6 +193,15 @@ def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
     """
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
     return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
+
+
+def orientation_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
+    """Compute the orientation term: high if the object axes that the views predict agree under the pose."""
+    if scene.reference_axes is None or scene.target_axes is None:
+        return torch.zeros(len(poses))
+    moved = scene.target_axes[:, None] @ poses.rotation  # (v, m, 3, 3), from the reference to the object's axes
+    angle = rotation_angles(moved.flatten(0, 1), scene.reference_axes[None]).view(moved.shape[:2])
+    return torch.exp(-((angle / ORIENTATION_SIGMA) ** 2)).mean(dim=0)
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
