@@ -168,5 +168,5 @@ def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, 
     assert cli.main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert text.index("Photographed motorcycle") < text.index("One pair per category")
-    assert text.count("verified") == 2 and "own saliency" in text and cli.MODELS_NOTE in " ".join(text.split())
+    assert text.count("│ verified ") == 2 and "own saliency" in text and cli.MODELS_NOTE in " ".join(text.split())
     assert "Which way does a real motorcycle stand?" in (tmp_path / "report.html").read_text()
