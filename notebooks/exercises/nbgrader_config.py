@@ -40,7 +40,11 @@ class FeedbackPage(HTMLExporter):
             names[cell.metadata.get("nbgrader", {}).get("grade_id")] = name
 
         def with_name(link):
-            name = escape(names[link["cell"]])
+            name = escape(names.get(link["cell"], ""))
+            if (
+                not name
+            ):  # a student's own link, or a task whose heading has another form
+                return link[0]
             return link["start"] + (f"{name}: comment" if link["comment"] else name)
 
         link = r'(?P<start><a href="#(?P<comment>comment-)?(?P<cell>\w+)">)'
