@@ -8,11 +8,12 @@ import sys
 import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from urllib.parse import unquote, urlsplit
 
 import nbformat
 import pytest
+from docutils.parsers.rst import DirectiveError
 
 import zsp_lite
 
@@ -144,6 +145,31 @@ def test_pictures_below_a_heading_end_with_its_section(slides):
     notebook = nbformat.v4.new_notebook(cells=cells)
     for heading, names in {"One": "abc", "Part": "bc", "2 · T": "d", "3 ·": ""}.items():
         assert slides.pictures_below(notebook, heading) == [("image/png", name, name) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["../notebooks/02_cyclical_maps.ipynb"], r"02_cyclical_maps.ipynb has no option :heading:, which it needs"),
+        (["../notebooks/overview.jpg"], r"overview.jpg has no option :alt:, which it needs"),
+        (["../README.md", ":alt: A page."], r"README.md is none of .ipynb, .svg, .png, .jpg"),
+        (
+            ["../notebooks/02_cyclical_maps.ipynb", ":heading: none such"],
+            r"has 0 pictures below the heading 'none such'",
+        ),
+    ],
+)
+def test_a_picture_without_what_it_needs_is_refused_in_one_line(slides, lines, message):
+    environment = SimpleNamespace(
+        docname="docs/page", doc2path=lambda name: REPOSITORY / f"{name}.md", note_dependency=lambda name: None
+    )
+    state = SimpleNamespace(document=SimpleNamespace(settings=SimpleNamespace(env=environment)))
+    path, *options = lines
+    options = dict(option[1:].split(": ", 1) for option in options)
+    picture = slides.Picture("picture", [path], options, [], 1, 0, "", state, SimpleNamespace(reporter=None))
+    with pytest.raises(DirectiveError) as raised:
+        picture.run()
+    assert re.search(message, raised.value.msg)
 
 
 @pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)

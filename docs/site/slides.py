@@ -8,7 +8,7 @@ one. The directive `picture` embeds a picture that a notebook shows, so that the
     ```
 
 is the first picture below the heading that contains these words. `:number: 2` is the second one. The path may also be
-that of a picture file (`:alt:` describes it).
+that of a picture file (`:alt:` describes it). With `:beside:` the text of the slide stands to the right of the picture.
 """
 
 import base64
@@ -31,13 +31,23 @@ class Picture(SphinxDirective):
     """Embed a picture file or a picture of a notebook's stored outputs, with its alternative text."""
 
     required_arguments = 1
-    option_spec = {"heading": directives.unchanged, "number": directives.positive_int, "alt": directives.unchanged}
+    option_spec = {
+        "heading": directives.unchanged,
+        "number": directives.positive_int,
+        "alt": directives.unchanged,
+        "beside": directives.flag,
+    }
 
     def run(self) -> list[nodes.Node]:
         path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
         if not path.is_file():
             raise self.error(f"no file {self.arguments[0]}")
         self.env.note_dependency(str(path))
+        needed = "heading" if path.suffix == ".ipynb" else "alt"
+        if needed not in self.options:
+            raise self.error(f"picture {self.arguments[0]} has no option :{needed}:, which it needs")
+        if path.suffix not in {".ipynb", *FORMATS}:
+            raise self.error(f"picture {self.arguments[0]} is none of .ipynb, {', '.join(FORMATS)}")
         if path.suffix == ".ipynb":
             notebook = nbformat.read(path, as_version=4)
             found = pictures_below(notebook, self.options["heading"])
@@ -51,7 +61,8 @@ class Picture(SphinxDirective):
         else:
             form, alt = FORMATS[path.suffix], self.options["alt"]
             data = base64.b64encode(path.read_bytes()).decode()
-        image = f'<img class="picture" src="data:{form};base64,{data}" alt="{escape(alt)}">'
+        kind = "picture beside" if "beside" in self.options else "picture"
+        image = f'<img class="{kind}" src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
 
 
