@@ -254,7 +254,7 @@ def scores_by_layer(scores: pd.DataFrame, used: int, guessing: float) -> Figure:
     axis.axhline(100 * guessing, color="0.4", linestyle=":", label="guessing")
     axis.axvline(used, color="0.6", linestyle="--", linewidth=1)
     axis.set(xlabel="layer", ylabel="nearest neighbour within one patch (%)", xticks=scores.index, ylim=(0, None))
-    axis.legend(ncols=5, loc="lower right", fontsize=9)
+    figure.legend(ncols=5, loc="outside upper center", fontsize=9)
     return figure
 
 
