@@ -20,13 +20,13 @@ def widget():
     plt.close("all")
 
 
-def test_the_caption_has_score_and_confidence_of_each_rank(widget):
+def test_the_caption_has_score_and_probability_of_each_rank(widget):
     solution, _ = sample_solution()
     assert widget.controls["rank"].max == len(solution.hypotheses)
     for rank, one in enumerate(solution.hypotheses, 1):
         widget.controls["rank"].value = rank
         assert f"Hypothesis {rank} of {len(solution.hypotheses)}" in widget.caption.value
-        assert f"score {one.score:.1f}, confidence {one.confidence:.0%}" in widget.caption.value
+        assert f"score {one.score:.1f}, probability {one.confidence:.0%}" in widget.caption.value
     widget.controls["rank"].value = 1
     assert "the best" in widget.caption.value and "below the best" not in widget.caption.value.split("Points")[0]
 

@@ -99,7 +99,7 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Sc
         points = ", ".join(f"{count} {name}" for count, name in zip(counts, POINT_CLASSES))
         return (
             f"Hypothesis {rank} of {len(found)}: {difference if index else 'the best'}; score {one.score:.1f}, "
-            f"confidence {one.confidence:.0%}. Points in target view {used[view - 1] + 1}: {points}."
+            f"probability {one.confidence:.0%}. Points in target view {used[view - 1] + 1}: {points}."
         )
 
     controls = {
