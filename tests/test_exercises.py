@@ -390,6 +390,7 @@ def test_nbgrader_generates_grades_and_returns_an_assignment(tmp_path, config, m
     first, second, *_ = MISTAKES[assignment]
     answers[first].source = solutions[first].source
     answers[second].source = with_mistake(solutions[second].source, next(iter(MISTAKES[assignment][second].values())))
+    answers["better"].source = "See my remark: [Comment](#mine)"
     folder = tmp_path / "submitted" / "student" / assignment
     folder.mkdir(parents=True)
     nbformat.write(handed_in, folder / f"{assignment}.ipynb")
@@ -410,7 +411,8 @@ def test_nbgrader_generates_grades_and_returns_an_assignment(tmp_path, config, m
     page = (tmp_path / "feedback" / "student" / assignment / f"{assignment}.html").read_text(encoding="utf-8")
     scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
     titles = [title.removeprefix("## ").partition(" (")[0] for title in tasks(source(assignment))]
-    assert [name for name, _, _ in scores] == titles and "Test cell" not in page and ">Comment</a>" not in page
+    assert [name for name, _, _ in scores] == titles and "Test cell" not in page
+    assert re.findall(r'href="([^"]*)">Comment</a>', page) == ["#mine"]  # the student's own link, and no other
     assert scores[0] == (titles[0], "4.0", "4.0") and "HIDDEN TESTS" in page
 
 
