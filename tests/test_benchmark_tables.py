@@ -485,6 +485,9 @@ def test_the_second_errors_survive_the_export_and_are_checked(tmp_path):
     results.rows["verified"][key]["second_error"] = 200.0
     with pytest.raises(InputError, match="second_error of verified on chair.* is 200.0, expected 0 to 180"):
         read_results(export_results(results, tmp_path / "wrong.json.gz"))
+    results.rows["verified"][key] |= {"second_error": 20.0, "one_of_two": "yes"}
+    with pytest.raises(InputError, match="one_of_two of verified on chair.* is 'yes', expected true or false"):
+        read_results(export_results(results, tmp_path / "wrong.json.gz"))
 
 
 def test_a_run_without_alternatives_has_no_such_table(run):

@@ -127,7 +127,7 @@ def _row(name: str, columns: Mapping[str, list], keys: Sequence[str], path: Path
 
 
 def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], where: str) -> None:
-    """Raise InputError if an error is not an angle from 0 to 180 degrees, or a confidence not from 0 to 1."""
+    """Raise InputError if an error is not an angle from 0 to 180 degrees, or another value is out of range."""
     for name, row in rows.items():
         for key, found in row.items():
             if not _KEY.fullmatch(key):
@@ -138,6 +138,8 @@ def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], where: str)
                 value = found.get(part, None if part == "error" else 0.0)
                 if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:
                     raise InputError(f"results {where}: {part} of {name} on {key} is {value!r}, expected 0 to {most:g}")
+            if not isinstance(flag := found.get("one_of_two", False), bool):
+                raise InputError(f"results {where}: one_of_two of {name} on {key} is {flag!r}, expected true or false")
 
 
 def _check_summary(summary: "_Summary", rows: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> None:
