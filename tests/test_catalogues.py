@@ -1,6 +1,7 @@
 """The catalogues of models and backgrounds are complete and consistent, and their builders check what they read."""
 
 import hashlib
+import json
 import zipfile
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import pytest
 from model_files import write_quad
 from PIL import Image
 
-from tools import backgrounds, credits
+from tools import backgrounds, credits, same_shape
 from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
+from tools.same_shape import CATALOGUE, copy_same_shape
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.models import list_models
@@ -112,6 +114,33 @@ def test_no_file_is_in_two_catalogues():
 
 def test_no_category_of_the_catalogue_is_trained_on_or_used_for_model_selection():
     assert not set(read_catalogue(ARTISTS).models) & {*TRAINING, *VALIDATION}
+
+
+def test_models_of_one_shape_are_of_the_catalogue_of_their_side(tmp_path):
+    listed = json.loads(CATALOGUE.read_text())
+    assert listed.keys() == {"training", "validation"}
+    for side, path in (("training", TRAINED), ("validation", CHOSEN_BY)):
+        models = read_catalogue(path).models
+        known = {f"{category}/{name}" for category, entries in models.items() for name in entries}
+        names = [name for some in listed[side].values() for name in some]
+        assert len(set(names)) == len(names) and set(names) <= known
+    with pytest.raises(InputError, match="side is 'evaluation', expected one of training, validation"):
+        copy_same_shape("evaluation", tmp_path, tmp_path / "out")
+    with pytest.raises(InputError, match="no model .*, expected the folder that tools/models.py made of training.json"):
+        copy_same_shape("training", tmp_path / "absent", tmp_path / "out")
+
+
+def test_models_of_one_shape_are_copied_under_their_class(tmp_path, monkeypatch):
+    (tmp_path / "list.json").write_text('{"training": {"stool": ["chair_kind/oak"]}}')
+    monkeypatch.setattr(same_shape, "CATALOGUE", tmp_path / "list.json")
+    models = tmp_path / "models"
+    for name in ("oak", "elm"):
+        (models / "chair_kind" / name).mkdir(parents=True)
+        (models / "chair_kind" / name / f"{name}.obj").write_text("v 0 0 0")
+    (models / "models.json").write_text('{"chair_kind/oak": {"front": "+x"}, "chair_kind/elm": {}}')
+    copy_same_shape("training", models, tmp_path / "out")
+    (model,) = list_models(tmp_path / "out")
+    assert (model.category, model.name, model.info.front) == ("stool", "oak", "+x")
 
 
 def test_an_ac3d_model_keeps_its_placement_texture_and_opacity(aircraft, tmp_path):

@@ -1,7 +1,7 @@
 """Copy the models whose poses can be compared: those of one shape, with the same side in front (`same_shape.json`).
 
-    python tools/same_shape.py training outputs/training_models outputs/training_poses_models
-    python tools/same_shape.py validation outputs/validation_models outputs/validation_poses_models
+    python tools/same_shape.py training outputs/training_models outputs/training_shapes
+    python tools/same_shape.py validation outputs/validation_models outputs/validation_shapes
 
 The catalogues `training.json` and `validation.json` group models by what they are. A ceiling fan and a table fan, or a
 desk and a lectern, have no pose in common that a picture could show. The models of this list were chosen from pictures
@@ -13,19 +13,43 @@ import shutil
 import sys
 from pathlib import Path
 
-from zsp_lite.synthetic.models import MODELS_FILE
+import msgspec
+
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import write_atomic
+from zsp_lite.synthetic.models import MODELS_FILE, read_infos
+
+CATALOGUE = Path(__file__).with_suffix(".json")
 
 
-def main(side: str, models: str, out: str) -> None:
-    """Copy the models of a side from the folder `models` to `out`."""
-    infos, kept = json.loads((Path(models) / MODELS_FILE).read_text()), {}
-    for category, names in json.loads(Path(__file__).with_suffix(".json").read_text())[side].items():
-        for name in names:
+def copy_same_shape(side: str, models: Path, out: Path) -> None:
+    """Copy the models of a side, "training" or "validation", from the folder `models` to `out`.
+
+    Raises:
+        InputError: There is no such side, or `models` lacks a model of the list.
+    """
+    catalogue = json.loads(CATALOGUE.read_text())
+    if side not in catalogue:
+        raise InputError(f"side is {side!r}, expected one of {', '.join(catalogue)}")
+    names = [name for listed in catalogue[side].values() for name in listed]
+    infos = read_infos(models)
+    if missing := [name for name in names if name not in infos or not (models / name).is_dir()]:
+        raise InputError(
+            f"{models}: no model {missing[0]}, expected the folder that tools/models.py made of {side}.json"
+        )
+    kept = {}
+    for category, listed in catalogue[side].items():
+        for name in listed:
             copy = f"{category}/{Path(name).name}"
-            shutil.copytree(Path(models) / name, Path(out) / copy, dirs_exist_ok=True)
+            shutil.copytree(models / name, out / copy, dirs_exist_ok=True)
             kept[copy] = infos[name]
-    (Path(out) / MODELS_FILE).write_text(json.dumps(kept, indent=1))
+    write_atomic(out / MODELS_FILE, msgspec.json.format(msgspec.json.encode(kept), indent=1))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
+    try:
+        copy_same_shape(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
+    except InputError as error:
+        sys.exit(str(error))

@@ -159,12 +159,13 @@ def turn_view(view: View, quarters: int) -> View:
         view: The view.
         quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
     """
-    keys, saliency, foreground = (
-        torch.rot90(values, quarters, (0, 1))
-        for values in (view.features.keys, view.features.saliency, view.foreground)
+    features = view.features
+    keys, saliency, positions, foreground = (
+        None if values is None else torch.rot90(values, quarters, (0, 1))
+        for values in (features.keys, features.saliency, features.positions, view.foreground)
     )
     mask = None if view.object_mask is None else np.ascontiguousarray(np.rot90(view.object_mask, quarters))
-    features = FeatureMap(keys, saliency, view.features.global_feature)
+    features = FeatureMap(keys, saliency, features.global_feature, positions)
     return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 
