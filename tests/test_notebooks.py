@@ -121,6 +121,7 @@ def test_headings_have_one_form(path):
     numbers = [int(number) for number in re.findall(r"^(\d+) · \S", "\n".join(sections), re.MULTILINE)]
     assert numbers == list(range(1, len(numbers) + 1))
     levels = [len(marks) for marks, _ in headings]
+    assert levels.count(1) == 1
     assert all(after <= before + 1 for before, after in zip(levels, levels[1:], strict=False))
     numbered = {level for level, text in zip(levels[1:], sections, strict=True) if re.match(r"\d+ · ", text)}
     assert numbered <= {2}
