@@ -165,10 +165,12 @@ def test_overlays_show_the_wanted_sides_in_their_colours():
 def test_landing_points_outside_the_picture_are_counted_and_not_drawn():
     picture = np.zeros((60, 80, 3), np.uint8)
     pixels = np.array([[10.0, 10], [20, 20]])
-    cases = {"right": pixels, "wrong": np.array([[10.0, 10], [200, 20]])}
+    cases = {"right": pixels, "wrong": np.array([[10.0, 10], [200, 20]]), "far": pixels + 100}
     figure, inside = result_plots.landing_points(picture, picture, pixels, cases)
-    assert inside == {"right": 1.0, "wrong": 0.5}
-    assert [len(axis.collections[0].get_offsets()) for axis in figure.axes[:3]] == [2, 2, 1]
+    assert inside == {"right": 1.0, "wrong": 0.5, "far": 0.0}
+    assert [len(axis.collections[0].get_offsets()) for axis in figure.axes[:4]] == [2, 2, 1, 0]
+    notes = [[text.get_text() for text in axis.texts] for axis in figure.axes[:4]]
+    assert notes == [[], [], [], ["no point in this picture"]]
 
 
 def test_fused_clouds_have_y_downwards():

@@ -370,6 +370,9 @@ def landing_points(
     shown = [np.ones(len(pixels), bool), *inside.values()]
     for axis, at, here in zip(axes, [pixels, *cases.values()], shown):
         axis.scatter(*at[here].T, c=colours[here], s=16, edgecolors="black", linewidths=0.4)
+        if not here.any():
+            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+            axis.text(0.5, 0.06, "no point in this picture", transform=axis.transAxes, ha="center", bbox=box)
     return figure, {name: float(here.mean()) for name, here in inside.items()}
 
 
