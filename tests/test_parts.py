@@ -7,6 +7,7 @@ from synthetic_views import CoordinateBackbone
 
 from tools import parts
 from tools.parts import WHOLE, differences, format_table, measure, read_errors, rows
+from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.errors import InputError
 from zsp_lite.verified.verification import ScoreWeights
 
@@ -37,6 +38,11 @@ def test_rows_are_compared_on_the_same_pairs():
     whole_line, line = format_table(table).splitlines()[2:]
     assert whole_line == "| whole | 66.7 | | | | |"
     assert line.startswith("| soft ICP | 50.0 | −16.7 [") and line.endswith("| 1 | 2 | 1.000 |")
+
+
+def test_the_table_of_the_documentation_is_that_of_the_stored_runs():
+    files = sorted((REPOSITORY / "notebooks" / "results" / "verified_parts").glob("*.json.gz"))
+    assert format_table(differences(read_errors(files))) in (REPOSITORY / "docs" / "solvers.md").read_text()
 
 
 @pytest.mark.slow

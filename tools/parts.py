@@ -24,6 +24,7 @@ from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.results import export_results, read_results
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.benchmark.summary import category_of, objects_of
+from zsp_lite.benchmark.tables import PValue
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, object_weights, paired_test
 from zsp_lite.verified import VerifiedSolver
@@ -118,7 +119,7 @@ def format_table(table: Mapping[str, Mapping[str, float]]) -> str:
     lines = ["| without | Acc30 (%) | change (points) | pairs won | lost | p |", "|---|---:|---:|---:|---:|---:|"]
     for name, row in table.items():
         change = f"{row['change']:+.1f} [{row['low']:+.1f}, {row['high']:+.1f}]".replace("-", "−")
-        compared = f"{change} | {row['won']} | {row['lost']} | {row['p']:.3f}"
+        compared = f"{change} | {row['won']} | {row['lost']} | {PValue(row['p'])}"
         lines.append(f"| {name} | {row['Acc30']:.1f} | {'| | |' if name == WHOLE else compared} |")
     return "\n".join(lines)
 
