@@ -427,9 +427,11 @@ def test_frames_are_cropped_at_the_size_that_the_backbone_takes():
 
 def test_the_points_behind_a_frames_patches_are_computed_once():
     frames = FrameStore(Co3D(small_folder()), "lump", {"backbone": BACKBONE, "other": BACKBONE})
-    points = frames.view("backbone", ("100_a", 0), "saliency", 0.05).patch_points
+    first = frames.view("backbone", ("100_a", 0), "saliency", 0.05)
+    points, measured = first.patch_points, first.measured_points
     for features, foreground in (("backbone", "mask"), ("other", "mask")):
-        assert frames.view(features, ("100_a", 0), foreground, 0.05).patch_points is points
+        view = frames.view(features, ("100_a", 0), foreground, 0.05)
+        assert view.patch_points is points and view.measured_points is measured
     assert frames.view("other", ("100_a", 1), "mask", 0.05).patch_points is not points
 
 

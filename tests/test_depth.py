@@ -116,6 +116,8 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     assert not known[1, 2] and known.sum() == 15
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
     np.testing.assert_allclose(points[1, 2], centre)
+    measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
+    assert (same == known).all() and (measured[known] == points[known]).all() and (measured[1, 2] == 0).all()
 
 
 def test_at_a_silhouette_the_nearer_surface_wins():
@@ -139,3 +141,5 @@ def test_inconsistent_sizes_are_refused():
         patch_points(np.ones((4, 4)), frontal((4, 4)), (5, 2))
     with pytest.raises(InputError, match="no known pixel"):
         patch_points(np.zeros((4, 4)), frontal((4, 4)), (2, 2))
+    with pytest.raises(InputError, match="no known pixel"):
+        patch_points(np.zeros((4, 4)), frontal((4, 4)), (2, 2), inpaint=False)

@@ -61,18 +61,26 @@ class View:
         Raises:
             InputError: The frame has no known depth.
         """
+        return self._patch_points(inpaint=True)
+
+    @cached_property
+    def measured_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+        """`patch_points` without in-painting: the point of a patch without measured depth is the origin."""
+        return self._patch_points(inpaint=False)
+
+    def _patch_points(self, inpaint: bool) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
         name = self.frame.name or "frame"
         if self.frame.depth is None:
             raise InputError(f"{name}: no depth map, expected one to unproject matches")
         try:
-            return patch_points(self.frame.depth, self.frame.camera, self.features.grid)
+            return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint)
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
         """Foreground patches with measured depth."""
-        return np.asarray(self.foreground.cpu()) & self.patch_points[1]
+        return np.asarray(self.foreground.cpu()) & self.measured_points[1]
 
 
 @checked

@@ -91,8 +91,11 @@ class FrameStore:
         view = views[name]
         # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
         for other in views.values():
-            if "patch_points" in vars(other) and other.features.grid == view.features.grid:
-                vars(view).setdefault("patch_points", other.patch_points)
+            if other.features.grid == view.features.grid:
+                points = {
+                    part: vars(other)[part] for part in ("patch_points", "measured_points") if part in vars(other)
+                }
+                vars(view).update(points)
         return view
 
     def similarity(

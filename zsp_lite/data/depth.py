@@ -95,7 +95,7 @@ def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.
 
 @checked
 def patch_points(
-    depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int]
+    depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int], inpaint: bool = True
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
     """Compute one point per patch in camera coordinates.
 
@@ -108,6 +108,8 @@ def patch_points(
         depth: (H, W) depth, 0 where unknown.
         camera: Camera of the depth map.
         grid: Rows and columns of patches.
+        inpaint: Whether to in-paint, which takes most of the time. If not, the point of a patch without known depth is
+            the origin.
 
     Returns:
         Points (rows, columns, 3), and (rows, columns) whether the patch has a known depth.
@@ -140,9 +142,12 @@ def patch_points(
         np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
         row_middle[:, None] * depth.shape[1] + col_middle,
     )
-    filled = depth if known.all() else inpaint_depth(depth)
+    if not known.any():
+        raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
+    filled = inpaint_depth(depth) if inpaint and not known.all() else depth
     y, x = np.divmod(index, depth.shape[1])
-    return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), filled.ravel()[index]), known
+    depths = filled.ravel()[index] if inpaint else np.where(known, filled.ravel()[index], 0)
+    return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), depths), known
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

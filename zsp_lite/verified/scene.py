@@ -196,7 +196,7 @@ def object_axes(view: View) -> Float[Tensor, "3 3"] | None:
     if view.features.positions is None or known.sum() < MIN_POINTS:
         return None
     positions = view.features.positions.cpu()[torch.from_numpy(known)]
-    points = _tensor(view.patch_points[0][known])
+    points = _tensor(view.measured_points[0][known])
     points = points - points.mean(dim=0)
     return nearest_rotation((positions.T @ points)[None])[0]
 
@@ -221,7 +221,7 @@ def _relative_pose(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 
 
 def _patch_cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.ndarray, " patches"]]:
     """Return the camera-frame points of all patches, and which of them are foreground of known depth."""
-    return view.patch_points[0].reshape(-1, 3), view.known_foreground.ravel()
+    return view.measured_points[0].reshape(-1, 3), view.known_foreground.ravel()
 
 
 def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:
@@ -235,7 +235,7 @@ def _matched_patches(
     """Return the flat indices of the matched patches of both views, for the matches with known depth on both sides."""
     u = np.ravel_multi_index(tuple(matches.reference.T), reference.features.grid)
     v = np.ravel_multi_index(tuple(matches.target.T), target.features.grid)
-    known = reference.patch_points[1].ravel()[u] & target.patch_points[1].ravel()[v]
+    known = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
     return u[known], v[known]
 
 
