@@ -196,7 +196,10 @@ def slider_moves_picture(output, patience: float = 90) -> bool:
 
 
 def label_by_clicks(page) -> None:
-    """Label a sequence as a person does: four keypoints on the reference, one taken back, four on the next, accept."""
+    """Label a sequence as a person does: four keypoints on the reference, one taken back, four on the next, accept.
+
+    The outermost points of two objects seldom correspond, so the widget may ask to press accept again.
+    """
     box = page.locator(".zsp-label")
     _pick_outermost(page, "reference")
     box.locator("button.zsp-undo").click()
@@ -204,8 +207,13 @@ def label_by_clicks(page) -> None:
     _pick_outermost(page, "reference", first=3)
     box.locator("button.zsp-next").click()
     _pick_outermost(page, "sequence")
-    box.locator("button.zsp-accept:enabled").click()
-    box.locator(".zsp-progress td", has_text="accepted").wait_for()
+    accept = box.locator("button.zsp-accept:enabled")
+    accepted, asked = box.locator(".zsp-progress td", has_text="accepted"), box.get_by_text("press accept again")
+    accept.click()
+    accepted.or_(asked).first.wait_for()
+    if asked.first.is_visible():
+        accept.click()
+    accepted.first.wait_for()
 
 
 def _pick_outermost(page, cloud: str, first: int = 0) -> None:
