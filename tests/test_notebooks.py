@@ -43,9 +43,8 @@ def test_cells_of_code_are_short(path):
     """Blank lines do not count."""
     cells = code_of(path)
     assert len(code_lines(cells[0])) <= 6, "the first cell of code is longer than 6 lines"
-    most = {"09_train_a_backbone": 16}.get(path.stem, 15)  # a whole vision transformer in one cell
     for cell in cells:
-        assert len(code_lines(cell)) <= most, f"a cell is longer than {most} lines:\n{cell.source}"
+        assert len(code_lines(cell)) <= 15, f"a cell is longer than 15 lines:\n{cell.source}"
         assert max(map(len, code_lines(cell))) <= 88, f"a line is longer than 88 characters:\n{cell.source}"
 
 
