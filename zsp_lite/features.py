@@ -130,7 +130,8 @@ def finite_tensor(name: str, values: ArrayLike | Tensor) -> Tensor:
     if not isinstance(values, Tensor):
         real_array(name, values)  # a check; the type is kept
     tensor = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
-    if tensor.is_complex() or not tensor.isfinite().all():
+    # The extremes are not finite if a value is not; to find them is faster than to look at each value.
+    if tensor.is_complex() or (tensor.numel() and not torch.stack(torch.aminmax(tensor)).isfinite().all()):
         raise InputError(f"{name} holds values that are no finite real numbers")
     return tensor
 

@@ -12,6 +12,7 @@ P S: a dozen additions of S to itself.
 
 import warnings
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -89,9 +90,9 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
                 f"similarity: ref has {keys1.shape[-1]} channels, target {index} has {keys2.shape[-1]}, "
                 f"expected equal numbers"
             )
-        product = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
-        summed = _bin_products(product.view(*keys1.shape[:2], *keys2.shape[:2]))
-        cosine = summed.view(product.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
+        products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
+        summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
+        cosine = summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
         results.append(cosine)
     return results
 
@@ -151,15 +152,7 @@ def cyclical_distances(
         _mask(mask, grid, f"cyclical_distances: {name}", sim.device)
         for mask, grid, name in ((fg1, grid1, "fg1"), (fg2, grid2, "fg2"))
     )
-    forth, back = nearest_neighbours(sim)
-    u = torch.arange(n1, device=sim.device)
-    returned = back[forth]
-    row, column = returned // grid1[1], returned % grid1[1]
-    offset = torch.stack([u // grid1[1] - row, u % grid1[1] - column])
-    valid_return = (row > 0) & (column > 0) if published else on1[returned]
-    valid = on1 & on2[forth] & valid_return
-    distance = -offset.to(torch.float32).square().sum(0).sqrt()
-    return distance.masked_fill(~valid, -torch.inf).view(grid1)
+    return _cycles(sim, grid1, on1, on2, published)[0].view(grid1)
 
 
 @checked
@@ -225,13 +218,13 @@ def match(
     else:
         start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
     if matcher == "cyclical":
+        sim = finite_tensor("match: sim", sim)
         published = cycle_from == "target"
-        score = cyclical_distances(sim, start.grid, end.grid, on_start, on_end, published).flatten()
-        best, neighbour = sim.max(dim=1)
+        score, neighbour = _cycles(sim, start.grid, on_start.flatten(), on_end.flatten(), published)
     else:
         rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
         neighbour, score = rank(sim, on_start.flatten(), on_end.flatten())
-        best = sim.gather(1, neighbour[:, None])[:, 0]
+    best = sim.gather(1, neighbour[:, None])[:, 0]
 
     # The rest works on a few hundred numbers, in NumPy.
     score, best, neighbour = (x.cpu().numpy() for x in (score, best, neighbour))
@@ -244,6 +237,27 @@ def match(
     v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
     reference, matched = (u, v) if cycle_from == "reference" else (v, u)
     return Matches(reference, matched, best[order], -score[order])
+
+
+def _cycles(
+    sim: Float[Tensor, "n1 n2"], grid1: Grid, on1: Bool[Tensor, " n1"], on2: Bool[Tensor, " n2"], published: bool
+) -> tuple[Float[Tensor, " n1"], Int[Tensor, " n1"]]:
+    """Compute the scores of `cyclical_distances`, and each foreground patch's nearest neighbour; 0 for the others.
+
+    Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
+    """
+    u = on1.nonzero()[:, 0]
+    forth = sim[u].argmax(dim=1)
+    reached, position = forth.unique(return_inverse=True)
+    back = sim[:, reached].argmax(dim=0)[position]
+    row, column = back // grid1[1], back % grid1[1]
+    offset = torch.stack([u // grid1[1] - row, u % grid1[1] - column])
+    valid = on2[forth] & ((row > 0) & (column > 0) if published else on1[back])
+    distance = -offset.to(torch.float32).square().sum(0).sqrt()
+    score = torch.full(on1.shape, -torch.inf, device=sim.device).index_copy(
+        0, u, distance.masked_fill(~valid, -torch.inf)
+    )
+    return score, torch.zeros_like(on1, dtype=torch.long).index_copy(0, u, forth)
 
 
 def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
@@ -265,31 +279,36 @@ def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, " n
     return mask.flatten().bool()
 
 
-def _bin_products(product: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
+def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
     """Sum the products of keys over the 17 bins, as the module's docstring explains."""
 
-    def rows(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        pooled = average_pool(average_pool(x, 0), 2)
-        return _joint_shifts(x, 1), _joint_shifts(pooled, 3), pooled
+    def pool(x: Tensor) -> Tensor:
+        return average_pool(average_pool(x, 0), 2)
 
     def columns(x: Tensor) -> Tensor:
-        # Swapping rows and columns makes the contiguous runs of memory longer, which is faster.
-        return x.permute(1, 0, 3, 2).contiguous()
+        return x.permute(1, 0, 3, 2)
 
-    near, far, centre = (columns(x) for x in rows(product))
-    far = average_pool(average_pool(far, 0), 2)
-    centre = average_pool(average_pool(centre, 0), 2)
-    return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
+    pooled = pool(products)
+    near, far, centre = (columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled))
+    return columns(_joint_shifts(near, 1).add_(_joint_shifts(pool(far), 3)).sub_(pool(centre)))
 
 
 def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
     """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border."""
-    n1, n2 = x.shape[0], x.shape[2]
-    padded = x
-    for axis, n in ((0, n1), (2, n2)):
-        padded = padded.index_select(axis, torch.arange(-step, n + step, device=x.device).clamp_(0, n - 1))
-    back, on = (padded[i : i + n1, :, i : i + n2] for i in (0, 2 * step))
-    return (x + back).add_(on)
+    total = x.clone()
+    for shift in (-step, step):
+        for (to1, from1), (to2, from2) in product(*(_clamped_shift(n, shift) for n in (x.shape[0], x.shape[2]))):
+            total[to1, :, to2].add_(x[from1, :, from2])
+    return total
+
+
+def _clamped_shift(n: int, shift: int) -> list[tuple[slice, slice]]:
+    """Return the entries of an axis that read others `shift` away, and those, clamped, that read its first or last."""
+    size = min(abs(shift), n)
+    front, back = slice(0, n - size), slice(size, n)
+    if shift > 0:
+        return [(front, back), (slice(n - size, n), slice(n - 1, n))]
+    return [(back, front), (slice(0, size), slice(0, 1))]
 
 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
