@@ -40,7 +40,7 @@ class ViewMaps:
         first_row: (v,) table row of each view's first pixel.
         table: (pixels, 4), row-major, view after view: depth in working units; weight of that depth (the soft mask, 0
             where the depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the
-            patch (-1 for none).
+            patch (-1 for none). Columns are contiguous in memory.
         pixel_scale: (v, 2), (x, y) pixels of the view's frame per map pixel.
     """
 
@@ -95,7 +95,7 @@ def build_maps(
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
     origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
-    lengths = [len(table) for table in tables]
+    lengths = [table.shape[1] for table in tables]
 
     def tensor(values) -> Tensor:
         return torch.from_numpy(np.asarray(values, dtype=np.float32))
@@ -109,7 +109,7 @@ def build_maps(
         tensor([camera.principal_point for camera in cameras]),
         tensor(sizes),
         torch.from_numpy(np.cumsum([0, *lengths[:-1]])),
-        torch.from_numpy(np.concatenate(tables)),
+        torch.from_numpy(np.concatenate(tables, axis=1)).T,
         tensor([view.frame.camera.size[::-1] for view in views] / sizes),
     )
 
@@ -138,17 +138,17 @@ def project_points(
     in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
     pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
-    x = in_camera[:, :, 0].mul_(pixels_per_unit).add_(maps.principal_point[:, :1])
-    y = in_camera[:, :, 1].mul_(pixels_per_unit).add_(maps.principal_point[:, 1:])
-    column = torch.minimum(x.floor().clamp_min_(0), maps.size[:, :1] - 1)
-    row = torch.minimum(y.floor().clamp_min_(0), maps.size[:, 1:] - 1)
-    index = (row * maps.size[:, :1] + column).long().add_(maps.first_row[:, None])
-    values = maps.table.index_select(0, index.flatten()).view(*index.shape, 4)
-    surface_depth, weight, distance, patch = values.unbind(-1)
-    # Distance from the pixel's edge, 0 for points within the image.
-    beyond = (x - column - 0.5).abs_().sub_(0.5).clamp_min_(0) + (y - row - 0.5).abs_().sub_(0.5).clamp_min_(0)
-    distance = torch.where(distance > 0, distance + beyond, distance) / pixels_per_unit
-    return Projection(depth, surface_depth, weight, distance, patch.long(), torch.stack([x, y], -1))
+    pixels = in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
+    last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
+    nearest = torch.minimum(pixels.clamp_min(0), last)
+    column, row = nearest.int().unbind(2)
+    index = (row * maps.size[:, :1].int()).add_(column).add_(maps.first_row[:, None].int())
+    surface_depth, weight, distance, patch = (
+        values.index_select(0, index.flatten()).view(index.shape) for values in maps.table.unbind(1)
+    )
+    beyond = torch.sub(pixels, nearest).abs_().sum(2)  # 0 within the image
+    distance = distance.addcmul_(beyond, distance.sign()).div_(pixels_per_unit)
+    return Projection(depth, surface_depth, weight, distance, patch.int(), pixels.transpose(2, 3))
 
 
 def _map_camera(camera: Camera) -> Camera:
@@ -161,19 +161,19 @@ def _map_camera(camera: Camera) -> Camera:
 
 def _table(
     view: View, camera: Camera, columns: Int[np.ndarray, " patches"], scale: float
-) -> Float[np.ndarray, "pixels 4"]:
+) -> Float[np.ndarray, "4 pixels"]:
     height, width = camera.size
     frame, grid = view.frame, view.features.grid
     rows, cols = ((2 * np.arange(n) + 1) * old // (2 * n) for n, old in zip(camera.size, frame.camera.size))
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth[np.ix_(rows, cols)]
-    table = np.empty((height, width, 4), np.float32)
-    table[..., _DEPTH] = depth * scale
-    table[..., _WEIGHT] = np.where(depth > 0, mask, 0)
-    table[..., _SILHOUETTE] = np.mean([_distance(mask < threshold) for threshold in _MASK_THRESHOLDS], axis=0)
+    table = np.empty((4, height, width), np.float32)
+    table[_DEPTH] = depth * scale
+    table[_WEIGHT] = np.where(depth > 0, mask, 0)
+    table[_SILHOUETTE] = np.mean([_distance(mask < threshold) for threshold in _MASK_THRESHOLDS], axis=0)
     patch = (np.arange(height) * grid[0] // height)[:, None] * grid[1] + np.arange(width) * grid[1] // width
-    table[..., _PATCH] = columns[patch]
-    return table.reshape(-1, 4)
+    table[_PATCH] = columns[patch]
+    return table.reshape(4, -1)
 
 
 def _distance(outside: np.ndarray) -> Float[np.ndarray, "h w"]:

@@ -82,6 +82,11 @@ def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) ->
     return Poses(scale, rotation, target_mean[:, 0] - scale[:, None] * rotated_mean)
 
 
+def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Compute exp(x) in place. Below exp(-80) the result is exp(-80), because underflow takes ten times as long."""
+    return x.clamp_min_(-80).exp_()
+
+
 def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
     """Compute the geodesic angle in degrees between each rotation of one batch and each of the other."""
     cosine = (first.flatten(1) @ second.flatten(1).T - 1) / 2

@@ -68,7 +68,7 @@ def poses_from_matches(
     rng = np.random.default_rng(seed)
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
-    sample = torch.from_numpy(np.argsort(rng.random((trials, len(source))), axis=1)[:, :3].copy())
+    sample = torch.from_numpy(np.argpartition(rng.random((trials, len(source))), (0, 1, 2), axis=1)[:, :3].copy())
     poses = fit_poses(source[sample], target[sample])
     smallest, largest = SCALE_RANGE
     poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]

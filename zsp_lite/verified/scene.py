@@ -20,7 +20,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.maps import ViewMaps, build_maps
-from zsp_lite.verified.poses import Poses, nearest_rotation
+from zsp_lite.verified.poses import Poses, exp_, nearest_rotation
 from zsp_lite.views import View
 
 # Points farther from the median point than this many median distances are outliers: patches at a silhouette may have
@@ -209,7 +209,10 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     Returns:
         (m,) positive weights that sum to 1.
     """
-    density = torch.cdist(points, points).square_().mul_(-0.5 / _DENSITY_SIGMA**2).exp_().sum(dim=1)
+    points = points / _DENSITY_SIGMA
+    half_square = points.square().sum(dim=1) / 2
+    exponent = torch.addmm(-half_square, points, points.T).sub_(half_square[:, None])
+    density = exp_(exponent).sum(dim=1)
     return (1 / density) / (1 / density).sum()
 
 

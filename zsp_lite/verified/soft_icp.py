@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, nearest_rotation
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, nearest_rotation
 from zsp_lite.verified.scene import Scene
 
 ITERATIONS = 6
@@ -43,7 +43,7 @@ def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, feature_w
         moved = poses.apply(source)
         square = moved.square().sum(dim=2, keepdim=True) + target_square
         square = torch.baddbmm(square, moved, target.T.expand(len(moved), 3, -1), alpha=-2).clamp_min_(0)
-        affinity = square.mul_(-0.5 / sigma**2).add_(feature_term).exp_()
+        affinity = exp_(square.mul_(-0.5 / sigma**2).add_(feature_term))
         total = affinity.sum(dim=2, keepdim=True)
         partner = (affinity @ target) / total.clamp_min(1e-12)
         weight = total / (total + _OUTLIER_AFFINITY * len(target))

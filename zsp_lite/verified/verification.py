@@ -52,7 +52,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from zsp_lite.verified.maps import Projection, project_points
-from zsp_lite.verified.poses import Poses, rotation_angles
+from zsp_lite.verified.poses import Poses, exp_, rotation_angles
 from zsp_lite.verified.scene import Scene
 
 SURFACE_SIGMA = 0.25  # sigma, working units
@@ -140,12 +140,12 @@ class PointTerms:
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
         """Yield similarity, overlap, silhouette and free space of each pose, averaged over views and points."""
         q = point_weights / point_weights.sum()
-        surface = torch.where(self.projection.patch < 0, 0, self.surface)
+        surface = self.surface * (self.projection.patch >= 0)
         total = surface.sum(dim=1)
-        yield ((surface * self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
+        yield (surface.mul_(self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
         yield total.clamp_max(1) @ q
-        yield self.silhouette.mean(dim=1) @ q
-        yield self.free_space.mean(dim=1) @ q
+        yield (self.silhouette @ q).mean(dim=1)
+        yield (self.free_space @ q).mean(dim=1)
 
 
 def forward_terms(scene: Scene, poses: Poses, rows: Int[Tensor, " n"] | None = None) -> PointTerms:
@@ -214,10 +214,10 @@ def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"]
         patch_stride: Step from there to the next patch of the views that the points are projected into.
     """
     delta = projection.depth - projection.surface_depth
-    surface = projection.weight * torch.exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2))
-    free_space = projection.weight * delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1)
-    index = (projection.patch.clamp_min(0) * patch_stride).add_(offset)
+    surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
+    free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)
+    index = projection.patch.clamp_min(0).mul_(patch_stride).add_(offset.int())
     similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
-    similarity = similarity.masked_fill_(projection.patch < 0, 0)
+    similarity = similarity.mul_(projection.patch >= 0)
     silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
     return PointTerms(projection, surface, silhouette, free_space, similarity)
