@@ -136,7 +136,11 @@ def patch_points(
     n_known = np.isfinite(values).sum(axis=-1)
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
-    chosen = np.take_along_axis(np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1)
+    # The pixel of this rank in a stable sort. Sorting the values alone is much faster than sorting their indices.
+    percentile = np.take_along_axis(np.sort(values, axis=-1), rank[..., None], axis=-1)
+    among_equal = rank - (values < percentile).sum(axis=-1)
+    equal = np.cumsum(values == percentile, axis=-1) > among_equal[..., None]
+    chosen = equal.argmax(axis=-1, keepdims=True)
     index = np.where(
         known,
         np.take_along_axis(pixel, chosen, axis=-1)[..., 0],

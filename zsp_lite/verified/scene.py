@@ -27,6 +27,7 @@ from zsp_lite.views import View
 # the depth of the background.
 _OUTLIER_DISTANCE = 3.0
 _DENSITY_SIGMA = 0.25  # working units
+_DENSITY_ROWS = 200
 # Fewer points do not determine a shape to align.
 MIN_POINTS = 8
 
@@ -120,13 +121,14 @@ def build_scene(
     foregrounds = [np.asarray(target.foreground.cpu()).ravel() for target in targets]
     starts = np.cumsum([0, *(foreground.sum() for foreground in foregrounds)])
     columns = [_number(foreground, start) for foreground, start in zip(foregrounds, starts)]
-    to_foreground = [
-        similarity.cpu().float()[:, torch.from_numpy(foreground)]
+    reference_foreground = reference.foreground.cpu().ravel()
+    between_foregrounds = [
+        similarity.cpu().float()[reference_foreground][:, torch.from_numpy(foreground)]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
-    reference_foreground = reference.foreground.cpu().ravel()
-    view_similarities = torch.stack([view_similarity(similarity[reference_foreground]) for similarity in to_foreground])
-    centred = [double_centre(similarity[torch.from_numpy(source_valid)]) for similarity in to_foreground]
+    view_similarities = torch.stack([view_similarity(similarity) for similarity in between_foregrounds])
+    valid_rows = torch.from_numpy(source_valid)[reference_foreground]
+    centred = [double_centre(similarity[valid_rows]) for similarity in between_foregrounds]
 
     matched = []
     for target, cloud, match in zip(targets, clouds, matches):
@@ -210,9 +212,11 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
         (m,) positive weights that sum to 1.
     """
     points = points / _DENSITY_SIGMA
-    half_square = points.square().sum(dim=1) / 2
-    exponent = torch.addmm(-half_square, points, points.T).sub_(half_square[:, None])
-    density = exp_(exponent).sum(dim=1)
+    square = points.square().sum(dim=1, keepdim=True)
+    left, right = torch.cat([points, square], dim=1), torch.cat([points, torch.full_like(square, -0.5)], dim=1)
+    # |x - y|^2 / 2 is a product of few rows at a time with all, so that it stays in the processor's cache.
+    products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
+    density = torch.cat([exp_(product).sum(dim=1) for product in products])
     return (1 / density) / (1 / density).sum()
 
 
