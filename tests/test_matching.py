@@ -123,6 +123,24 @@ def test_each_station_of_a_cycle_must_lie_on_the_foreground():
         assert cyclical_distances(sim, row, row, *masks)[0, 0] == -np.inf
 
 
+def test_cycles_from_the_foreground_are_those_of_all_patches_restricted_to_it():
+    sim = similarity(feature_map(1, (7, 5)), feature_map(2, (6, 8)))
+    on = feature_map(3, (7, 5)).foreground(0.5)
+    forth, back = nearest_neighbours(sim)
+    returned = back[forth].view(7, 5)
+    everywhere = cyclical_distances(sim, (7, 5), (6, 8))
+    expected = everywhere.masked_fill(~on | ~on.flatten()[returned], -torch.inf)
+    assert torch.equal(cyclical_distances(sim, (7, 5), (6, 8), on), expected)
+
+
+def test_a_similarity_that_is_not_finite_is_refused():
+    features, sim = feature_map(0), torch.zeros(81, 81)
+    for bad in (torch.nan, torch.inf, -torch.inf):
+        sim[40, 7] = bad
+        with pytest.raises(InputError, match="match: sim holds values that are no finite"):
+            match(features, features, sim=sim)
+
+
 def test_the_published_form_masks_returns_to_the_first_row_and_column_only():
     sim = similarity(feature_map(0, (4, 5)), feature_map(0, (4, 5)))
     masked = cyclical_distances(sim, (4, 5), (4, 5), published=True)
