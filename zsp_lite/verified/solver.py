@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from zsp_lite.best_view import ViewPair
 from zsp_lite.errors import check_seed
-from zsp_lite.estimates import Hypothesis, PoseEstimate, match_points, timed
+from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.verified.confidence import (
     Calibration,
     hypothesis_probabilities,
@@ -86,14 +86,19 @@ class VerifiedSolver:
     def __call__(
         self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
     ) -> PoseEstimate:
-        """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`."""
+        """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`.
+
+        Inliers are matches with measured depth on both sides.
+        """
         solution = self.solve(reference, targets, pairs, seed)
         best = solution.hypotheses[0]
         matches = pairs[best.view].matches
-        source, target = match_points(reference, targets[best.view], matches)
-        residual = np.linalg.norm(best.sim3.apply(source) - target, axis=1)
+        (source, known), (target, seen) = (view.measured_points for view in (reference, targets[best.view]))
+        u, v = tuple(matches.reference.T), tuple(matches.target.T)
+        residual = np.linalg.norm(best.sim3.apply(source[u]) - target[v], axis=1)
+        inliers = known[u] & seen[v] & (residual < threshold * solution.target_spread)
         return PoseEstimate(
-            best.sim3, best.view, matches, residual < threshold * solution.target_spread, -solution.view_angles,
+            best.sim3, best.view, matches, inliers, -solution.view_angles,
             reference, tuple(targets), solution.timings, solution.flags, solution.hypotheses, solution.one_of_two,
         )  # fmt: skip
 
