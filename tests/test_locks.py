@@ -112,5 +112,5 @@ def test_points_that_overflow_when_squared_are_refused():
 def test_a_backbone_that_answers_nan_in_its_global_feature_is_refused():
     import torch
 
-    with pytest.raises(InputError, match="global feature or positions hold values that are not finite"):
+    with pytest.raises(InputError, match="global feature, positions or photo hold values that are not finite"):
         FeatureMap(torch.ones(2, 2, 3), torch.ones(2, 2), torch.tensor([1.0, torch.nan]))

@@ -60,37 +60,39 @@ def test_pairs_without_a_correct_hypothesis_do_not_change_the_weights():
 
 
 def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[Outcome]:
-    """Pairs of three different poses, scored by the first term alone, of which one or none is right as `true` says."""
+    """Pairs of three different poses, scored by the first two terms, of which one or none is right as `true` says."""
     outcomes = []
     for index in range(n):
         n_views, view_std, terms = int(rng.integers(1, 11)), float(rng.uniform(0, 0.2)), np.zeros((3, len(TERM_NAMES)))
         terms[:, 0] = np.sort(rng.uniform(0, 6, 3))[::-1]
-        p = true.probabilities(terms[0, 0] - terms[:, 0], n_views, view_std)
+        terms[:, 1] = rng.uniform(-2, 2)  # the shape term, equal for all poses
+        p = true.probabilities(terms[0, 0] - terms[:, 0], n_views, view_std, terms[0, 1])
         errors = np.full(4, 120.0)
         errors[rng.choice(4, p=[*p, 1 - p.sum()])] = 5
         outcomes.append(Outcome(f"category {index % 4}", terms, errors[:3], 90 * (1 - np.eye(3)), view_std, n_views))
     return outcomes
 
 
-FIRST_TERM = ScoreWeights(*[1.0, *[0.0] * (len(TERM_NAMES) - 1)])
-TRUE_CALIBRATION = Calibration(-0.4, 0.2, 0.5, -0.4, -6.0)
+FIRST_TERMS = ScoreWeights(*[1.0, 1.0, *[0.0] * (len(TERM_NAMES) - 2)])
+TRUE_CALIBRATION = Calibration(-0.4, 0.2, 0.5, -0.4, -6.0, -0.6)
 
 
 def test_the_coefficients_of_the_calibration_are_recovered():
     outcomes = sample_ranked(6000, TRUE_CALIBRATION, np.random.default_rng(0))
-    found = fit_calibration(outcomes, FIRST_TERM, ridge=0)
+    found = fit_calibration(outcomes, FIRST_TERMS, ridge=0)
     assert astuple(found)[:4] == pytest.approx(astuple(TRUE_CALIBRATION)[:4], abs=0.2)
     assert found.none_std == pytest.approx(TRUE_CALIBRATION.none_std, abs=1.5)
+    assert found.none_shape == pytest.approx(TRUE_CALIBRATION.none_shape, abs=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
     with pytest.raises(InputError, match="all have a right pose or none has"):
-        fit_calibration(right, FIRST_TERM)
+        fit_calibration(right, FIRST_TERMS)
 
 
 def test_calibrated_probabilities_are_frequencies_on_new_pairs():
-    fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERM)
+    fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERMS)
     new = sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(3))
-    ranked = [one.ranked(FIRST_TERM) for one in new]
-    found = [fitted.probabilities(deficit, one.n_views, one.view_std) for one, (deficit, _) in zip(new, ranked)]
+    ranked = [one.ranked(FIRST_TERMS) for one in new]
+    found = [fitted.probabilities(deficit, *one.circumstances(FIRST_TERMS)) for one, (deficit, _) in zip(new, ranked)]
     for k in range(3):
         confidence, right = np.array([p[k] for p in found]), np.array([error[k] < 30 for _, error in ranked])
         assert reliability(confidence, right, 5).calibration_error < 0.05
@@ -122,7 +124,7 @@ def test_the_reports_have_all_fits():
     text = "\n".join(report_weights(sample_outcomes(60, np.random.default_rng(5))))
     assert "60 pairs of 4 categories" in text and "held-out category" in text and "best 2 different poses" in text
     assert all(name in text for name in TERM_NAMES)
-    text = "\n".join(report_calibration(sample_ranked(200, TRUE_CALIBRATION, np.random.default_rng(5)), FIRST_TERM))
+    text = "\n".join(report_calibration(sample_ranked(200, TRUE_CALIBRATION, np.random.default_rng(5)), FIRST_TERMS))
     assert "AUROC" in text and "10 views:" in text and "probabilities of the other poses" in text
 
 

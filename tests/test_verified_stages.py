@@ -618,13 +618,13 @@ MODE = np.array([0, 0, 2, 2, 4])
 
 
 def test_probabilities_of_hypotheses_by_hand():
-    # Of four views: a = exp(0.2 - 0.5 log 4), odds of "none" exp(0.3 - 0.1 log 4 - 2 * 0.03).
-    calibration = Calibration(0.2, -0.5, 0.3, -0.1, -2.0)
-    a, none = np.exp(0.2) / 2, np.exp(0.3 - 0.06) * 4**-0.1
+    # Of four views: a = exp(0.2 - 0.5 log 4), odds of "none" exp(0.3 - 0.1 log 4 - 2 * 0.03 - 0.25 * 2).
+    calibration = Calibration(0.2, -0.5, 0.3, -0.1, -2.0, -0.25)
+    a, none = np.exp(0.2) / 2, np.exp(0.3 - 0.06 - 0.5) * 4**-0.1
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0]))
     first, second, third = odds / (none + odds.sum())
     score = np.array([5.0, 4.9, 4.5, 4.4, 3.0])
-    found = hypothesis_probabilities(score, MODE, 4, 0.03, calibration)
+    found = hypothesis_probabilities(score, MODE, 4, 0.03, 2.0, calibration)
     np.testing.assert_allclose(found, [first, first, second, second, third])
 
 
@@ -632,17 +632,28 @@ def test_probabilities_of_hypotheses_by_hand():
     st.lists(st.floats(0, 40), min_size=0, max_size=5),
     st.sampled_from([1, 2, 3, 4, 5, 10]),
     st.floats(0, 0.3),
+    st.floats(-40, 40),
 )
-def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, n_views, view_std):
+def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, n_views, view_std, shape):
     score = 10 - np.cumsum([0.0, *deficits])
-    found = hypothesis_probabilities(score, np.arange(len(score)), n_views, view_std, Calibration())
+    found = hypothesis_probabilities(score, np.arange(len(score)), n_views, view_std, shape, Calibration())
     assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
 
 
 def test_with_fewer_views_more_of_the_mass_is_left_for_none_of_the_poses():
     score = np.array([5.0, 4.0])
-    left = [1 - hypothesis_probabilities(score, np.arange(2), n, 0.03, Calibration()).sum() for n in (1, 2, 3, 5, 10)]
+    left = [
+        1 - hypothesis_probabilities(score, np.arange(2), n, 0.03, 5.0, Calibration()).sum() for n in (1, 2, 3, 5, 10)
+    ]
     assert (np.diff(left) < 0).all() and left[0] > 2 * left[-1]
+
+
+def test_the_worse_the_shapes_fit_the_more_is_left_for_none_of_the_poses():
+    score, calibration = np.array([5.0, 4.0]), Calibration()
+    left = [
+        1 - hypothesis_probabilities(score, np.arange(2), 5, 0.03, fit, calibration).sum() for fit in (-5.0, 0.0, 5.0)
+    ]
+    assert (np.diff(left) < 0).all()
 
 
 def test_poses_are_nearly_as_probable_above_a_fraction_of_the_best_ones_probability():

@@ -179,7 +179,7 @@ def test_the_weights_and_the_calibration_reach_the_verified_solver(views, verifi
     weights = replace(VerifiedSolver().weights, viewpoint=-3.0, forward_similarity=7.0)
     for one in verify(views, VERIFIED, weights=weights).hypotheses:
         assert one.score == pytest.approx(sum(w * t for w, t in zip(astuple(weights), one.terms.values())), abs=1e-3)
-    certain = verify(views, VERIFIED, calibration=Calibration(20.0, 0.0, -3.0, 0.0, 0.0))  # rivals do not count
+    certain = verify(views, VERIFIED, calibration=Calibration(20.0, 0.0, -3.0, 0.0, 0.0, 0.0))  # rivals do not count
     assert certain.confidence == pytest.approx(1 / (1 + np.exp(-3)))
     assert certain.confidence != verified.confidence
 

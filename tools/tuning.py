@@ -36,7 +36,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, different_poses, modes, reliability
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 from zsp_lite.views import View, usable_targets
 
 CORRECT_ANGLE = 30.0  # degrees
@@ -75,6 +75,11 @@ class Outcome:
         order = np.argsort(-scores, kind="stable")
         different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
         return scores[order[0]] - scores[different], self.errors[different]
+
+    def circumstances(self, weights: ScoreWeights) -> tuple[int, float, float]:
+        """Return what the probability of "none of these" depends on: number of views, view_std and shape fit."""
+        best = self.terms[(self.terms @ np.array(astuple(weights))).argmax()]
+        return self.n_views, self.view_std, float(best @ np.array(astuple(weights.without(*FEATURE_TERMS))))
 
 
 def collect_outcomes(
@@ -178,8 +183,8 @@ def fit_calibration(
     Args:
         outcomes: Outcomes for several numbers of views.
         weights: Weights of the score.
-        ridge: Penalty on the squared coefficients of log N and of the view similarities' standard deviation, per
-            standard deviation of these.
+        ridge: Penalty on the squared coefficients of log N, of the view similarities' standard deviation and of the
+            shape fit, per standard deviation of these.
 
     Raises:
         InputError: All estimates are right, or none is.
@@ -193,10 +198,11 @@ def fit_calibration(
     for row, (deficit, _) in zip(deficits, ranked):
         row[: len(deficit)] = torch.from_numpy(deficit)
     target = torch.tensor([int(found[0]) if len(found) else most for found in right])
-    inputs = np.array([(np.log(one.n_views), one.view_std) for one in outcomes])
+    inputs = np.array([one.circumstances(weights) for one in outcomes])
+    inputs[:, 0] = np.log(inputs[:, 0])
     mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
     x = torch.from_numpy((inputs - mean) / std)
-    theta = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+    theta = torch.zeros(3 + inputs.shape[1], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([theta], max_iter=300, line_search_fn="strong_wolfe")
 
     def loss() -> Float[torch.Tensor, ""]:
@@ -204,7 +210,7 @@ def fit_calibration(
         scale = torch.exp(theta[0] + theta[1] * x[:, 0])
         none = theta[2] + x @ theta[3:]
         logits = torch.cat([-scale[:, None] * deficits, none[:, None]], dim=1)
-        value = torch.nn.functional.cross_entropy(logits, target) + ridge * theta[[1, 3, 4]].square().sum()
+        value = torch.nn.functional.cross_entropy(logits, target) + ridge * theta[[1, 3, 4, 5]].square().sum()
         value.backward()
         return value
 
@@ -248,7 +254,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreWeights) -> li
     first, others = [], []
     for one, calibration in zip(outcomes, held_out):
         deficit, error = one.ranked(weights)
-        probability = calibration.probabilities(deficit, one.n_views, one.view_std)
+        probability = calibration.probabilities(deficit, *one.circumstances(weights))
         pairs = list(zip(probability, error < CORRECT_ANGLE))
         first.append((one.n_views, *pairs[0]))
         others += pairs[1:]

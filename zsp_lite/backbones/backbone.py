@@ -132,15 +132,23 @@ class Backbone:
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
-            grids = [tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls]
+            parts = {
+                "keys": tokens.keys.unflatten(1, tokens.grid), "saliency": saliency.unflatten(1, tokens.grid),
+                "global_feature": tokens.cls,
+            }  # fmt: skip
+            if tokens.photo_last is not None:
+                parts["photo"] = tokens.photo_last.permute(0, 2, 3, 1)
             if self.position_head is not None:
                 places = patch_places(tokens.grid).to(self.device).expand(len(batch), -1, -1)
                 salient = saliency > SALIENCY_THRESHOLD
                 positions = self.position_head(tokens.keys, tokens.photo, places, tokens.cls, salient)
-                grids.append(positions.unflatten(1, tokens.grid))
+                parts["positions"] = positions.unflatten(1, tokens.grid)
         # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
         # batch in memory.
-        return [FeatureMap(*(x.to(torch.float32, copy=True) for x in one)) for one in zip(*grids)]
+        return [
+            FeatureMap(**{name: values[index].to(torch.float32, copy=True) for name, values in parts.items()})
+            for index in range(len(batch))
+        ]
 
 
 def image_batches(

@@ -77,7 +77,7 @@ class CombinedBackbone:
         keys = [w * F.normalize(_resize(one.keys, grid), dim=-1) for w, one in zip(self.weights, maps)]
         saliency = _resize(salient.saliency[..., None], grid)[..., 0]
         positions = None if salient.positions is None else _resize(salient.positions, grid)
-        return FeatureMap(torch.cat(keys, dim=-1), saliency, salient.global_feature, positions)
+        return FeatureMap(torch.cat(keys, dim=-1), saliency, salient.global_feature, positions, salient.photo)
 
 
 def is_combination(name: str) -> bool:

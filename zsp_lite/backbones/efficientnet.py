@@ -134,8 +134,13 @@ class EfficientNetLite0(nn.Module):
             InputError: If there is no such block, or the shape does not fit.
         """
         check_integer("block", block, 0, self.depth - 1)
-        x = self._stem(images)
-        for module in self._blocks[: block + 1]:
+        return self.run_blocks(self._stem(images), 0, block + 1)
+
+    def run_blocks(
+        self, x: Float[Tensor, "batch channels height width"], first: int, end: int | None = None
+    ) -> Float[Tensor, "batch outputs rows columns"]:
+        """Run the blocks from `first` up to, but not including, `end`; by default to the last one."""
+        for module in self._blocks[first:end]:
             x = module(x)
         return x
 
@@ -143,10 +148,9 @@ class EfficientNetLite0(nn.Module):
         self, images: Float[Tensor, "batch 3 height width"], block: int = 10
     ) -> tuple[Float[Tensor, "batch channels rows columns"], Float[Tensor, "batch 1280"]]:
         """Compute the output of a block (see `features`) and the input of the classifier in one forward pass."""
-        chosen = x = self.features(images, block)
-        for module in self._blocks[block + 1 :]:
-            x = module(x)
-        return chosen, F.relu6(self._bn1(self._conv_head(x))).mean((2, 3))
+        chosen = self.features(images, block)
+        last = self.run_blocks(chosen, block + 1)
+        return chosen, F.relu6(self._bn1(self._conv_head(last))).mean((2, 3))
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 1000"]:
         """Return the logits of ImageNet's classes for images with values in [0, 1]."""

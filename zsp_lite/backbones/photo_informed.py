@@ -73,11 +73,12 @@ class PhotoInformedViT(nn.Module):
 
     def inputs(
         self, images: Float[Tensor, "batch 3 height width"]
-    ) -> tuple[Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"], Float[Tensor, "batch n channels"]]:
+    ) -> tuple[
+        Float[Tensor, "batch 3 h w"], Float[Tensor, "batch n dim"], Float[Tensor, "batch channels rows columns"]
+    ]:  # fmt: skip
         """Return the transformer's images, what is added to its patch tokens, and the photo network's features."""
         features = self.photo_network.features(images, BLOCK)
-        added = self.photo_input.projection(features)
-        return normalize(F.avg_pool2d(images, DETAIL)), added, features.flatten(2).transpose(1, 2)
+        return normalize(F.avg_pool2d(images, DETAIL)), self.photo_input.projection(features), features
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
         """Compute what `VisionTransformer.extract` does, and the features of the photo network.
@@ -87,5 +88,8 @@ class PhotoInformedViT(nn.Module):
             layer, facet: Block and activation that describe the patches.
         """
         small, added, photo = self.inputs(images)
-        tokens = replace(self.vit.extract(small, layer, facet, added), photo=photo)
+        tokens = replace(
+            self.vit.extract(small, layer, facet, added),
+            photo=photo.flatten(2).transpose(1, 2), photo_last=self.photo_network.run_blocks(photo, BLOCK + 1),
+        )  # fmt: skip
         return replace(tokens, keys=tokens.keys - self.photo_input.key_mean[layer]) if facet == "key" else tokens

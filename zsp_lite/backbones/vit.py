@@ -27,7 +27,8 @@ class Tokens:
         attention: Attention of the last block from CLS to the patches; softmax over all 1 + n tokens.
         cls: CLS output token after the final normalisation.
         grid: (rows, columns) of the patch grid; rows * columns = n.
-        photo: Features of a photo network (see `photo_informed`); None without one.
+        photo: Features of a photo network for each patch (see `photo_informed`); None without one.
+        photo_last: Output of the last block of that network, on a grid of its own.
     """
 
     keys: Float[Tensor, "batch n dim"]
@@ -35,6 +36,7 @@ class Tokens:
     cls: Float[Tensor, "batch dim"]
     grid: tuple[int, int]
     photo: Float[Tensor, "batch n channels"] | None = None
+    photo_last: Float[Tensor, "batch last rows columns"] | None = None
 
 
 @dataclass(frozen=True)

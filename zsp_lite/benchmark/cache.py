@@ -15,7 +15,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.files import make_folder, write_atomic
 
-_PARTS = ("keys", "saliency", "global_feature", "positions")  # the last where the backbone predicts them
+_PARTS = ("keys", "saliency", "global_feature")
+_OPTIONAL = ("positions", "photo")  # where the backbone has them
 _UNCACHED = ("rootsift",)  # computed faster than read
 
 
@@ -52,13 +53,13 @@ class FeatureCache:
             return None
         try:
             tensors = load(self.path(features, frame).read_bytes())
-            return FeatureMap(*(tensors[part] for part in _PARTS[:-1]), tensors.get(_PARTS[-1]))
+            return FeatureMap(*(tensors[part] for part in _PARTS), *(tensors.get(part) for part in _OPTIONAL))
         except (OSError, SafetensorError, KeyError, InputError):
             return None
 
     def write(self, features: str, frame: Frame, found: Any) -> None:
         """Store features of the type FeatureMap."""
         if features in self._fingerprints and isinstance(found, FeatureMap):
-            parts = {part: getattr(found, part) for part in _PARTS}
+            parts = {part: getattr(found, part) for part in (*_PARTS, *_OPTIONAL)}
             tensors = {part: values.cpu().contiguous() for part, values in parts.items() if values is not None}
             write_atomic(self.path(features, frame), save(tensors))

@@ -17,7 +17,7 @@ from zsp_lite.benchmark.identity import digest_of
 from zsp_lite.benchmark.robustness import DAMAGES, Damaged
 from zsp_lite.errors import InputError, describe_failure
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,10 @@ def _verified_rows() -> dict[str, Method]:
         "nofreespace": VerifiedSolver(weights.without("forward_free_space", "reverse_free_space")),
         "noview": VerifiedSolver(weights.without("viewpoint")),
         "noorientation": VerifiedSolver(weights.without("orientation")),
+        "noagreement": VerifiedSolver(weights.without("agreement")),
         "simonly": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "similarity" not in name))),
         "forward": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "forward" not in name))),
-        "nofeatures": VerifiedSolver(
-            weights.without("forward_similarity", "reverse_similarity", "viewpoint", "orientation"), feature_weight=0.0
-        ),
+        "nofeatures": VerifiedSolver(weights.without(*FEATURE_TERMS), feature_weight=0.0),
         "noicp": VerifiedSolver(icp=False),
         "norefinement": VerifiedSolver(refinement=False),
     }

@@ -4,11 +4,13 @@ The score S is a conditional logit (McFadden 1974), with one more alternative: t
 different poses (see `modes`) of an estimate from N target views, pose k has the probability
 
     p_k = \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
-    a = \exp(\alpha_0 + \alpha_1 \log N),   b = \beta_0 + \beta_1 \log N + \beta_2 s,
+    a = \exp(\alpha_0 + \alpha_1 \log N),   b = \beta_0 + \beta_1 \log N + \beta_2 s + \beta_3 g,
 
-where s is the standard deviation of the target views' feature similarity to the reference. If it is small, the features
-hardly distinguish the sides of the object. What the p_k leave of 1 is the probability of none of these. The
-confidence of an estimate is p_1. `reliability` measures how well such probabilities are calibrated.
+where s is the standard deviation of the target views' feature similarity to the reference, and g that part of the best
+score which compares shapes (overlap, silhouettes and free space). If s is small, the features hardly distinguish the
+sides of the object; if g is small, the two shapes do not fit under any pose that was found. What the p_k leave of 1 is
+the probability of none of these. The confidence of an estimate is p_1. `reliability` measures how well such
+probabilities are calibrated.
 """
 
 from dataclasses import dataclass
@@ -26,7 +28,7 @@ TIE_RATIO = float(np.exp(-1))
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The five coefficients, fitted on validation categories for N = 1 to 10 (`tools/tuning.py`).
+    r"""The six coefficients, fitted on validation categories for N = 1 to 10 (`tools/tuning.py`).
 
     Attributes:
         scale: \alpha_0.
@@ -34,17 +36,19 @@ class Calibration:
         none: \beta_0.
         none_views: \beta_1.
         none_std: \beta_2.
+        none_shape: \beta_3.
     """
 
-    scale: float = -1.15
-    scale_views: float = 0.23
-    none: float = 0.83
-    none_views: float = -0.56
-    none_std: float = -58.0
+    scale: float = -1.46
+    scale_views: float = 0.30
+    none: float = 1.77
+    none_views: float = -0.75
+    none_std: float = -59.0
+    none_shape: float = -0.215
 
     def probabilities(
         self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
-        view_std: float | Float[np.ndarray, "*batch 1"],
+        view_std: float | Float[np.ndarray, "*batch 1"], shape_fit: float | Float[np.ndarray, "*batch 1"],
     ) -> Float[np.ndarray, "*batch m"]:  # fmt: skip
         """Return the probabilities of different poses.
 
@@ -52,11 +56,12 @@ class Calibration:
             deficit: S_1 - S_k, nats; infinite for no pose.
             n_views: Number N of target views.
             view_std: Standard deviation s of view similarities (see `Scene.view_similarity_std`).
+            shape_fit: Shape part g of the best score, nats (see `ScoreWeights.shape_fit`).
         """
         log_n = np.log(n_views)
         odds = np.exp(-np.exp(self.scale + self.scale_views * log_n) * deficit)
-        none = np.exp(self.none + self.none_views * log_n + self.none_std * view_std)
-        return odds / (none + odds.sum(axis=-1, keepdims=True))
+        none = self.none + self.none_views * log_n + self.none_std * view_std + self.none_shape * shape_fit
+        return odds / (np.exp(none) + odds.sum(axis=-1, keepdims=True))
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
@@ -82,8 +87,9 @@ def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
 
 
 def hypothesis_probabilities(
-    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], n_views: int, view_std: float, calibration: Calibration
-) -> Float[np.ndarray, " m"]:
+    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], n_views: int, view_std: float, shape_fit: float,
+    calibration: Calibration,
+) -> Float[np.ndarray, " m"]:  # fmt: skip
     """Return the probability of each hypothesis; over different poses they sum to at most 1.
 
     Args:
@@ -91,13 +97,14 @@ def hypothesis_probabilities(
         mode: The hypothesis that stands for each (see `modes`).
         n_views: Number of target views.
         view_std: Standard deviation of view similarities.
+        shape_fit: Shape part of the best score, nats.
         calibration: Coefficients.
 
     Returns:
         Probabilities that the rotation error is below 30 degrees. A hypothesis has that of the one that stands for it.
     """
     different, probability = different_poses(mode), np.empty(len(score))
-    probability[different] = calibration.probabilities(score[0] - score[different], n_views, view_std)
+    probability[different] = calibration.probabilities(score[0] - score[different], n_views, view_std, shape_fit)
     return probability[mode]
 
 

@@ -55,6 +55,8 @@ class Scene:
         reference_axes: Rotation from the working frame of the reference to its object's axes, as predicted from the
             reference view (see `object_axes`); None if the features have no positions.
         target_axes: (v,) the same of each target view, from the working frame of the targets; None if one has none.
+        reference_photo: Photo features at the reference's points (see `features.FeatureMap`); None without them.
+        target_photo: The same at the targets' points.
     """
 
     reference_points: Float[Tensor, "n 3"]
@@ -72,6 +74,8 @@ class Scene:
     view_similarity: Float[Tensor, " v"]
     reference_axes: Float[Tensor, "3 3"] | None = None
     target_axes: Float[Tensor, "v 3 3"] | None = None
+    reference_photo: Float[Tensor, "n c"] | None = None
+    target_photo: Float[Tensor, "m c"] | None = None
 
     @property
     def view_similarity_std(self) -> float:
@@ -139,6 +143,10 @@ def build_scene(
     if all(one is not None for one in axes):
         reference_axes = axes[0]
         target_axes = torch.stack([one @ _tensor(R) for one, (R, _) in zip(axes[1:], to_camera)])
+    reference_photo = target_photo = None
+    if all(view.features.photo is not None for view in (reference, *targets)):
+        reference_photo = photo_features(reference, source_valid)
+        target_photo = torch.cat([photo_features(view, chosen) for view, chosen in zip(targets, valid)])
     target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
     return Scene(
         reference_points=_tensor(reference_to_working.apply(source[source_valid])),
@@ -158,6 +166,8 @@ def build_scene(
         view_similarity=view_similarities - view_similarities.mean(),
         reference_axes=reference_axes,
         target_axes=target_axes,
+        reference_photo=reference_photo,
+        target_photo=target_photo,
     )
 
 
@@ -201,6 +211,16 @@ def object_axes(view: View) -> Float[Tensor, "3 3"] | None:
     points = _tensor(view.measured_points[0][known])
     points = points - points.mean(dim=0)
     return nearest_rotation((positions.T @ points)[None])[0]
+
+
+def photo_features(view: View, chosen: Bool[np.ndarray, " patches"]) -> Float[Tensor, "n c"]:
+    """Return the photo features at the centres of the chosen patches (row-major) of a view."""
+    photo, grid = view.features.photo.cpu(), view.features.grid
+    row, column = (
+        torch.from_numpy((2 * index + 1) * size // (2 * n))
+        for index, size, n in zip(np.unravel_index(np.flatnonzero(chosen), grid), photo.shape, grid)
+    )
+    return photo[row, column]
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from zsp_lite.best_view import ViewPair
 from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
+from zsp_lite.verified.agreement import agreement_term
 from zsp_lite.verified.confidence import (
     Calibration,
     hypothesis_probabilities,
@@ -144,7 +145,7 @@ class VerifiedSolver:
                 if self.refinement:
                     poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
             with timed(timings, "ranking"):
-                terms = score_terms(scene, poses)
+                terms = replace(score_terms(scene, poses), agreement=agreement_term(scene, poses))
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)
@@ -159,7 +160,14 @@ class VerifiedSolver:
         score = self.weights.score(terms).double().numpy()
         angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
         mode = modes(angle)
-        confidence = hypothesis_probabilities(score, mode, len(order), scene.view_similarity_std, self.calibration)
+        confidence = hypothesis_probabilities(
+            score,
+            mode,
+            len(order),
+            scene.view_similarity_std,
+            float(self.weights.shape_fit(terms)[0]),
+            self.calibration,
+        )
         view_angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
         hypotheses = []
         for i, view in enumerate(view_angle.argmin(axis=1)):

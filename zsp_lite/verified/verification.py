@@ -1,4 +1,4 @@
-r"""The score of a pose: a weighted sum of ten terms that compare it with everything that the views show.
+r"""The score of a pose: a weighted sum of eleven terms that compare it with everything that the views show.
 
     S(T) = \sum_k w_k \phi_k(T)
 
@@ -40,6 +40,9 @@ A_0 from the reference's frame and A_v from the targets', both to the axes of th
 
 and 0 without such a backbone. Axes that are wrong in the same way in both objects do not matter.
 
+The eleventh, `agreement`, compares photo features near each point under the pose (`verified.agreement`). It ranks the
+hypotheses at the end and is 0 in the search for them.
+
 The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
 probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
 """
@@ -78,6 +81,7 @@ class ScoreTerms:
     reverse_free_space: Float[Tensor, " m"]
     viewpoint: Float[Tensor, " m"]
     orientation: Float[Tensor, " m"]
+    agreement: Float[Tensor, " m"]
 
     def __getitem__(self, index) -> "ScoreTerms":
         """Select the terms of some poses by an index array, slice or mask."""
@@ -93,6 +97,8 @@ class ScoreTerms:
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
+# Terms that need features; the others compare shapes.
+FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint", "orientation", "agreement")
 
 
 @dataclass(frozen=True)
@@ -109,10 +115,15 @@ class ScoreWeights:
     reverse_free_space: float = -30.0
     viewpoint: float = 20.0
     orientation: float = 6.5
+    agreement: float = 1.0
 
     def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
         return terms.matrix() @ torch.tensor(astuple(self), dtype=torch.float32)
+
+    def shape_fit(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
+        """Return the part of the scores that compares shapes: that of the terms without features."""
+        return self.without(*FEATURE_TERMS).score(terms)
 
     def without(self, *names: str) -> "ScoreWeights":
         """Return these weights with those of the named terms set to 0."""
@@ -164,7 +175,7 @@ def reverse_terms(scene: Scene, poses: Poses, indices: Int[Tensor, " n"] | None 
 
 
 def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> ScoreTerms:
-    """Compute the terms of every pose.
+    """Compute the terms of every pose, all but `agreement`, which is 0.
 
     Args:
         scene: The scene to score against.
@@ -181,8 +192,9 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         forward, reverse = forward_terms(scene, some, rows), reverse_terms(scene, some, indices)
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
     return ScoreTerms(
-        *(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses), orientation_term(scene, poses)
-    )
+        *(torch.cat(term) for term in zip(*chunks)),
+        viewpoint_term(scene, poses), orientation_term(scene, poses), torch.zeros(len(poses)),
+    )  # fmt: skip
 
 
 def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
