@@ -14,7 +14,7 @@ from tools.tuning import (
     collect_outcomes,
     fit_calibration,
     fit_weights,
-    leave_one_out,
+    leave_out,
     report_calibration,
     report_weights,
 )
@@ -100,7 +100,7 @@ def test_calibrated_probabilities_are_frequencies_on_new_pairs():
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():
     outcomes = sample_outcomes(12, np.random.default_rng(4))
-    seen = leave_one_out(outcomes, lambda some: {one.category for one in some})
+    seen = leave_out(outcomes, lambda some: {one.category for one in some})
     assert all(one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen))
 
 

@@ -11,10 +11,13 @@ CONCEPTS = Path(__file__).with_suffix(".csv")
 
 
 def check_sides(folders: Iterable[str | Path], side: str) -> None:
-    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side."""
+    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side.
+
+    A category CATEGORY-MODEL, as `tools/variants.py` makes it, is on the side of CATEGORY.
+    """
     with CONCEPTS.open(newline="") as file:
         sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
     for folder in folders:
         for category in Co3D(folder).categories():
-            if (found := sides.get(category, "no side")) != side:
+            if (found := sides.get(category.partition("-")[0], "no side")) != side:
                 raise InputError(f"{folder}: category {category} is for {found}, expected {side}")

@@ -1,29 +1,33 @@
-"""Fit the constants of the verified solver: the weights of its score, and the calibration of its probabilities.
+"""Fit the constants of the verified solver: weights of the score, of the channels of `agreement`, and the calibration.
 
 Run from the root of the repository. The weights are fitted on training categories, the calibration on validation
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training outputs/training_poses
+    python -m tools.tuning agreement outputs/training outputs/variants --out agreement.safetensors
     python -m tools.tuning calibration outputs/validation outputs/validation_poses
 
-Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values; the constants
-in `zsp_lite/verified` are these, rounded.
+Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well
+they do on categories left out of the fit; the constants in `zsp_lite/verified` are these, rounded.
 
-The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability that one
-is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
+Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
+that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
 weights; if the fitted ones differ much, run the tool again with these as defaults.
 """
 
 import argparse
 import logging
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from safetensors.torch import save_file
 
 from tools.concepts import check_sides
 from zsp_lite.backbones.load import load_backbone
@@ -35,6 +39,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
+from zsp_lite.verified.agreement import channel_agreement
 from zsp_lite.verified.confidence import Calibration, different_poses, modes, reliability
 from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 from zsp_lite.views import View, usable_targets
@@ -43,6 +48,7 @@ CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
+_AGREEMENT_RIDGE, _FOLDS = 2.0, 5
 _CALIBRATION_RIDGE = 1e-3
 _VIEWS = (1, 2, 3, 5, 7, 10)  # of the calibration
 _log = logging.getLogger("zsp_lite.tuning")
@@ -60,6 +66,7 @@ class Outcome:
         angles: (m, m) angles between the hypotheses' rotations in degrees.
         view_std: Standard deviation of the target views' similarity to the reference.
         n_views: Number of usable target views.
+        channels: (m, channels) agreement of every channel (see `verified.agreement`); None without photo features.
     """
 
     category: str
@@ -68,6 +75,17 @@ class Outcome:
     angles: Float[np.ndarray, "m m"]
     view_std: float = 0.0
     n_views: int = 5
+    channels: Float[np.ndarray, "m channels"] | None = None
+
+    @property
+    def correctness(self) -> Float[np.ndarray, " m"]:
+        """How correct each hypothesis is, in [0, 1]."""
+        return np.exp(-np.square(self.errors / _SOFT_ANGLE))
+
+    @property
+    def informative(self) -> bool:
+        """Whether there are several hypotheses, one of them correct enough to learn from."""
+        return len(self.errors) > 1 and bool(self.correctness.max() > _MIN_CORRECTNESS)
 
     def ranked(self, weights: ScoreWeights) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return by how many nats each different pose is below the best under the weights, and its error."""
@@ -121,13 +139,17 @@ def solve_views(
     hypotheses = solution.hypotheses
     # Rotations to the targets' world, which hypotheses in different target views have in common.
     in_world = np.stack([cameras[one.view].R.T @ one.sim3.R for one in hypotheses])
+    scene, channels = solution.scene, None
+    if scene.reference_photo is not None:
+        channels = channel_agreement(scene, solution.poses).double().numpy()
     return Outcome(
         category,
         np.array([[one.terms[name] for name in TERM_NAMES] for one in hypotheses]),
         np.array([rotation_error(one.sim3.R, true[one.view]) for one in hypotheses]),
         rotation_error(in_world[:, None], in_world[None]),
-        solution.scene.view_similarity_std,
+        scene.view_similarity_std,
         len(targets),
+        channels,
     )
 
 
@@ -140,39 +162,86 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     Raises:
         InputError: No pair has a correct hypothesis among several.
     """
-    correctness = [np.exp(-np.square(one.errors / _SOFT_ANGLE)) for one in outcomes]
-    used = [
-        (one.terms - one.terms.mean(axis=0), c)
-        for one, c in zip(outcomes, correctness)
-        if c.max() > _MIN_CORRECTNESS and len(c) > 1
-    ]
+    used = [one for one in outcomes if one.informative]
     if not used:
         raise InputError(f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some")
-    std = np.concatenate([terms for terms, _ in used]).std(axis=0) + 1e-9
+    std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
+    correctness = [one.correctness for one in used]
+    return ScoreWeights(
+        *(conditional_logit([one.terms / std for one in used], correctness, np.full(len(std), ridge)) / std).tolist()
+    )
+
+
+def fit_agreement(
+    outcomes: Sequence[Outcome], weights: ScoreWeights, ridge: float = _AGREEMENT_RIDGE
+) -> Float[np.ndarray, " channels"]:
+    r"""Fit the channel weights of the term `agreement`, in nats of the score without that term.
+
+    That score gets a weight of its own, which is not penalised. Pairs count by one over the root of the number of pairs
+    of their category.
+
+    Args:
+        outcomes: Outcomes with channels.
+        weights: Weights of the score; that of `agreement` is not used.
+        ridge: Penalty on the squared weights, per standard deviation of all channels together.
+
+    Raises:
+        InputError: No pair with channels has a correct hypothesis among several, or the score is of no use on them.
+    """
+    used = [one for one in outcomes if one.informative and one.channels is not None]
+    if not used:
+        raise InputError(f"{len(outcomes)} pairs, none with photo features and a correct hypothesis among several")
+    std = np.concatenate([one.channels - one.channels.mean(axis=0) for one in used]).std()
+    base = np.array(astuple(weights.without("agreement")))
+    columns = [np.column_stack([one.channels / std, one.terms @ base]) for one in used]
+    count = Counter(one.category for one in used)
+    importance = np.array([count[one.category] ** -0.5 for one in used])
+    penalty = np.append(np.full(used[0].channels.shape[1], ridge), 0.0)
+    fitted = conditional_logit(columns, [one.correctness for one in used], penalty, importance)
+    if fitted[-1] <= 0:
+        raise InputError(f"{len(used)} pairs: the score without the term has no positive weight, expected it to help")
+    return fitted[:-1] / (std * fitted[-1])
+
+
+def conditional_logit(
+    columns: Sequence[Float[np.ndarray, "_ k"]], correctness: Sequence[Float[np.ndarray, " _"]],
+    penalty: Float[np.ndarray, " k"], importance: Float[np.ndarray, " pairs"] | None = None,
+) -> Float[np.ndarray, " k"]:  # fmt: skip
+    r"""Fit weights w of hypotheses' columns x so that softmax(x w) is the probability of being correct.
+
+    Minimises -mean_pairs \log \sum_i softmax(x w)_i c_i + \sum_k penalty_k w_k^2.
+
+    Args:
+        columns: For each pair, a row per hypothesis.
+        correctness: For each pair, c of every hypothesis, in [0, 1].
+        penalty: Penalty of every squared weight.
+        importance: Weights of the pairs in the mean; by default equal.
+    """
     # One row per pair, padded to the longest list with hypotheses of probability 0.
-    shape = len(used), max(len(c) for _, c in used)
-    terms = torch.zeros(*shape, len(TERM_NAMES), dtype=torch.float64)
+    shape = len(columns), max(map(len, correctness))
+    x = torch.zeros(*shape, len(penalty), dtype=torch.float64)
     log_correctness = torch.full(shape, -torch.inf, dtype=torch.float64)
     padding = torch.full(shape, -torch.inf, dtype=torch.float64)
-    for row, (some, c) in enumerate(used):
-        terms[row, : len(c)] = torch.from_numpy(some / std)
+    for row, (some, c) in enumerate(zip(columns, correctness)):
+        x[row, : len(c)] = torch.from_numpy(some - some.mean(axis=0))
         log_correctness[row, : len(c)] = torch.from_numpy(np.log(c.clip(1e-12)))
         padding[row, : len(c)] = 0
-
-    w = torch.zeros(len(TERM_NAMES), dtype=torch.float64, requires_grad=True)
+    share = torch.from_numpy(np.ones(len(x)) if importance is None else importance)
+    share, ridge = share / share.sum(), torch.from_numpy(penalty).double()
+    w = torch.zeros(len(penalty), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([w], max_iter=200, line_search_fn="strong_wolfe")
 
     def loss() -> Float[torch.Tensor, ""]:
         optimiser.zero_grad()
-        score = terms @ w + padding
+        score = x @ w + padding
         negative = torch.logsumexp(score, dim=1) - torch.logsumexp(score + log_correctness, dim=1)
-        value = negative.mean() + ridge * w.square().sum()
+        value = share @ negative + ridge @ w.square()
         value.backward()
         return value
 
     with torch.enable_grad():
         optimiser.step(loss)
-    return ScoreWeights(*(float(value) for value in w.detach().numpy() / std))
+    return w.detach().numpy()
 
 
 def fit_calibration(
@@ -223,17 +292,26 @@ def fit_calibration(
     )
 
 
-def leave_one_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit]) -> list[_Fit]:
-    """Return for each outcome the fit to the outcomes of all other categories."""
-    categories = dict.fromkeys(one.category for one in outcomes)
-    fitted = {name: fit([one for one in outcomes if one.category != name]) for name in categories}
-    return [fitted[one.category] for one in outcomes]
+def leave_out(
+    outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit], folds: int | None = None
+) -> list[_Fit]:
+    """Return for each outcome a fit that has not seen its category.
+
+    Args:
+        outcomes: Outcomes of several categories.
+        fit: The fit.
+        folds: Number of parts into which the categories are divided; each is left out once. By default one category.
+    """
+    categories = list(dict.fromkeys(one.category for one in outcomes))
+    part = {name: index % (folds or len(categories)) for index, name in enumerate(categories)}
+    fitted = {index: fit([one for one in outcomes if part[one.category] != index]) for index in set(part.values())}
+    return [fitted[part[one.category]] for one in outcomes]
 
 
 def report_weights(outcomes: Sequence[Outcome]) -> list[str]:
     """Format the fit of the weights and its accuracy on categories that the fit has not seen."""
     present, fitted = ScoreWeights(), fit_weights(outcomes)
-    held_out = leave_one_out(outcomes, fit_weights)
+    held_out = leave_out(outcomes, fit_weights)
     rows = (
         ("present weights", [one.ranked(present)[1][0] for one in outcomes]),
         ("fitted weights, held-out category", [one.ranked(w)[1][0] for one, w in zip(outcomes, held_out)]),
@@ -247,10 +325,26 @@ def report_weights(outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
+def report_agreement(outcomes: Sequence[Outcome], weights: ScoreWeights, fitted: Float[np.ndarray, " c"]) -> list[str]:
+    """Format what the term `agreement` gains with fitted weights, on categories that the fit has not seen."""
+    used = [one for one in outcomes if one.channels is not None]
+    rest = np.array(astuple(weights.without("agreement")))
+    held_out = leave_out(used, lambda some: fit_agreement(some, weights), _FOLDS)
+    before = np.array([one.errors[(one.terms @ rest).argmax()] for one in used])
+    after = np.array([one.errors[(one.terms @ rest + one.channels @ w).argmax()] for one, w in zip(used, held_out)])
+    won, lost = ((one < CORRECT_ANGLE) & (two >= CORRECT_ANGLE) for one, two in ((after, before), (before, after)))
+    return [
+        f"{len(used)} pairs of {len({one.category for one in used})} categories",
+        f"without the term                   {_accuracy(before)}",
+        f"with it, held-out category         {_accuracy(after)}: {won.sum()} pairs won, {lost.sum()} lost",
+        f"{len(fitted)} channel weights, root mean square {np.sqrt(np.mean(fitted**2)):.1f} nats",
+    ]
+
+
 def report_calibration(outcomes: Sequence[Outcome], weights: ScoreWeights) -> list[str]:
     """Format the fit of the calibration, and how well it holds on categories that the fit has not seen."""
     fitted = fit_calibration(outcomes, weights)
-    held_out = leave_one_out(outcomes, lambda some: fit_calibration(some, weights))
+    held_out = leave_out(outcomes, lambda some: fit_calibration(some, weights))
     first, others = [], []
     for one, calibration in zip(outcomes, held_out):
         deficit, error = one.ranked(weights)
@@ -293,14 +387,17 @@ def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
-    parser.add_argument("constants", choices=("weights", "calibration"), help="what to fit")
+    parser.add_argument("constants", choices=("weights", "agreement", "calibration"), help="what to fit")
     parser.add_argument("root", nargs="+", help="folder of categories in CO3D's layout, with pose labels")
     parser.add_argument("--pairs", type=int, default=30, metavar="N", help="pairs per category (default 30)")
     parser.add_argument("--backbone", action="append", metavar="NAME", help=f"may be repeated (default {DEFAULT})")
+    parser.add_argument("--out", type=Path, help="file of weights to write, for agreement")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    calibrate = given.constants == "calibration"
+    calibrate, agreement = given.constants == "calibration", given.constants == "agreement"
     try:
+        if agreement != (given.out is not None):
+            raise InputError("--out names the file of `agreement`; expected it there, and there only")
         check_sides(given.root, "validation" if calibrate else "training")
         with torch.no_grad():
             outcomes = [
@@ -310,7 +407,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 for n in (_VIEWS if calibrate else (5,))
                 for one in collect_outcomes(root, given.pairs, backbone, n)
             ]
-        print("\n".join(report_calibration(outcomes, ScoreWeights()) if calibrate else report_weights(outcomes)))
+        if agreement:
+            fitted = fit_agreement(outcomes, ScoreWeights())
+            save_file({"weights": torch.from_numpy(fitted).float()}, given.out)
+            print("\n".join(report_agreement(outcomes, ScoreWeights(), fitted)))
+        else:
+            print("\n".join(report_calibration(outcomes, ScoreWeights()) if calibrate else report_weights(outcomes)))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -86,13 +86,24 @@ class ModelInstances:
             meshes, extents = [meshes[0]] * 2, [extents[0]] * 2
         common = np.sqrt(extents[0] * extents[1])
         self._instances = [
-            Instance(_deformed(_recoloured(mesh, rng), rng, deformation), mesh.vertices / extent * common)
+            Instance(altered_copy(mesh, rng, deformation), mesh.vertices / extent * common)
             for mesh, extent in zip(meshes, extents, strict=True)
         ]
 
     def instance(self, view: int) -> Instance:
         """Return the instance of an even or odd view."""
         return self._instances[view % 2]
+
+
+def altered_copy(mesh: TexturedMesh, rng: np.random.Generator, deformation: float = 1.0) -> TexturedMesh:
+    """Return a deformed copy of a mesh in other colours; vertices correspond.
+
+    Args:
+        mesh: The mesh.
+        rng: Source of the draws.
+        deformation: Amount of the deformation.
+    """
+    return _deformed(_recoloured(mesh, rng), rng, deformation)
 
 
 @lru_cache(maxsize=2)
