@@ -13,7 +13,7 @@ from zsp_lite.verified.verification import ScoreWeights
 
 
 def test_each_row_lacks_its_part_and_no_other():
-    weights = ScoreWeights().without("orientation")
+    weights = ScoreWeights().without("orientation", "agreement")
     solvers = {name: row.settings["solver"] for name, row in rows().items()}
     assert solvers[WHOLE].weights == weights and solvers[WHOLE].icp and solvers[WHOLE].refinement
     assert solvers["view term"].weights == weights.without("viewpoint")

@@ -5,8 +5,9 @@ Run from the root of the repository; docs/rebuild.md makes the data:
     python -m tools.parts outputs/parts outputs/training_poses outputs/training
 
 The tool runs the benchmark on every folder, or continues it, keeps the errors of all pairs in `outputs/parts`, and
-prints the differences to the whole solver on the same pairs. The term `orientation` is left out of all rows, because
-the position head was trained on these objects. Folders with categories of another side (`concepts.csv`) are refused.
+prints the differences to the whole solver on the same pairs. The terms `orientation` and `agreement` are left out of
+all rows, because they were trained on these objects. Folders with categories of another side (`concepts.csv`) are
+refused.
 """
 
 import argparse
@@ -50,7 +51,9 @@ _PARTS: dict[str, tuple[tuple[str, ...], dict[str, bool]]] = {
 def rows() -> dict[str, Method]:
     """Return the benchmark's rows: the whole solver, and the solver without one part or several."""
     return {
-        name: Method(settings={"solver": VerifiedSolver(ScoreWeights().without("orientation", *terms), **settings)})
+        name: Method(
+            settings={"solver": VerifiedSolver(ScoreWeights().without("orientation", "agreement", *terms), **settings)}
+        )
         for name, (terms, settings) in _PARTS.items()
     }
 
