@@ -13,6 +13,7 @@ from tools.tuning import Outcome, fit_agreement, main, report_agreement
 from tools.variants import render_variants
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.best_view import ViewPair
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -106,25 +107,35 @@ def test_photo_features_are_read_at_the_centres_of_patches(views):
     torch.testing.assert_close(turned.features.photo[-1, 0], photo[0, 0])
 
 
-def test_without_fitting_photo_features_the_term_is_zero(scene, poses):
+def test_without_fitting_photo_features_the_term_is_zero(scene, poses, views):
     assert len(channel_weights()) == 640
     assert (agreement_term(replace(scene, reference_photo=None, target_photo=None), poses) == 0).all()
-    assert (agreement_term(scene, poses) == 0).all()  # of another network
+    assert (agreement_term(scene, poses) == 0).all()  # another number of channels
+    bare = replace(views[1], features=replace(views[1].features, photo=None))
+    sims = similarities(views[0].features, [bare.features, views[2].features])
+    assert build_scene(views[0], [bare, views[2]], sims).target_photo is None
+
+
+def test_constant_photo_features_agree_nowhere(scene, poses):
+    flat = replace(
+        scene,
+        reference_photo=torch.full_like(scene.reference_photo, 0.3),
+        target_photo=torch.ones_like(scene.target_photo),
+    )
+    assert channel_agreement(flat, poses).abs().max() < 1e-6
 
 
 def test_the_default_backbone_has_photo_features_and_the_term_enters_the_score(views):
     image = np.random.default_rng(0).integers(0, 255, (60, 60, 3), np.uint8)
     assert load_backbone("zsp-tiny-photo", "cpu")([image])[0].photo.shape == (14, 14, 320)
     assert load_backbone("zsp-tiny", "cpu")([image])[0].photo is None
+    assert load_backbone("effnet-lite0+zsp-tiny-photo", "cpu")([image])[0].photo.shape == (14, 14, 320)
     rng = torch.Generator().manual_seed(0)
     some = [
         replace(view, features=replace(view.features, photo=torch.rand(14, 14, 320, generator=rng))) for view in views
     ]
     found = similarities(some[0].features, [target.features for target in some[1:]])
     matches = [match(some[0].features, target.features, sim=sim) for target, sim in zip(some[1:], found)]
-    scene = build_scene(some[0], some[1:], found, matches)
-    from zsp_lite.best_view import ViewPair
-
     pairs = [
         ViewPair(some[0].features, one.features, some[0].foreground, one.foreground, sim, matched, 50)
         for one, sim, matched in zip(some[1:], found, matches)
@@ -133,7 +144,7 @@ def test_the_default_backbone_has_photo_features_and_the_term_enters_the_score(v
         VerifiedSolver(weights).solve(some[0], some[1:], pairs)
         for weights in (ScoreWeights(), ScoreWeights().without("agreement"))
     )
-    assert scene.target_photo.shape == (len(scene.target_points), 320)
+    assert with_term.scene.target_photo.shape == (len(with_term.scene.target_points), 320)
     best = with_term.hypotheses[0]
     assert best.terms["agreement"] != 0
     same = [one for one in without.hypotheses if np.allclose(one.sim3.matrix, best.sim3.matrix)]
@@ -143,6 +154,8 @@ def test_the_default_backbone_has_photo_features_and_the_term_enters_the_score(v
 def test_photo_features_of_a_wrong_shape_are_refused():
     with pytest.raises(InputError, match=r"photo has shape \(2, 2\), expected \(h, w, C\)"):
         FeatureMap(torch.zeros(2, 3, 4), torch.zeros(2, 3), torch.zeros(4), photo=torch.zeros(2, 2))
+    with pytest.raises(InputError, match="photo hold values that are not finite"):
+        FeatureMap(torch.zeros(2, 3, 4), torch.zeros(2, 3), torch.zeros(4), photo=torch.full((1, 1, 2), torch.nan))
 
 
 def made_up(n: int, rng: np.random.Generator) -> list[Outcome]:
@@ -176,7 +189,7 @@ def test_the_channel_that_tells_is_found():
 
 def test_the_command_asks_for_a_file(tmp_path, capsys):
     assert main(["agreement", str(tmp_path)]) == 2
-    assert "--out names the file" in capsys.readouterr().err
+    assert "--out FILE is required" in capsys.readouterr().err
 
 
 @pytest.mark.slow

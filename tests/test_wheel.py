@@ -48,7 +48,8 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel):
         fields = Parser().parsestr(archive.read(metadata).decode())
     assert {name.split("/")[0] for name in names} == {"zsp_lite", metadata.split("/")[0]}
     assert "zsp_lite/data/co3d_archives.json" in names and "zsp_lite/weights/zsp-tiny.safetensors" in names
-    assert {"zsp_lite/weights/zsp-tiny-photo.safetensors", "zsp_lite/weights/SHA256SUMS"} <= set(names)
+    weights = ("zsp-tiny-photo.safetensors", "agreement.safetensors", "SHA256SUMS")
+    assert {f"zsp_lite/weights/{name}" for name in weights} <= set(names)
     assert not [name for name in names if "/earlier/" in name]
     assert fields["Name"] == "zsp-lite" and fields["License-Expression"] == "MIT"
     assert fields["Description-Content-Type"] == "text/markdown" and fields["Requires-Python"] == ">=3.11"

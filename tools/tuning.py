@@ -4,11 +4,14 @@ Run from the root of the repository. The weights are fitted on training categori
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training outputs/training_poses
-    python -m tools.tuning agreement outputs/training outputs/variants --out agreement.safetensors
+    python -m tools.tuning agreement outputs/training8 outputs/variants --out agreement.safetensors
     python -m tools.tuning calibration outputs/validation outputs/validation_poses
 
 Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well
 they do on categories left out of the fit; the constants in `zsp_lite/verified` are these, rounded.
+
+The terms `orientation` and `agreement` were trained on training categories themselves. There, the fit of the weights
+leaves both out and prints 0 for them, and that of the agreement leaves out `orientation`.
 
 Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
 that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
@@ -20,7 +23,7 @@ import logging
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,6 +54,7 @@ _WEIGHT_RIDGE = 1e-2
 _AGREEMENT_RIDGE, _FOLDS = 2.0, 5
 _CALIBRATION_RIDGE = 1e-3
 _VIEWS = (1, 2, 3, 5, 7, 10)  # of the calibration
+_UNTRAINED = np.array([name not in ("orientation", "agreement") for name in TERM_NAMES])
 _log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
@@ -166,10 +170,8 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     if not used:
         raise InputError(f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some")
     std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
-    correctness = [one.correctness for one in used]
-    return ScoreWeights(
-        *(conditional_logit([one.terms / std for one in used], correctness, np.full(len(std), ridge)) / std).tolist()
-    )
+    columns, correctness = [one.terms / std for one in used], [one.correctness for one in used]
+    return ScoreWeights(*(conditional_logit(columns, correctness, np.full(len(std), ridge)) / std).tolist())
 
 
 def fit_agreement(
@@ -279,7 +281,10 @@ def fit_calibration(
         scale = torch.exp(theta[0] + theta[1] * x[:, 0])
         none = theta[2] + x @ theta[3:]
         logits = torch.cat([-scale[:, None] * deficits, none[:, None]], dim=1)
-        value = torch.nn.functional.cross_entropy(logits, target) + ridge * theta[[1, 3, 4, 5]].square().sum()
+        value = (
+            torch.nn.functional.cross_entropy(logits, target)
+            + ridge * torch.cat([theta[1:2], theta[3:]]).square().sum()
+        )
         value.backward()
         return value
 
@@ -397,7 +402,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     calibrate, agreement = given.constants == "calibration", given.constants == "agreement"
     try:
         if agreement != (given.out is not None):
-            raise InputError("--out names the file of `agreement`; expected it there, and there only")
+            raise InputError("--out FILE is required for `agreement` and refused otherwise")
+        if agreement and not given.out.absolute().parent.is_dir():
+            raise InputError(f"--out {given.out}: folder {given.out.parent} does not exist")
         check_sides(given.root, "validation" if calibrate else "training")
         with torch.no_grad():
             outcomes = [
@@ -408,11 +415,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 for one in collect_outcomes(root, given.pairs, backbone, n)
             ]
         if agreement:
-            fitted = fit_agreement(outcomes, ScoreWeights())
+            weights = ScoreWeights().without("orientation")
+            fitted = fit_agreement(outcomes, weights)
+            print("\n".join(report_agreement(outcomes, weights, fitted)))
             save_file({"weights": torch.from_numpy(fitted).float()}, given.out)
-            print("\n".join(report_agreement(outcomes, ScoreWeights(), fitted)))
+        elif calibrate:
+            print("\n".join(report_calibration(outcomes, ScoreWeights())))
         else:
-            print("\n".join(report_calibration(outcomes, ScoreWeights()) if calibrate else report_weights(outcomes)))
+            print("\n".join(report_weights([replace(one, terms=one.terms * _UNTRAINED) for one in outcomes])))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

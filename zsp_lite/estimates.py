@@ -73,7 +73,8 @@ class PoseEstimate:
         sim3: Reference-camera points to camera points of the chosen target view.
         view: Index of the chosen target view.
         matches: Matches between the reference and the chosen view.
-        inliers: (K,) the matches that agree with the pose.
+        inliers: (K,) the matches that agree with the pose; with the verified solver, of those with measured depth on
+            both sides.
         view_scores: (N,) score of every target view, higher is better; -inf for views that were left out.
         reference_view: Crop, features and foreground of the reference.
         target_views: The same of all N target views.

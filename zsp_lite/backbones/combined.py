@@ -24,8 +24,8 @@ class CombinedBackbone:
 
     The keys of each part are interpolated to the grid of the first part, normalised to unit length and multiplied by
     the part's weight; the cosine similarity of two patches is then the mean of the parts' cosines, weighted by the
-    squares of the weights. Log-binning follows, as for any keys. Saliency and global feature are those of the first
-    part that has a saliency of its own, or of the first part if none has.
+    squares of the weights. Log-binning follows, as for any keys. Saliency, global feature, positions and photo
+    features are those of the first part that has a saliency of its own, or of the first part if none has.
 
     Args:
         parts: The backbones, all on one device.

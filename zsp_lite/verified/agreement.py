@@ -27,7 +27,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from zsp_lite.backbones.pretrained import WEIGHTS, check_shipped
-from zsp_lite.verified.poses import Poses
+from zsp_lite.verified.poses import Poses, exp_
 from zsp_lite.verified.scene import Scene
 
 CHANNEL_WEIGHTS = WEIGHTS / "agreement.safetensors"
@@ -51,18 +51,17 @@ def channel_agreement(scene: Scene, poses: Poses) -> Float[Tensor, "m channels"]
     inverse = poses.inverse()
     moved = inverse.apply(scene.target_points[columns])
     squared = torch.cdist(scene.reference_points[rows].expand(len(poses), -1, -1), moved).square_()
-    kernel = squared.mul_(-0.5 / _SIGMA**2).exp_()
+    kernel = exp_(squared.mul_(-0.5 / _SIGMA**2))
     near_reference = kernel @ target / (kernel.sum(dim=2, keepdim=True) + _PRIOR)
     near_target = kernel.transpose(1, 2) @ reference / (kernel.sum(dim=1)[..., None] + _PRIOR)
     return torch.cat([(near_reference * reference).mean(dim=1), (near_target * target).mean(dim=1)], dim=1)
 
 
 def agreement_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the agreement term; 0 for a scene without photo features, or with those of another network."""
-    weights = channel_weights()
-    if scene.reference_photo is None or 2 * scene.reference_photo.shape[1] != len(weights):
+    """Compute the agreement term; 0 for a scene without photo features, or with another number of channels."""
+    if scene.reference_photo is None or 2 * scene.reference_photo.shape[1] != len(channel_weights()):
         return torch.zeros(len(poses))
-    return channel_agreement(scene, poses) @ weights
+    return channel_agreement(scene, poses) @ channel_weights()
 
 
 @lru_cache(maxsize=1)
@@ -78,4 +77,4 @@ def _spaced(n: int, most: int) -> Int[Tensor, " k"]:
 
 def _descriptors(photo: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
     photo = F.layer_norm(photo, photo.shape[1:])
-    return F.normalize(photo - photo.mean(dim=0), dim=1)
+    return F.normalize(photo - photo.mean(dim=0), dim=1, eps=1e-3)  # equal features have no direction

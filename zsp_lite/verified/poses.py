@@ -83,7 +83,7 @@ def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) ->
 
 
 def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Compute exp(x) in place. Below exp(-80) the result is exp(-80), because underflow takes ten times as long."""
+    """Compute exp(max(x, -80)) in place: underflow would take ten times as long."""
     return x.clamp_min_(-80).exp_()
 
 

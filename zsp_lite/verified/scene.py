@@ -27,7 +27,7 @@ from zsp_lite.views import View
 # the depth of the background.
 _OUTLIER_DISTANCE = 3.0
 _DENSITY_SIGMA = 0.25  # working units
-_DENSITY_ROWS = 200
+_DENSITY_ROWS = 200  # points at a time
 # Fewer points do not determine a shape to align.
 MIN_POINTS = 8
 
@@ -55,8 +55,8 @@ class Scene:
         reference_axes: Rotation from the working frame of the reference to its object's axes, as predicted from the
             reference view (see `object_axes`); None if the features have no positions.
         target_axes: (v,) the same of each target view, from the working frame of the targets; None if one has none.
-        reference_photo: Photo features at the reference's points (see `features.FeatureMap`); None without them.
-        target_photo: The same at the targets' points.
+        reference_photo: (n, c) photo features at the reference's points (see `features.FeatureMap`); None without them.
+        target_photo: (m, c) the same at the targets' points.
     """
 
     reference_points: Float[Tensor, "n 3"]

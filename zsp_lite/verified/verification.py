@@ -103,7 +103,10 @@ FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint", "orien
 
 @dataclass(frozen=True)
 class ScoreWeights:
-    """The weight of each term, in nats. The defaults were fitted on objects of training categories and rounded."""
+    """The weight of each term, in nats. The defaults were fitted on objects of training categories and rounded.
+
+    That of `agreement` is 1, because its channel weights are in nats.
+    """
 
     forward_similarity: float = 60.0
     forward_overlap: float = 5.0
