@@ -1,4 +1,4 @@
-"""The figures of the verified solver with a position head in docs/results.md are those of its stored runs."""
+"""The figures of the verified solver in docs/results.md are those of its stored runs."""
 
 import re
 
@@ -9,25 +9,25 @@ from zsp_lite.benchmark.results import read_results
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.verified.confidence import reliability
 
-RUNS = {
-    name: REPOSITORY / "notebooks" / "results" / "verified_run" / f"{name}.json.gz"
-    for name in ("artists", "procedural")
+RESULTS = REPOSITORY / "notebooks" / "results"
+SECTIONS = {
+    "verified_run": "The verified solver with agreement of photo features",
+    "position_head_run": "The verified solver with a position head",
 }
 
 
-@pytest.fixture(scope="module", params=RUNS)
+@pytest.fixture(scope="module", params=[(run, name) for run in SECTIONS for name in ("artists", "procedural")], ids=str)
 def run(request):
-    return request.param, read_results(RUNS[request.param])
-
-
-def section() -> str:
+    """The data's name, the stored results, and the section about them."""
+    folder, name = request.param
     text = (REPOSITORY / "docs" / "results.md").read_text()
-    return text[text.index("\n## The verified solver with a position head") :].split("\n## ")[1]
+    section = text[text.index(f"\n## {SECTIONS[folder]}\n") :].split("\n## ")[1]
+    return name, read_results(RESULTS / folder / f"{name}.json.gz"), section
 
 
 def test_the_table_has_the_figures(run):
-    name, found = run
-    lines = re.findall(r"^\| `([\w-]+)`[^|]*\|(.+)\|$", section(), re.MULTILINE)
+    name, found, section = run
+    lines = re.findall(r"^\| `([\w-]+)`[^|]*\|(.+)\|$", section, re.MULTILINE)
     seen = set()
     for row, line in lines:
         cells = line.split("|")[:3] if name == "artists" else line.split("|")[3:]
@@ -41,11 +41,11 @@ def test_the_table_has_the_figures(run):
 
 
 def test_the_confidences_are_as_stated(run):
-    name, found = run
+    name, found, section = run
     confidence = np.array(list(found.confidences("verified").values()))
     error = np.array(list(found.errors("verified").values()))
     measured = reliability(confidence, error < 30)
-    text = " ".join(section().split())
+    text = " ".join(section.split())
     part = text[text.index("Confidence of `verified`") : text.index("The aims were")].split("On procedural pairs")
     stated = part[0 if name == "artists" else 1]
     assert f"mean {100 * confidence.mean():.0f} %, right {100 * (error < 30).mean():.0f} %" in stated
