@@ -12,6 +12,7 @@ P S: a dozen additions of S to itself.
 
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 from typing import Literal
 
@@ -21,6 +22,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from zsp_lite.arguments import checked
@@ -337,15 +339,21 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = Tr
     return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
+@lru_cache(maxsize=1)
+def _thread_pools() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels.
 
     The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
     products, hence the same distances. k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
+    One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
     """
-    values, vectors = np.linalg.eigh(gram)
-    points = vectors * np.sqrt(np.maximum(values, 0.0))
-    with warnings.catch_warnings():
+    with _thread_pools().limit(limits=1, user_api="blas"), warnings.catch_warnings():
+        values, vectors = np.linalg.eigh(gram)
+        points = vectors * np.sqrt(np.maximum(values, 0.0))
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
