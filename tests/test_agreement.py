@@ -147,6 +147,10 @@ def test_the_default_backbone_has_photo_features_and_the_term_enters_the_score(v
     assert with_term.scene.target_photo.shape == (len(with_term.scene.target_points), 320)
     best = with_term.hypotheses[0]
     assert best.terms["agreement"] != 0
+    torch.testing.assert_close(
+        agreement_term(with_term.scene, with_term.poses),
+        channel_agreement(with_term.scene, with_term.poses) @ channel_weights(),
+    )
     same = [one for one in without.hypotheses if np.allclose(one.sim3.matrix, best.sim3.matrix)]
     assert same and same[0].score == pytest.approx(best.score - best.terms["agreement"], abs=1e-3)
 

@@ -43,25 +43,38 @@ def channel_agreement(scene: Scene, poses: Poses) -> Float[Tensor, "m channels"]
         scene: Scene with photo features.
         poses: The m poses.
     """
+    reference, target, kernel = _near_points(scene, poses)
+    forward = kernel @ target / (kernel.sum(dim=2, keepdim=True) + _PRIOR)
+    reverse = kernel.transpose(1, 2) @ reference / (kernel.sum(dim=1)[..., None] + _PRIOR)
+    return torch.cat([(forward * reference).mean(dim=1), (reverse * target).mean(dim=1)], dim=1)
+
+
+def agreement_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
+    """Compute the agreement term; 0 for a scene without photo features, or with another number of channels.
+
+    The weighted sum over the channels is taken before that over the points: it does not depend on the pose.
+    """
+    if scene.reference_photo is None or 2 * scene.reference_photo.shape[1] != len(channel_weights()):
+        return torch.zeros(len(poses))
+    reference, target, kernel = _near_points(scene, poses)
+    forward, reverse = ((reference * weights) @ target.T for weights in channel_weights().chunk(2))
+    forward = (kernel * forward).sum(dim=2) / (kernel.sum(dim=2) + _PRIOR)
+    reverse = (kernel * reverse).sum(dim=1) / (kernel.sum(dim=1) + _PRIOR)
+    return forward.mean(dim=1) + reverse.mean(dim=1)
+
+
+def _near_points(
+    scene: Scene, poses: Poses
+) -> tuple[Float[Tensor, "n c"], Float[Tensor, "k c"], Float[Tensor, "m n k"]]:
+    """Return the descriptors of some points of the reference and of the targets, and their kernel K under the poses."""
     rows, columns = (
         _spaced(len(points), most)
         for points, most in ((scene.reference_points, _REFERENCE_POINTS), (scene.target_points, _TARGET_POINTS))
     )
-    reference, target = _descriptors(scene.reference_photo)[rows], _descriptors(scene.target_photo)[columns]
-    inverse = poses.inverse()
-    moved = inverse.apply(scene.target_points[columns])
+    moved = poses.inverse().apply(scene.target_points[columns])
     squared = torch.cdist(scene.reference_points[rows].expand(len(poses), -1, -1), moved).square_()
     kernel = exp_(squared.mul_(-0.5 / _SIGMA**2))
-    near_reference = kernel @ target / (kernel.sum(dim=2, keepdim=True) + _PRIOR)
-    near_target = kernel.transpose(1, 2) @ reference / (kernel.sum(dim=1)[..., None] + _PRIOR)
-    return torch.cat([(near_reference * reference).mean(dim=1), (near_target * target).mean(dim=1)], dim=1)
-
-
-def agreement_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the agreement term; 0 for a scene without photo features, or with another number of channels."""
-    if scene.reference_photo is None or 2 * scene.reference_photo.shape[1] != len(channel_weights()):
-        return torch.zeros(len(poses))
-    return channel_agreement(scene, poses) @ channel_weights()
+    return _descriptors(scene.reference_photo)[rows], _descriptors(scene.target_photo)[columns], kernel
 
 
 @lru_cache(maxsize=1)

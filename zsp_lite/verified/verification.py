@@ -3,7 +3,8 @@ r"""The score of a pose: a weighted sum of eleven terms that compare it with eve
     S(T) = \sum_k w_k \phi_k(T)
 
 Four terms project the n reference points into the V target views (`forward_*`), four project the target points into
-the reference view (`reverse_*`, then V = 1), and two compare views as a whole.
+the reference view (`reverse_*`, then V = 1), two compare views as a whole, and one compares photo features near each
+point.
 
 Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth d of weight m (the
 soft mask, 0 where the depth is unknown), at distance r from the silhouette. With \delta = z - d (positive behind the
@@ -69,7 +70,7 @@ _CHUNK = 250_000
 
 @dataclass(frozen=True, eq=False)
 class ScoreTerms:
-    """The terms of m poses as (m,) tensors. A correct pose has high similarity, overlap and viewpoint, low others."""
+    """The terms of m poses as (m,) tensors. A correct pose has low silhouettes and free space, high others."""
 
     forward_similarity: Float[Tensor, " m"]
     forward_overlap: Float[Tensor, " m"]
@@ -214,9 +215,9 @@ def orientation_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
     """Compute the orientation term: high if the object axes that the views predict agree under the pose."""
     if scene.reference_axes is None or scene.target_axes is None:
         return torch.zeros(len(poses))
-    moved = scene.target_axes[:, None] @ poses.rotation  # (v, m, 3, 3), from the reference to the object's axes
-    angle = rotation_angles(moved.flatten(0, 1), scene.reference_axes[None]).view(moved.shape[:2])
-    return torch.exp(-((angle / ORIENTATION_SIGMA) ** 2)).mean(dim=0)
+    # The angle between A_0 and A_v R is that between R and A_v^T A_0.
+    angle = rotation_angles(poses.rotation, scene.target_axes.transpose(1, 2) @ scene.reference_axes)
+    return torch.exp(-((angle / ORIENTATION_SIGMA) ** 2)).mean(dim=1)
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
