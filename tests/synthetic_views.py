@@ -13,6 +13,9 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.features import FeatureMap
+from zsp_lite.matching import match, similarities
+from zsp_lite.verified.scene import Scene, build_scene
+from zsp_lite.views import View
 
 AXES = np.array([1.2, 0.8, 0.6])
 REACH = 1.6  # colours map [-REACH, REACH]
@@ -101,3 +104,18 @@ def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placeme
     """Reference-camera points to target-camera points, for the same object at two placements."""
     first = Sim3(1.0, reference.R, reference.t) @ placement
     return Sim3(1.0, target.R, target.t) @ target_placement @ first.inverse()
+
+
+def reference_and_targets() -> list[Frame]:
+    """A frame of the object at home, and three of the object elsewhere."""
+    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:3]]
+    targets = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
+    return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *targets]
+
+
+def matched_scene(views: list[View]) -> Scene:
+    """The verified solver's scene of a reference view and its target views."""
+    reference, *targets = views
+    found = similarities(reference.features, [target.features for target in targets])
+    matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
+    return build_scene(reference, targets, found, matches)

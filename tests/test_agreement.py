@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from model_files import write_wedge
-from synthetic_views import ELSEWHERE, CoordinateBackbone, look_at, render, true_pose
+from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, reference_and_targets, true_pose
 
 from tools.concepts import check_sides
 from tools.tuning import Outcome, fit_agreement, main, report_agreement
@@ -26,15 +26,12 @@ from zsp_lite.verified.scene import build_scene, photo_features
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 from zsp_lite.views import extract_views, object_crop, turn_view
 
-DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2)]
 CHANNELS = 6
 
 
 @pytest.fixture(scope="module")
 def frames():
-    cameras = [look_at(direction, distance=4.5) for direction in DIRECTIONS]
-    cameras = [replace(camera, R=camera.R @ ELSEWHERE.R.T) for camera in cameras]
-    return [render(look_at((1, 0.6, 0.4)), Sim3.identity()), *(render(camera, ELSEWHERE) for camera in cameras)]
+    return reference_and_targets()
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +47,7 @@ def views(frames):
 
 @pytest.fixture(scope="module")
 def scene(views):
-    reference, *targets = views
-    found = similarities(reference.features, [target.features for target in targets])
-    matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
-    return build_scene(reference, targets, found, matches)
+    return matched_scene(views)
 
 
 @pytest.fixture(scope="module")

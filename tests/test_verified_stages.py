@@ -7,7 +7,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+from synthetic_views import (
+    ELSEWHERE,
+    CoordinateBackbone,
+    look_at,
+    matched_scene,
+    reference_and_targets,
+    true_pose,
+)
 
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.cameras import Camera
@@ -50,8 +57,6 @@ from zsp_lite.verified.verification import (
 )
 from zsp_lite.views import View, extract_views, object_crop
 
-ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
-DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2)]
 seeds = st.integers(0, 2**31)
 
 
@@ -67,10 +72,7 @@ def as_poses(*sim3s: Sim3) -> Poses:
 
 @pytest.fixture(scope="module")
 def frames():
-    reference = render(look_at((1, 0.6, 0.4)), Sim3.identity(), "reference")
-    cameras = [look_at(direction, distance=4.5) for direction in DIRECTIONS]
-    cameras = [replace(camera, R=camera.R @ ELSEWHERE.R.T) for camera in cameras]
-    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+    return reference_and_targets()
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +82,7 @@ def views(frames):
 
 @pytest.fixture(scope="module")
 def scene(views):
-    from zsp_lite.matching import match, similarities
-
-    reference, *targets = views
-    found = similarities(reference.features, [target.features for target in targets])
-    matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
-    return build_scene(reference, targets, found, matches)
+    return matched_scene(views)
 
 
 @pytest.fixture(scope="module")
