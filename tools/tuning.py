@@ -105,26 +105,35 @@ class Outcome:
 
 
 def collect_outcomes(
-    root: str, pairs: int, backbone: Any, n_targets: int = 5, seed: int = 0, solver: VerifiedSolver | None = None
-) -> list[Outcome]:
-    """Run the verified solver on `pairs` pairs of each category of a folder.
+    root: str, pairs: int, backbone: Any, numbers: Sequence[int] = (5,), seed: int = 0,
+    solver: VerifiedSolver | None = None,
+) -> list[Outcome]:  # fmt: skip
+    """Run the verified solver on `pairs` pairs of each category of a folder, for each of the numbers of target views.
+
+    Features are extracted once per image.
 
     Raises:
         InputError: A sequence has no pose label.
     """
     dataset, outcomes = Co3D(root), []
     for category in dataset.categories():
-        labels = read_labels(root, category)
-        found = []
-        for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-            method = ZeroShotPose(backbone, seed=pair.seed)
-            reference, targets = dataset.load_pair(pair)
-            reference, *targets = method.views([reference, *targets])
-            ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-            found.append(solve_views(method, category, reference, targets, ends, solver or VerifiedSolver()))
-        outcomes += found
-        accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
-        _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)
+        labels, views = read_labels(root, category), {}
+        for n_targets in numbers:
+            found = []
+            for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
+                method = ZeroShotPose(backbone, seed=pair.seed)
+                frames = [
+                    (pair.reference_sequence, pair.reference_frame),
+                    *((pair.target_sequence, number) for number in pair.target_frames),
+                ]
+                new = [one for one in frames if one not in views]
+                views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
+                reference, *targets = (views[one] for one in frames)
+                ends = labels[pair.reference_sequence], labels[pair.target_sequence]
+                found.append(solve_views(method, category, reference, targets, ends, solver or VerifiedSolver()))
+            outcomes += found
+            accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
+            _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)
     return outcomes
 
 
@@ -251,6 +260,8 @@ def fit_calibration(
 ) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
+    Every category counts the same, whatever its number of outcomes: users bring categories, and some are easier.
+
     Args:
         outcomes: Outcomes for several numbers of views.
         weights: Weights of the score.
@@ -269,6 +280,8 @@ def fit_calibration(
     for row, (deficit, _) in zip(deficits, ranked):
         row[: len(deficit)] = torch.from_numpy(deficit)
     target = torch.tensor([int(found[0]) if len(found) else most for found in right])
+    count = Counter(one.category for one in outcomes)
+    importance = torch.tensor([1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64)
     inputs = np.array([one.circumstances(weights) for one in outcomes])
     inputs[:, 0] = np.log(inputs[:, 0])
     mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
@@ -281,10 +294,8 @@ def fit_calibration(
         scale = torch.exp(theta[0] + theta[1] * x[:, 0])
         none = theta[2] + x @ theta[3:]
         logits = torch.cat([-scale[:, None] * deficits, none[:, None]], dim=1)
-        value = (
-            torch.nn.functional.cross_entropy(logits, target)
-            + ridge * torch.cat([theta[1:2], theta[3:]]).square().sum()
-        )
+        negative = torch.nn.functional.cross_entropy(logits, target, reduction="none")
+        value = importance @ negative + ridge * torch.cat([theta[1:2], theta[3:]]).square().sum()
         value.backward()
         return value
 
@@ -411,8 +422,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 one
                 for backbone in map(load_backbone, given.backbone or [DEFAULT])
                 for root in given.root
-                for n in (_VIEWS if calibrate else (5,))
-                for one in collect_outcomes(root, given.pairs, backbone, n)
+                for one in collect_outcomes(root, given.pairs, backbone, _VIEWS if calibrate else (5,))
             ]
         if agreement:
             weights = ScoreWeights().without("orientation")
