@@ -121,7 +121,7 @@ def collect_outcomes(
         for n_targets in numbers:
             found = []
             for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-                method = ZeroShotPose(backbone, seed=pair.seed)
+                method = ZeroShotPose(backbone, solver="verified", seed=pair.seed)
                 frames = [
                     (pair.reference_sequence, pair.reference_frame),
                     *((pair.target_sequence, number) for number in pair.target_frames),

@@ -1,4 +1,4 @@
-"""Pose proposals: fits to three matches of one target view, and the relative rotations of the views themselves.
+"""Pose proposals: fits to three matches of one target view, and viewpoints around the object.
 
 Unlike in RANSAC, the sample with the largest consensus is not taken as the result, because errors of matches are
 correlated (the front of an object can match its back everywhere). Each view contributes several proposals, and the
@@ -7,10 +7,18 @@ score over all views selects among them (see `verification`).
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, fit_poses, non_maximum_suppression
+from zsp_lite.verified.poses import (
+    SCALE_RANGE,
+    Poses,
+    concatenate,
+    fit_poses,
+    non_maximum_suppression,
+    rotation_matrices,
+)
 from zsp_lite.verified.scene import Scene
 
 TRIALS = 300  # samples of three matches, per view
@@ -18,6 +26,7 @@ PER_VIEW = 6  # proposals kept per view
 _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 _POOL = 200  # best samples of a view that go into non-maximum suppression
+TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
 # Scale of the poses from views: one view shows a part of the object, all target views together show nearly the whole,
 # so the spread of the reference's points is about this fraction of the spread of the targets' points.
 _VIEW_SCALE = 0.9
@@ -26,7 +35,7 @@ _VIEW_SCALE = 0.9
 def propose_poses(
     scene: Scene, seed: int | np.random.Generator = 0, trials: int = TRIALS, per_view: int = PER_VIEW
 ) -> Poses:
-    """Propose poses from the matches of each target view, followed by one pose per view from its rotation.
+    """Propose poses from the matches of each target view, followed by those of `poses_from_views`.
 
     Args:
         scene: Scene with N target views.
@@ -35,7 +44,7 @@ def propose_poses(
         per_view: Largest number of proposals from the matches of a view.
 
     Returns:
-        N to N * (per_view + 1) poses.
+        N + 11 to N * (per_view + 1) + 11 poses.
     """
     rng = np.random.default_rng(seed)
     proposals = [poses_from_matches(source, target, rng, trials, per_view) for source, target in scene.matches]
@@ -79,6 +88,12 @@ def poses_from_matches(
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return for each target view the pose under which the reference has its viewpoint, with the centroids aligned."""
-    rotation = scene.target_maps.rotation.transpose(1, 2).contiguous()
+    """Return poses under which the reference has certain viewpoints, with the centroids aligned: 11 more than views.
+
+    The viewpoints are those of the target views, followed by that of the first view turned about the vertical by 30, 60,
+    ..., 330 degrees. The vertical is the mean of the directions that are up in the target images.
+    """
+    views = scene.target_maps.rotation.transpose(1, 2)
+    vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)
+    rotation = torch.cat([views, rotation_matrices(TURNS[:, None] * vertical) @ views[0]])
     return Poses(torch.full((len(rotation),), _VIEW_SCALE), rotation, torch.zeros(len(rotation), 3))

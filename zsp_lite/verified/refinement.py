@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from zsp_lite.verified.agreement import agreement_term
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import ScoreWeights, score_terms
@@ -48,8 +49,8 @@ class SearchSchedule:
 
 
 COARSE = SearchSchedule(rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65)
-FINE = SearchSchedule(rounds=6, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
-POLISH = SearchSchedule(rounds=5, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
+FINE = SearchSchedule(rounds=5, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
+POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
 
 
 def refine_coarse_to_fine(
@@ -57,7 +58,7 @@ def refine_coarse_to_fine(
 ) -> Poses:
     """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
 
-    Scores are computed from a subset of the points.
+    Scores are computed from a subset of the points. The agreement is too slow to climb: it counts in the suppression only.
 
     Args:
         scene: Scene to score against.
@@ -72,6 +73,7 @@ def refine_coarse_to_fine(
     score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
+        reached = reached + weights.agreement * agreement_term(scene, poses)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
     polished, _ = refine(poses[:_MAX_POLISHED], fine_score, POLISH, rng)
     return concatenate([polished, poses[_MAX_POLISHED:]])
