@@ -88,10 +88,10 @@ def poses_from_matches(
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return poses under which the reference has certain viewpoints, with the centroids aligned: 11 more than views.
+    """Return poses under which the reference has viewpoints all around the object, with the centroids aligned.
 
-    The viewpoints are those of the target views, followed by that of the first view turned about the vertical by 30, 60,
-    ..., 330 degrees. The vertical is the mean of the directions that are up in the target images.
+    These are the N viewpoints of the target views, and that of the first view turned about the vertical by 30, 60, ...,
+    330 degrees. The vertical is the mean of the directions that are up in the target images.
     """
     views = scene.target_maps.rotation.transpose(1, 2)
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

@@ -58,7 +58,7 @@ def refine_coarse_to_fine(
 ) -> Poses:
     """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
 
-    Scores are computed from a subset of the points. The agreement is too slow to climb: it counts in the suppression only.
+    Scores are computed from a subset of the points. The term `agreement` is not climbed; it counts in the suppression.
 
     Args:
         scene: Scene to score against.
