@@ -19,6 +19,8 @@ from tools.tuning import (
     report_weights,
 )
 from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap
+from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, reliability
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 
@@ -88,6 +90,13 @@ def test_the_coefficients_of_the_calibration_are_recovered():
         fit_calibration(right, FIRST_TERMS)
 
 
+def test_every_category_counts_the_same_in_the_calibration():
+    outcomes = sample_ranked(400, TRUE_CALIBRATION, np.random.default_rng(1))
+    more = outcomes + 3 * [one for one in outcomes if one.category == "category 0"]
+    once, again = (fit_calibration(some, FIRST_TERMS, ridge=0) for some in (outcomes, more))
+    assert astuple(again) == pytest.approx(astuple(once), rel=0.01, abs=0.01)
+
+
 def test_calibrated_probabilities_are_frequencies_on_new_pairs():
     fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERMS)
     new = sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(3))
@@ -104,12 +113,25 @@ def test_no_fit_sees_the_category_it_is_evaluated_on():
     assert all(one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen))
 
 
+class CountingBackbone(CoordinateBackbone):
+    """Remembers the images whose features it has computed."""
+
+    seen: list[bytes] = []
+
+    def features(self, image: np.ndarray) -> FeatureMap:
+        self.seen.append(image.tobytes())
+        return super().features(image)
+
+
 @pytest.mark.slow
 def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog):
+    backbone = CountingBackbone()
+    backbone.seen.clear()
     with caplog.at_level(logging.INFO):
-        outcomes = collect_outcomes(str(ellipsoids.root), 2, CoordinateBackbone(), (3, 2))
+        outcomes = collect_outcomes(str(ellipsoids.root), 2, backbone, VerifiedSolver(), (3, 2))
     correct = sum(one.errors[0] < 30 for one in outcomes[:2])
     assert [one.n_views for one in outcomes] == [3, 3, 2, 2]
+    assert len(backbone.seen) == len(set(backbone.seen))  # features of an image are extracted once
     assert f"ellipsoid: 2 pairs of 3 views, Acc30 {50 * correct} %" in caplog.messages
     assert min(one.errors[0] for one in outcomes[:2]) < 5
     for one in outcomes:

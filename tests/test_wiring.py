@@ -70,7 +70,7 @@ def by_hand(frames, s: ZeroShotPose):
         foregrounds = reference.foreground, target.foreground
         sim = similarity(*maps) if s.binning else key_similarities(maps[0], [maps[1]])[0]
         matches = match(
-            *maps, s.k, s.clusters, s.seed, s.cycle_from, 0.0, *foregrounds, sim, matcher=s.matcher, binning=s.binning
+            *maps, s.k, s.kmeans, s.seed, s.cycle_from, 0.0, *foregrounds, sim, matcher=s.matcher, binning=s.binning
         )
         pairs.append(ViewPair(*maps, *foregrounds, sim, matches, s.k))
     scores = np.array([VIEW_SELECTORS[s.view_selector](pair) for pair in pairs])

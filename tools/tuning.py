@@ -11,7 +11,8 @@ Folders with categories of another side (`concepts.csv`) are refused. The tool p
 they do on categories left out of the fit; the constants in `zsp_lite/verified` are these, rounded.
 
 The terms `orientation` and `agreement` were trained on training categories themselves. There, the fit of the weights
-leaves both out and prints 0 for them, and that of the agreement leaves out `orientation`.
+leaves both out, of the search for the hypotheses, too, and prints 0 for them; that of the agreement searches without
+`agreement` and leaves `orientation` out of the score.
 
 Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
 that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
@@ -105,10 +106,10 @@ class Outcome:
 
 
 def collect_outcomes(
-    root: str, pairs: int, backbone: Any, numbers: Sequence[int] = (5,), seed: int = 0,
-    solver: VerifiedSolver | None = None,
-) -> list[Outcome]:  # fmt: skip
-    """Run the verified solver on `pairs` pairs of each category of a folder, for each of the numbers of target views.
+    root: str, pairs: int, backbone: Any, solver: VerifiedSolver, view_numbers: Sequence[int], seed: int = 0
+) -> list[Outcome]:
+    """Run the verified solver on `pairs` pairs of each category of a folder, for each number of target views in
+    `view_numbers`.
 
     Features are extracted once per image.
 
@@ -118,10 +119,10 @@ def collect_outcomes(
     dataset, outcomes = Co3D(root), []
     for category in dataset.categories():
         labels, views = read_labels(root, category), {}
-        for n_targets in numbers:
+        for n_targets in view_numbers:
             found = []
             for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-                method = ZeroShotPose(backbone, solver="verified", seed=pair.seed)
+                method = ZeroShotPose(backbone, seed=pair.seed)
                 frames = [
                     (pair.reference_sequence, pair.reference_frame),
                     *((pair.target_sequence, number) for number in pair.target_frames),
@@ -130,7 +131,7 @@ def collect_outcomes(
                 views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
                 reference, *targets = (views[one] for one in frames)
                 ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-                found.append(solve_views(method, category, reference, targets, ends, solver or VerifiedSolver()))
+                found.append(solve_views(method, category, reference, targets, ends, solver))
             outcomes += found
             accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
             _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)
@@ -260,7 +261,7 @@ def fit_calibration(
 ) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
-    Every category counts the same, whatever its number of outcomes: users bring categories, and some are easier.
+    Every category counts the same, so that the numbers of pairs chosen per category do not decide.
 
     Args:
         outcomes: Outcomes for several numbers of views.
@@ -411,6 +412,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     calibrate, agreement = given.constants == "calibration", given.constants == "agreement"
+    unused = {"weights": ("orientation", "agreement"), "agreement": ("agreement",), "calibration": ()}
+    solver = VerifiedSolver(ScoreWeights().without(*unused[given.constants]))
     try:
         if agreement != (given.out is not None):
             raise InputError("--out FILE is required for `agreement` and refused otherwise")
@@ -422,7 +425,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 one
                 for backbone in map(load_backbone, given.backbone or [DEFAULT])
                 for root in given.root
-                for one in collect_outcomes(root, given.pairs, backbone, _VIEWS if calibrate else (5,))
+                for one in collect_outcomes(root, given.pairs, backbone, solver, _VIEWS if calibrate else (5,))
             ]
         if agreement:
             weights = ScoreWeights().without("orientation")

@@ -192,8 +192,6 @@ class Solver(Protocol):
             return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
-
-    Its attribute `kmeans`, if it has one, says whether k-means selects its matches, which is the default.
     """
 
     def __call__(

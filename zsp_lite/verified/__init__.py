@@ -4,7 +4,7 @@ The paper selects one target view and fits the pose to its matches. The relative
 all of them have depth, so a pose can be tested in every view. Each stage is a function:
 
     scene         points, feature similarities and maps of all views, in normalised frames
-    proposals     poses from three matches of one view, and from the rotations of the views
+    proposals     poses from three matches of one view, and from viewpoints around the object
     soft_icp      local alignment with soft correspondences, weighted by feature similarity
     verification  the score: a weighted sum of eleven terms on features, silhouettes, free space and views as a whole
     agreement     the eleventh term: photo features near each point, with a weight for every channel

@@ -26,7 +26,7 @@ PER_VIEW = 6  # proposals kept per view
 _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 _POOL = 200  # best samples of a view that go into non-maximum suppression
-TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
+_TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
 # Scale of the poses from views: one view shows a part of the object, all target views together show nearly the whole,
 # so the spread of the reference's points is about this fraction of the spread of the targets' points.
 _VIEW_SCALE = 0.9
@@ -90,10 +90,11 @@ def poses_from_matches(
 def poses_from_views(scene: Scene) -> Poses:
     """Return poses under which the reference has viewpoints all around the object, with the centroids aligned.
 
-    These are the N viewpoints of the target views, and that of the first view turned about the vertical by 30, 60, ...,
-    330 degrees. The vertical is the mean of the directions that are up in the target images.
+    These are the N viewpoints of the target views, and that of the scene's first view turned about the vertical by 30,
+    60, ..., 330 degrees. The vertical is estimated as the mean of the directions that are up in the target images; if
+    there is one image, it is off by the camera's elevation.
     """
     views = scene.target_maps.rotation.transpose(1, 2)
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)
-    rotation = torch.cat([views, rotation_matrices(TURNS[:, None] * vertical) @ views[0]])
+    rotation = torch.cat([views, rotation_matrices(_TURNS[:, None] * vertical) @ views[0]])
     return Poses(torch.full((len(rotation),), _VIEW_SCALE), rotation, torch.zeros(len(rotation), 3))

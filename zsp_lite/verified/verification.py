@@ -41,8 +41,8 @@ A_0 from the reference's frame and A_v from the targets', both to the axes of th
 
 and 0 without such a backbone. Axes that are wrong in the same way in both objects do not matter.
 
-The eleventh, `agreement`, compares photo features near each point under the pose (`verified.agreement`). It takes part
-in the choice between poses, but is 0 while each climbs the score.
+The eleventh, `agreement`, compares photo features near each point under the pose (`verified.agreement`). It counts
+in the suppression during the refinement and in the ranking; it is 0 in the first suppression and while a pose climbs.
 
 The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
 probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
