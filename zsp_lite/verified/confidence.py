@@ -28,7 +28,7 @@ TIE_RATIO = float(np.exp(-1))
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The six coefficients, fitted on validation categories for N = 1 to 10 (`tools/tuning.py`).
+    r"""The six coefficients, fitted on validation categories, each with the same weight, for N = 1 to 10 (`tools/tuning.py`).
 
     Attributes:
         scale: \alpha_0.
@@ -39,12 +39,12 @@ class Calibration:
         none_shape: \beta_3.
     """
 
-    scale: float = -1.46
-    scale_views: float = 0.30
-    none: float = 1.77
-    none_views: float = -0.75
-    none_std: float = -59.0
-    none_shape: float = -0.215
+    scale: float = -1.91
+    scale_views: float = 0.62
+    none: float = 0.76
+    none_views: float = -1.54
+    none_std: float = -31.3
+    none_shape: float = -0.148
 
     def probabilities(
         self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
