@@ -131,7 +131,8 @@ def collect_outcomes(
                 views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
                 reference, *targets = (views[one] for one in frames)
                 ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-                found.append(solve_views(method, category, reference, targets, ends, solver))
+                name = f"{Path(root).name}/{category}"  # folders may mean different objects by one name
+                found.append(solve_views(method, name, reference, targets, ends, solver))
             outcomes += found
             accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
             _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)

@@ -1,10 +1,12 @@
 """Render altered copies of models: deformed and recoloured, each in a room of its own.
 
     python -m tools.variants outputs/training_models outputs/variants
+    python -m tools.variants outputs/validation_models outputs/validation_variants 16
 
 Two altered copies of one model are two instances of a category, so that every model is a category to learn from. The
 models that `same_shape.json` lists for training share a shape with others; they form the categories named there, with
-one copy each. The folder is in CO3D's layout, with pose labels. An interrupted run is continued.
+one copy each. The last argument is the number of views, by default 8. The folder is in CO3D's layout, with pose labels.
+An interrupted run is continued.
 """
 
 import json
@@ -50,9 +52,9 @@ def _categories(folder: Path) -> dict[str, list[Model]]:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
+    if len(sys.argv) not in (3, 4) or not all(one.isdecimal() for one in sys.argv[3:]):
         sys.exit(__doc__)
     try:
-        render_variants(Path(sys.argv[1]), Path(sys.argv[2]))
+        render_variants(Path(sys.argv[1]), Path(sys.argv[2]), *map(int, sys.argv[3:]))
     except InputError as error:
         sys.exit(str(error))

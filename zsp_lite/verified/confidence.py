@@ -28,7 +28,7 @@ TIE_RATIO = float(np.exp(-1))
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The six coefficients, fitted on validation categories, each with the same weight, for N = 1 to 10 (`tools/tuning.py`).
+    r"""The six coefficients, fitted on validation categories of equal weight for N = 1 to 10 (`tools/tuning.py`).
 
     Attributes:
         scale: \alpha_0.
