@@ -1,4 +1,4 @@
-# Start with `make demo` or `make test`; either creates .venv once. README.md has the same steps in plain pip.
+# Start with `make demo` or `make test`; either creates .venv once. docs/install.md has the same steps in plain pip.
 PYTHON ?= python3
 OUT ?= outputs/demo
 

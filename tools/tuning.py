@@ -4,15 +4,15 @@ Run from the root of the repository. The weights are fitted on training categori
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training outputs/training_poses
-    python -m tools.tuning agreement outputs/training8 outputs/variants --out agreement.safetensors
-    python -m tools.tuning calibration outputs/validation outputs/validation_poses
+    python -m tools.tuning agreement outputs/training8 outputs/variants --pairs 16 --out outputs/agreement.safetensors
+    python -m tools.tuning calibration outputs/{validation,validation_poses,validation_variants} --pairs 10
 
 Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well
 they do on categories left out of the fit; the constants in `zsp_lite/verified` are these, rounded.
 
-The terms `orientation` and `agreement` were trained on training categories themselves. There, the fit of the weights
-leaves both out, of the search for the hypotheses, too, and prints 0 for them; that of the agreement searches without
-`agreement` and leaves `orientation` out of the score.
+The terms `orientation` and `agreement` were trained on training categories themselves. Therefore the fit of the weights
+leaves both out, in the search for hypotheses as well, and prints 0 for them. That of the agreement searches without
+`agreement`, and leaves `orientation` out of the score.
 
 Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
 that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
