@@ -565,7 +565,10 @@ def test_the_agreement_counts_in_the_choice_between_poses_that_are_near(scene, t
     poses = concatenate([truth, replace(truth, rotation=tilted)])
     monkeypatch.setattr(refinement, "refine", lambda poses, score, schedule, rng: (poses, score(poses)))
     assert torch.equal(refine_coarse_to_fine(scene, poses, ScoreWeights()).rotation, truth.rotation)
-    prefers_the_second = lambda scene, poses: 1000.0 * (poses.rotation == tilted).all(dim=2).all(dim=1)  # noqa: E731
+
+    def prefers_the_second(scene, poses):
+        return 1000.0 * (poses.rotation == tilted).all(dim=2).all(dim=1)
+
     monkeypatch.setattr(refinement, "agreement_term", prefers_the_second)
     assert torch.equal(refine_coarse_to_fine(scene, poses, ScoreWeights()).rotation, tilted)
     without = ScoreWeights().without("agreement")

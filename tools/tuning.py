@@ -108,8 +108,7 @@ class Outcome:
 def collect_outcomes(
     root: str, pairs: int, backbone: Any, solver: VerifiedSolver, view_numbers: Sequence[int], seed: int = 0
 ) -> list[Outcome]:
-    """Run the verified solver on `pairs` pairs of each category of a folder, for each number of target views in
-    `view_numbers`.
+    """Run the verified solver on `pairs` pairs of each category of a folder, for each of several numbers of views.
 
     Features are extracted once per image.
 
