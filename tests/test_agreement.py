@@ -9,7 +9,7 @@ from model_files import write_wedge
 from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, reference_and_targets, true_pose
 
 from tools.concepts import check_sides
-from tools.tuning import Outcome, fit_agreement, main, report_agreement
+from tools.tuning import Outcome, channel_columns, fit_agreement, main, report_beside
 from tools.variants import render_variants
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import load_backbone
@@ -173,17 +173,18 @@ def test_the_channel_that_tells_is_found():
     assert fitted[0] > 5 * np.abs(fitted[1:]).max()
     smaller = fit_agreement(outcomes, ScoreWeights(), ridge=1.0)
     assert 0 < smaller[0] < fitted[0]
-    assert "pairs won" in "\n".join(report_agreement(outcomes, ScoreWeights(), fitted))
+    report = report_beside(outcomes, channel_columns, ScoreWeights(), lambda some: fit_agreement(some, ScoreWeights()))
+    assert "pairs won" in report[2] and report[3].startswith("5 weights")
     for one in outcomes:
         one.terms[:] *= -1
     with pytest.raises(InputError, match="score without the term has no positive weight"):
         fit_agreement(outcomes, ScoreWeights())
-    with pytest.raises(InputError, match="none with photo features"):
+    with pytest.raises(InputError, match="none with the term"):
         fit_agreement([replace(one, channels=None) for one in outcomes], ScoreWeights())
 
 
 def test_the_command_asks_for_a_file(tmp_path, capsys):
-    assert main(["agreement", str(tmp_path)]) == 2
+    assert main(["agreement", f"{tmp_path}:2"]) == 2
     assert "--out FILE is required" in capsys.readouterr().err
 
 

@@ -49,19 +49,19 @@ def test_the_table_of_the_documentation_is_that_of_the_stored_runs():
 def test_a_run_of_all_rows_stores_the_error_of_every_pair(ellipsoids, tmp_path, monkeypatch):
     monkeypatch.setattr(parts, "check_sides", lambda folders, side: None)
     monkeypatch.setattr(parts, "load_backbone", lambda name: CoordinateBackbone())
-    files = measure([ellipsoids.root], tmp_path, 2, "coordinates")
+    files = measure([(ellipsoids.root, 2)], tmp_path, "coordinates")
     errors = read_errors(files)
     assert errors.keys() == rows().keys() and {len(found) for found in errors.values()} == {2}
     assert min(errors[WHOLE].values()) < 5
     with pytest.raises(InputError, match="expected different names"):
-        measure([ellipsoids.root] * 2, tmp_path, 2, "coordinates")
+        measure([(ellipsoids.root, 2)] * 2, tmp_path, "coordinates")
 
 
 def test_categories_of_another_side_are_refused(tmp_path, capsys):
     (tmp_path / "data" / "drill").mkdir(parents=True)
     (tmp_path / "data" / "drill" / "frame_annotations.jgz").write_bytes(b"")
-    assert parts.main([str(tmp_path / "out"), str(tmp_path / "data")]) == 2
+    assert parts.main([str(tmp_path / "out"), f"{tmp_path / 'data'}:2"]) == 2
     assert "category drill is for validation, expected training" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     shutil.rmtree(tmp_path / "data")
-    assert parts.main([str(tmp_path / "out"), str(tmp_path / "data")]) == 2
+    assert parts.main([str(tmp_path / "out"), f"{tmp_path / 'data'}:2"]) == 2

@@ -1,10 +1,12 @@
 """tools/tuning.py: the fits recover known parameters, are evaluated on held-out categories, and refuse other splits."""
 
 import logging
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 from synthetic_views import CoordinateBackbone
 
 from tools import tuning
@@ -12,12 +14,17 @@ from tools.concepts import check_sides
 from tools.tuning import (
     Outcome,
     collect_outcomes,
+    fit_beside,
     fit_calibration,
     fit_weights,
     leave_out,
+    orientation_column,
+    report_beside,
     report_calibration,
     report_weights,
+    use_head,
 )
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.verified import VerifiedSolver
@@ -158,5 +165,36 @@ def test_categories_of_another_side_are_refused(tmp_path, capsys):
         check_sides([tmp_path], "training")
     with pytest.raises(InputError, match="category camera is for training, expected validation"):
         check_sides([tmp_path], "validation")
-    assert tuning.main(["weights", str(tmp_path), "--pairs", "2"]) == 2
+    assert tuning.main(["weights", f"{tmp_path}:2"]) == 2
     assert "category drill is for validation" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        tuning.main(["weights", str(tmp_path)])
+    assert f"{tmp_path}: expected FOLDER:PAIRS" in capsys.readouterr().err
+
+
+def test_the_weight_of_a_term_beside_the_score_is_recovered():
+    outcomes = sample_outcomes(1200, np.random.default_rng(6))
+    base = replace(TRUE_WEIGHTS, orientation=0.0)
+    for one in outcomes:
+        one.terms[:, -1] = 0  # no agreement
+    found = fit_beside(outcomes, orientation_column, base, ridge=0)
+    assert found == pytest.approx([TRUE_WEIGHTS.orientation], abs=0.3)
+    half = fit_beside(outcomes, orientation_column, ScoreWeights(*np.array(astuple(base)) / 2), ridge=0)
+    assert half == pytest.approx(found / 2, rel=1e-3)  # in nats of the score
+    text = "\n".join(report_beside(outcomes, orientation_column, base, lambda some: found))
+    assert "1200 pairs of 4 categories" in text and f"weight {found[0]:.2f}" in text
+
+
+def test_a_head_is_used_on_categories_it_was_trained_without(tmp_path, capsys):
+    backbone = load_backbone("zsp-tiny-photo")
+    weights = {name: torch.zeros_like(value) for name, value in backbone.position_head.state_dict().items()}
+    save_file(weights, tmp_path / "part.safetensors", {"without": "data/desk data/shoe"})
+    assert use_head(backbone, tmp_path / "part.safetensors") == ["data/desk", "data/shoe"]
+    assert not any(value.any() for value in backbone.position_head.state_dict().values())
+    save_file(weights, tmp_path / "all.safetensors", {"without": ""})
+    with pytest.raises(InputError, match="all.safetensors: trained on all categories, expected"):
+        use_head(backbone, tmp_path / "all.safetensors")
+    with pytest.raises(InputError, match="zsp-tiny has no position head"):
+        use_head(load_backbone("zsp-tiny"), tmp_path / "part.safetensors")
+    assert tuning.main(["orientation", f"{tmp_path}:2"]) == 2
+    assert "--head FILE is required for `orientation`" in capsys.readouterr().err

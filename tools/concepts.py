@@ -1,6 +1,7 @@
-"""`concepts.csv`: which side, training, validation or evaluation, every category name belongs to."""
+"""The data of the tools: folders with numbers of pairs, and the side of every category name (`concepts.csv`)."""
 
 import csv
+from argparse import ArgumentTypeError
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -8,6 +9,19 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
 
 CONCEPTS = Path(__file__).with_suffix(".csv")
+DATA_HELP = "folder of categories in CO3D's layout with pose labels, and pairs of each category"
+
+
+def folder_and_pairs(text: str) -> tuple[Path, int]:
+    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its categories.
+
+    Raises:
+        ArgumentTypeError: The text has another form.
+    """
+    folder, _, pairs = text.rpartition(":")
+    if not folder or not pairs.isdecimal() or int(pairs) < 1:
+        raise ArgumentTypeError(f"{text}: expected FOLDER:PAIRS")
+    return Path(folder), int(pairs)
 
 
 def check_sides(folders: Iterable[str | Path], side: str) -> None:

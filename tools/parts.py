@@ -2,7 +2,7 @@
 
 Run from the root of the repository; docs/rebuild.md makes the data:
 
-    python -m tools.parts outputs/parts outputs/training_poses outputs/training
+    python -m tools.parts outputs/parts outputs/training_poses:36 outputs/training:36
 
 The tool runs the benchmark on every folder, or continues it, keeps the errors of all pairs in `outputs/parts`, and
 prints the differences to the whole solver on the same pairs. The terms `orientation` and `agreement` are left out of
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tools.concepts import check_sides
+from tools.concepts import DATA_HELP, check_sides, folder_and_pairs
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.pretrained import DEFAULT
 from zsp_lite.benchmark.methods import Method
@@ -58,8 +58,13 @@ def rows() -> dict[str, Method]:
     }
 
 
-def measure(folders: Sequence[Path], out: Path, pairs: int, backbone: str) -> list[Path]:
-    """Run all rows on `pairs` pairs of each category of the folders, or continue, and export each run.
+def measure(data: Sequence[tuple[Path, int]], out: Path, backbone: str) -> list[Path]:
+    """Run all rows on folders of data, or continue, and export each run.
+
+    Args:
+        data: Folders, and how many pairs to take of each of their categories.
+        out: Folder of the runs and their exports.
+        backbone: Name of the backbone.
 
     Returns:
         The exported files, OUT/NAME.json.gz for a folder NAME.
@@ -67,11 +72,12 @@ def measure(folders: Sequence[Path], out: Path, pairs: int, backbone: str) -> li
     Raises:
         InputError: A folder has a category that is not for training, or two folders have the same name.
     """
+    folders = [folder for folder, _ in data]
     check_sides(folders, "training")
     if len({folder.name for folder in folders}) < len(folders):
         raise InputError(f"folders {', '.join(map(str, folders))}: expected different names")
     loaded, written = load_backbone(backbone), []
-    for folder in folders:
+    for folder, pairs in data:
         run = out / folder.name
         evaluate(folder, loaded, rows(), pairs=pairs, out=run)
         written.append(export_results(read_results(run), out / f"{folder.name}.json.gz"))
@@ -131,12 +137,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.parts", description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path, help="folder of the runs and their exports")
-    parser.add_argument("root", type=Path, nargs="+", help="folder of categories in CO3D's layout, with pose labels")
-    parser.add_argument("--pairs", type=int, default=36, metavar="N", help="pairs per category (default 36)")
+    parser.add_argument("data", type=folder_and_pairs, nargs="+", metavar="FOLDER:PAIRS", help=DATA_HELP)
     parser.add_argument("--backbone", default=DEFAULT, metavar="NAME", help=f"default {DEFAULT}")
     given = parser.parse_args(arguments)
     try:
-        errors = read_errors(measure(given.root, given.out, given.pairs, given.backbone))
+        errors = read_errors(measure(given.data, given.out, given.backbone))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

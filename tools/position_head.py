@@ -37,6 +37,7 @@ _LEARNING_RATE, _WEIGHT_DECAY = 2e-3, 0.05
 _NOISE = 0.1  # on the features, standard deviations
 _FARTHEST = 4.0  # points farther from the object's centre, in its standard deviations, are background
 _FEWEST = 16  # foreground patches of known depth
+WITHOUT = "without"  # metadata of the file: the categories left out
 _log = logging.getLogger("zsp_lite.position_head")
 
 
@@ -73,7 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         examples = [one for folder in given.data for one in read_examples(folder, backbone)]
         unseen = [one for folder in given.validation for one in read_examples(folder, backbone)]
         head = train([one for one in examples if one.category not in given.without], unseen, given.steps)
-        save_file({name: value.half().contiguous() for name, value in head.state_dict().items()}, given.out)
+        weights = {name: value.half().contiguous() for name, value in head.state_dict().items()}
+        save_file(weights, given.out, {WITHOUT: " ".join(given.without)})
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,18 +1,21 @@
-"""Fit the constants of the verified solver: weights of the score, of the channels of `agreement`, and the calibration.
+"""Fit the constants of the verified solver: weights of the score and of the channels of `agreement`, the calibration.
 
 Run from the root of the repository. The weights are fitted on training categories, the calibration on validation
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
-    python -m tools.tuning weights outputs/training outputs/training_poses
-    python -m tools.tuning agreement outputs/training8 outputs/variants --pairs 16 --out outputs/agreement.safetensors
-    python -m tools.tuning calibration outputs/{validation,validation_poses,validation_variants} --pairs 10
+    python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
+    python -m tools.tuning orientation outputs/training_poses:36 --head outputs/head_without.safetensors
+    python -m tools.tuning agreement outputs/training8:16 outputs/variants:8 --out outputs/agreement.safetensors
+    python -m tools.tuning calibration outputs/{validation:10,validation_poses:20,validation_variants:4}
 
-Folders with categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well
-they do on categories left out of the fit; the constants in `zsp_lite/verified` are these, rounded.
+FOLDER:PAIRS is a data folder and the number of pairs of each of its categories. Folders with categories of another
+side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on categories left out of the
+fit; the constants in `zsp_lite/verified` are these, rounded.
 
 The terms `orientation` and `agreement` were trained on training categories themselves. Therefore the fit of the weights
-leaves both out, in the search for hypotheses as well, and prints 0 for them. That of the agreement searches without
-`agreement`, and leaves `orientation` out of the score.
+leaves both out, in the search for hypotheses as well, and prints 0 for them. So does that of the weight of
+`orientation`, on the categories that the position head FILE was trained without (`tools/position_head.py --without`).
+The fit of the agreement searches without `agreement`, and leaves `orientation` out of the score.
 
 Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
 that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
@@ -33,8 +36,12 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import save_file
 
-from tools.concepts import check_sides
+from tools.concepts import DATA_HELP, check_sides, folder_and_pairs
+from tools.position_head import WITHOUT
+from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.backbones.checkpoints import read_checkpoint
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.backbones.positions import load_position_head
 from zsp_lite.backbones.pretrained import DEFAULT
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
@@ -52,10 +59,16 @@ CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
+_ORIENTATION_RIDGE = 1e-2
 _AGREEMENT_RIDGE, _FOLDS = 2.0, 5
 _CALIBRATION_RIDGE = 1e-3
 _VIEWS = (1, 2, 3, 5, 7, 10)  # of the calibration
-_UNTRAINED = np.array([name not in ("orientation", "agreement") for name in TERM_NAMES])
+# Terms that the search for hypotheses leaves out, by what is fitted.
+_UNUSED = {
+    "weights": ("orientation", "agreement"), "orientation": ("orientation", "agreement"), "agreement": ("agreement",),
+    "calibration": (),
+}  # fmt: skip
+_UNTRAINED = np.array([name not in _UNUSED["weights"] for name in TERM_NAMES])
 _log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
@@ -105,18 +118,38 @@ class Outcome:
         return self.n_views, self.view_std, float(best @ np.array(astuple(weights.without(*FEATURE_TERMS))))
 
 
+def use_head(backbone: Backbone, file: Path) -> list[str]:
+    """Replace a backbone's position head by that of a file, and return the categories the head was trained without.
+
+    Raises:
+        InputError: The backbone has no position head, or the file is damaged or does not name such categories.
+    """
+    if backbone.position_head is None:
+        raise InputError(f"backbone {backbone.name} has no position head, expected one with it")
+    dims = backbone.position_head.key.in_features, backbone.position_head.photo.in_features
+    backbone.position_head = load_position_head(file, *dims)
+    categories = read_checkpoint(file)[1].get(WITHOUT, "").split()
+    if not categories:
+        raise InputError(f"{file}: trained on all categories, expected a head of tools.position_head --without")
+    return categories
+
+
 def collect_outcomes(
-    root: str, pairs: int, backbone: Any, solver: VerifiedSolver, view_numbers: Sequence[int], seed: int = 0
-) -> list[Outcome]:
+    root: str | Path, pairs: int, backbone: Any, solver: VerifiedSolver, view_numbers: Sequence[int], seed: int = 0,
+    categories: Sequence[str] | None = None,
+) -> list[Outcome]:  # fmt: skip
     """Run the verified solver on `pairs` pairs of each category of a folder, for each of several numbers of views.
 
-    Features are extracted once per image.
+    Features are extracted once per image. `categories`, as FOLDER/CATEGORY, takes only some of the folder's.
 
     Raises:
         InputError: A sequence has no pose label.
     """
     dataset, outcomes = Co3D(root), []
     for category in dataset.categories():
+        name = f"{Path(root).name}/{category}"  # folders may mean different objects by one name
+        if categories is not None and name not in categories:
+            continue
         labels, views = read_labels(root, category), {}
         for n_targets in view_numbers:
             found = []
@@ -130,7 +163,6 @@ def collect_outcomes(
                 views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
                 reference, *targets = (views[one] for one in frames)
                 ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-                name = f"{Path(root).name}/{category}"  # folders may mean different objects by one name
                 found.append(solve_views(method, name, reference, targets, ends, solver))
             outcomes += found
             accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
@@ -184,32 +216,59 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     return ScoreWeights(*(conditional_logit(columns, correctness, np.full(len(std), ridge)) / std).tolist())
 
 
+def orientation_column(outcome: Outcome) -> Float[np.ndarray, "m 1"]:
+    """Return the term `orientation` of the hypotheses."""
+    return outcome.terms[:, [TERM_NAMES.index("orientation")]]
+
+
+def channel_columns(outcome: Outcome) -> Float[np.ndarray, "m channels"] | None:
+    """Return the agreement of every channel under the hypotheses; None without photo features."""
+    return outcome.channels
+
+
+def fit_orientation(outcomes: Sequence[Outcome], ridge: float = _ORIENTATION_RIDGE) -> Float[np.ndarray, " 1"]:
+    """Fit the weight of the term `orientation`, beside the score without it and without `agreement` (`fit_beside`)."""
+    return fit_beside(outcomes, orientation_column, ScoreWeights().without("orientation", "agreement"), ridge)
+
+
 def fit_agreement(
     outcomes: Sequence[Outcome], weights: ScoreWeights, ridge: float = _AGREEMENT_RIDGE
 ) -> Float[np.ndarray, " channels"]:
-    r"""Fit the channel weights of the term `agreement`, in nats of the score without that term.
+    """Fit the channel weights of the term `agreement`, beside the score without that term (`fit_beside`)."""
+    return fit_beside(outcomes, channel_columns, weights.without("agreement"), ridge)
 
-    That score gets a weight of its own, which is not penalised. Pairs count by one over the root of the number of pairs
+
+def fit_beside(
+    outcomes: Sequence[Outcome], columns: Callable[[Outcome], Float[np.ndarray, "m k"] | None], weights: ScoreWeights,
+    ridge: float,
+) -> Float[np.ndarray, " k"]:  # fmt: skip
+    r"""Fit the weights of further columns beside a score, in nats of that score.
+
+    The score gets a weight of its own, which is not penalised. Pairs count by one over the root of the number of pairs
     of their category.
 
     Args:
-        outcomes: Outcomes with channels.
-        weights: Weights of the score; that of `agreement` is not used.
-        ridge: Penalty on the squared weights, per standard deviation of all channels together.
+        outcomes: Outcomes of several pairs.
+        columns: Returns the k columns of an outcome's hypotheses; None where there are none.
+        weights: Weights of the score.
+        ridge: Penalty on the squared weights, per standard deviation of all columns together.
 
     Raises:
-        InputError: No pair with channels has a correct hypothesis among several, or the score is of no use on them.
+        InputError: No pair with columns has a correct hypothesis among several, or the score is of no use on them.
     """
-    used = [one for one in outcomes if one.informative and one.channels is not None]
+    found = [(one, columns(one)) for one in outcomes if one.informative]
+    used = [(one, further) for one, further in found if further is not None]
     if not used:
-        raise InputError(f"{len(outcomes)} pairs, none with photo features and a correct hypothesis among several")
-    std = np.concatenate([one.channels - one.channels.mean(axis=0) for one in used]).std()
-    base = np.array(astuple(weights.without("agreement")))
-    columns = [np.column_stack([one.channels / std, one.terms @ base]) for one in used]
-    count = Counter(one.category for one in used)
-    importance = np.array([count[one.category] ** -0.5 for one in used])
-    penalty = np.append(np.full(used[0].channels.shape[1], ridge), 0.0)
-    fitted = conditional_logit(columns, [one.correctness for one in used], penalty, importance)
+        raise InputError(f"{len(outcomes)} pairs, none with the term and a correct hypothesis among several")
+    std = np.concatenate([further - further.mean(axis=0) for _, further in used]).std() + 1e-9
+    score = np.array(astuple(weights))
+    count = Counter(one.category for one, _ in used)
+    fitted = conditional_logit(
+        [np.column_stack([further / std, one.terms @ score]) for one, further in used],
+        [one.correctness for one, _ in used],
+        np.append(np.full(used[0][1].shape[1], ridge), 0.0),
+        np.array([count[one.category] ** -0.5 for one, _ in used]),
+    )
     if fitted[-1] <= 0:
         raise InputError(f"{len(used)} pairs: the score without the term has no positive weight, expected it to help")
     return fitted[:-1] / (std * fitted[-1])
@@ -342,19 +401,24 @@ def report_weights(outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def report_agreement(outcomes: Sequence[Outcome], weights: ScoreWeights, fitted: Float[np.ndarray, " c"]) -> list[str]:
-    """Format what the term `agreement` gains with fitted weights, on categories that the fit has not seen."""
-    used = [one for one in outcomes if one.channels is not None]
-    rest = np.array(astuple(weights.without("agreement")))
-    held_out = leave_out(used, lambda some: fit_agreement(some, weights), _FOLDS)
-    before = np.array([one.errors[(one.terms @ rest).argmax()] for one in used])
-    after = np.array([one.errors[(one.terms @ rest + one.channels @ w).argmax()] for one, w in zip(used, held_out)])
+def report_beside(
+    outcomes: Sequence[Outcome], columns: Callable[[Outcome], Float[np.ndarray, "m k"] | None], weights: ScoreWeights,
+    fit: Callable[[Sequence[Outcome]], Float[np.ndarray, " k"]],
+) -> list[str]:  # fmt: skip
+    """Format what further columns gain beside a score (`fit_beside`), on categories that the fit has not seen."""
+    used = [one for one in outcomes if columns(one) is not None]
+    held_out = leave_out(used, fit, _FOLDS)
+    score = [one.terms @ np.array(astuple(weights)) for one in used]
+    before = np.array([one.errors[s.argmax()] for one, s in zip(used, score)])
+    after = np.array([one.errors[(s + columns(one) @ w).argmax()] for one, s, w in zip(used, score, held_out)])
     won, lost = ((one < CORRECT_ANGLE) & (two >= CORRECT_ANGLE) for one, two in ((after, before), (before, after)))
+    fitted = fit(used)
+    size = f"root mean square {np.sqrt(np.mean(fitted**2)):.2f} nats"
     return [
         f"{len(used)} pairs of {len({one.category for one in used})} categories",
         f"without the term                   {_accuracy(before)}",
         f"with it, held-out category         {_accuracy(after)}: {won.sum()} pairs won, {lost.sum()} lost",
-        f"{len(fitted)} channel weights, root mean square {np.sqrt(np.mean(fitted**2)):.1f} nats",
+        f"weight {fitted[0]:.2f}" if len(fitted) == 1 else f"{len(fitted)} weights, {size}",
     ]
 
 
@@ -404,38 +468,46 @@ def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
-    parser.add_argument("constants", choices=("weights", "agreement", "calibration"), help="what to fit")
-    parser.add_argument("root", nargs="+", help="folder of categories in CO3D's layout, with pose labels")
-    parser.add_argument("--pairs", type=int, default=30, metavar="N", help="pairs per category (default 30)")
+    parser.add_argument("constants", choices=_UNUSED, help="what to fit")
+    parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS", help=DATA_HELP)
     parser.add_argument("--backbone", action="append", metavar="NAME", help=f"may be repeated (default {DEFAULT})")
-    parser.add_argument("--out", type=Path, help="file of weights to write, for agreement")
+    parser.add_argument("--head", type=Path, metavar="FILE", help="position head to use, for orientation")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="weights to write, for agreement")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    calibrate, agreement = given.constants == "calibration", given.constants == "agreement"
-    unused = {"weights": ("orientation", "agreement"), "agreement": ("agreement",), "calibration": ()}
-    solver = VerifiedSolver(ScoreWeights().without(*unused[given.constants]))
+    fit = given.constants
+    solver = VerifiedSolver(ScoreWeights().without(*_UNUSED[fit]))
     try:
-        if agreement != (given.out is not None):
-            raise InputError("--out FILE is required for `agreement` and refused otherwise")
-        if agreement and not given.out.absolute().parent.is_dir():
+        for option, value, needed_by in (("--out", given.out, "agreement"), ("--head", given.head, "orientation")):
+            if (fit == needed_by) != (value is not None):
+                raise InputError(f"{option} FILE is required for `{needed_by}` and refused otherwise")
+        if given.out is not None and not given.out.absolute().parent.is_dir():
             raise InputError(f"--out {given.out}: folder {given.out.parent} does not exist")
-        check_sides(given.root, "validation" if calibrate else "training")
+        check_sides([folder for folder, _ in given.data], "validation" if fit == "calibration" else "training")
+        backbones, categories = [load_backbone(name) for name in given.backbone or [DEFAULT]], None
+        if given.head is not None:
+            categories = [name for backbone in backbones for name in use_head(backbone, given.head)]
         with torch.no_grad():
             outcomes = [
                 one
-                for backbone in map(load_backbone, given.backbone or [DEFAULT])
-                for root in given.root
-                for one in collect_outcomes(root, given.pairs, backbone, solver, _VIEWS if calibrate else (5,))
+                for backbone in backbones
+                for root, pairs in given.data
+                for one in collect_outcomes(
+                    root, pairs, backbone, solver, _VIEWS if fit == "calibration" else (5,), categories=categories
+                )
             ]
-        if agreement:
-            weights = ScoreWeights().without("orientation")
-            fitted = fit_agreement(outcomes, weights)
-            print("\n".join(report_agreement(outcomes, weights, fitted)))
-            save_file({"weights": torch.from_numpy(fitted).float()}, given.out)
-        elif calibrate:
-            print("\n".join(report_calibration(outcomes, ScoreWeights())))
+        present = ScoreWeights()
+        if fit == "weights":
+            lines = report_weights([replace(one, terms=one.terms * _UNTRAINED) for one in outcomes])
+        elif fit == "orientation":
+            lines = report_beside(outcomes, orientation_column, solver.weights, fit_orientation)
+        elif fit == "agreement":
+            weights = present.without("orientation", "agreement")
+            lines = report_beside(outcomes, channel_columns, weights, lambda some: fit_agreement(some, weights))
+            save_file({"weights": torch.from_numpy(fit_agreement(outcomes, weights)).float()}, given.out)
         else:
-            print("\n".join(report_weights([replace(one, terms=one.terms * _UNTRAINED) for one in outcomes])))
+            lines = report_calibration(outcomes, present)
+        print("\n".join(lines))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
