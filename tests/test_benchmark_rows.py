@@ -85,6 +85,13 @@ def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
     assert len(calls) == 2 * 3
 
 
+def test_rows_whose_matches_differ_do_not_share_them(tmp_path):
+    """The verified solver takes the best matches, the paper's those that k-means selects."""
+    together = evaluate(small_folder(), BACKBONE, ["ours", "verified"], 2, 2, out=tmp_path / "a", categories=["pebble"])
+    alone = evaluate(small_folder(), BACKBONE, ["verified"], 2, 2, out=tmp_path / "b", categories=["pebble"])
+    assert together["methods"]["verified"]["median"] == alone["methods"]["verified"]["median"]
+
+
 def test_more_views_than_a_sequence_has_are_refused(tmp_path):
     with pytest.raises(InputError, match="20"):
         evaluate(small_folder(), BACKBONE, ["ours-n20"], 2, out=tmp_path)

@@ -16,6 +16,7 @@ def test_each_row_lacks_its_part_and_no_other():
     weights = ScoreWeights().without("orientation", "agreement")
     solvers = {name: row.settings["solver"] for name, row in rows().items()}
     assert solvers[WHOLE].weights == weights and solvers[WHOLE].icp and solvers[WHOLE].refinement
+    assert rows(["view term"]).keys() == {WHOLE, "view term"}
     assert solvers["view term"].weights == weights.without("viewpoint")
     assert solvers["free space"].weights == weights.without("forward_free_space", "reverse_free_space")
     for name, solver in solvers.items():
@@ -49,12 +50,12 @@ def test_the_table_of_the_documentation_is_that_of_the_stored_runs():
 def test_a_run_of_all_rows_stores_the_error_of_every_pair(ellipsoids, tmp_path, monkeypatch):
     monkeypatch.setattr(parts, "check_sides", lambda folders, side: None)
     monkeypatch.setattr(parts, "load_backbone", lambda name: CoordinateBackbone())
-    files = measure([(ellipsoids.root, 2)], tmp_path, "coordinates")
+    files = measure([(ellipsoids.root, 2)], tmp_path, "coordinates", rows())
     errors = read_errors(files)
     assert errors.keys() == rows().keys() and {len(found) for found in errors.values()} == {2}
     assert min(errors[WHOLE].values()) < 5
     with pytest.raises(InputError, match="expected different names"):
-        measure([(ellipsoids.root, 2)] * 2, tmp_path, "coordinates")
+        measure([(ellipsoids.root, 2)] * 2, tmp_path, "coordinates", rows())
 
 
 def test_categories_of_another_side_are_refused(tmp_path, capsys):

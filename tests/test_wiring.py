@@ -70,7 +70,7 @@ def by_hand(frames, s: ZeroShotPose):
         foregrounds = reference.foreground, target.foreground
         sim = similarity(*maps) if s.binning else key_similarities(maps[0], [maps[1]])[0]
         matches = match(
-            *maps, s.k, s.kmeans, s.seed, s.cycle_from, 0.0, *foregrounds, sim, matcher=s.matcher, binning=s.binning
+            *maps, s.k, s.clusters, s.seed, s.cycle_from, 0.0, *foregrounds, sim, matcher=s.matcher, binning=s.binning
         )
         pairs.append(ViewPair(*maps, *foregrounds, sim, matches, s.k))
     scores = np.array([VIEW_SELECTORS[s.view_selector](pair) for pair in pairs])
@@ -146,12 +146,31 @@ def test_a_given_matcher_selector_and_solver_are_called(frames):
     assert calls == [(5, 0.3)]
 
 
+class Clustering(VerifiedSolver):
+    kmeans = True
+
+
+def test_a_solver_says_whether_kmeans_selects_its_matches(views):
+    def matches(**settings):
+        method = replace(BASE, **settings)
+        return method.match_pair(*views[:2], method.similarities(views[0], views[1:2])[0]).matches.reference
+
+    clustered, best = matches(kmeans=True), matches(kmeans=False)
+    assert not np.array_equal(clustered, best)
+    for chosen in ("paper", pipeline.align_best_view, Clustering()):
+        np.testing.assert_array_equal(matches(solver=chosen), clustered)
+        np.testing.assert_array_equal(matches(solver=chosen, kmeans=False), best)
+    for chosen in ("verified", VerifiedSolver()):
+        np.testing.assert_array_equal(matches(solver=chosen), best)
+        np.testing.assert_array_equal(matches(solver=chosen, kmeans=True), clustered)
+
+
 def test_the_scale_of_the_best_view_alone_is_that_of_target_over_reference(frames):
     reference, target = BASE.views([frames[0], replace(frames[0], depth=3 * frames[0].depth)])
     assert view_alignment(reference, target).scale == pytest.approx(3, rel=1e-4)
 
 
-VERIFIED = replace(BASE, solver="verified", kmeans=False)  # without k-means, matches do not depend on the seed
+VERIFIED = replace(BASE, solver="verified")
 
 
 @pytest.fixture(scope="module")

@@ -48,23 +48,25 @@ _PARTS: dict[str, tuple[tuple[str, ...], dict[str, bool]]] = {
 }
 
 
-def rows() -> dict[str, Method]:
+def rows(names: Sequence[str] = tuple(_PARTS)) -> dict[str, Method]:
     """Return the benchmark's rows: the whole solver, and the solver without one part or several."""
     return {
         name: Method(
             settings={"solver": VerifiedSolver(ScoreWeights().without("orientation", "agreement", *terms), **settings)}
         )
         for name, (terms, settings) in _PARTS.items()
+        if name in names or name == WHOLE
     }
 
 
-def measure(data: Sequence[tuple[Path, int]], out: Path, backbone: str) -> list[Path]:
-    """Run all rows on folders of data, or continue, and export each run.
+def measure(data: Sequence[tuple[Path, int]], out: Path, backbone: str, methods: Mapping[str, Method]) -> list[Path]:
+    """Run rows on folders of data, or continue, and export each run.
 
     Args:
         data: Folders, and how many pairs to take of each of their categories.
         out: Folder of the runs and their exports.
         backbone: Name of the backbone.
+        methods: The rows.
 
     Returns:
         The exported files, OUT/NAME.json.gz for a folder NAME.
@@ -79,17 +81,17 @@ def measure(data: Sequence[tuple[Path, int]], out: Path, backbone: str) -> list[
     loaded, written = load_backbone(backbone), []
     for folder, pairs in data:
         run = out / folder.name
-        evaluate(folder, loaded, rows(), pairs=pairs, out=run)
+        evaluate(folder, loaded, methods, pairs=pairs, out=run)
         written.append(export_results(read_results(run), out / f"{folder.name}.json.gz"))
     return written
 
 
 def read_errors(files: Sequence[Path]) -> dict[str, dict[str, float]]:
     """Return the rotation errors in degrees by row and pair of several exported runs."""
-    errors: dict[str, dict[str, float]] = {name: {} for name in _PARTS}
+    errors: dict[str, dict[str, float]] = {}
     for results in map(read_results, files):
-        for name, found in errors.items():
-            found.update(results.errors(name))
+        for name in filter(results.rows.__contains__, _PARTS):
+            errors.setdefault(name, {}).update(results.errors(name))
     return errors
 
 
@@ -138,10 +140,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.parts", description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path, help="folder of the runs and their exports")
     parser.add_argument("data", type=folder_and_pairs, nargs="+", metavar="FOLDER:PAIRS", help=DATA_HELP)
+    parser.add_argument(
+        "--without", action="append", choices=list(_PARTS)[1:], metavar="PART", help="rows to run (default all)"
+    )
     parser.add_argument("--backbone", default=DEFAULT, metavar="NAME", help=f"default {DEFAULT}")
     given = parser.parse_args(arguments)
     try:
-        errors = read_errors(measure(given.data, given.out, given.backbone))
+        errors = read_errors(measure(given.data, given.out, given.backbone, rows(given.without or _PARTS)))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -154,7 +154,7 @@ def collect_outcomes(
         for n_targets in view_numbers:
             found = []
             for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-                method = ZeroShotPose(backbone, seed=pair.seed)
+                method = ZeroShotPose(backbone, solver=solver, seed=pair.seed)
                 frames = [
                     (pair.reference_sequence, pair.reference_frame),
                     *((pair.target_sequence, number) for number in pair.target_frames),
@@ -163,7 +163,7 @@ def collect_outcomes(
                 views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
                 reference, *targets = (views[one] for one in frames)
                 ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-                found.append(solve_views(method, name, reference, targets, ends, solver))
+                found.append(solve_views(method, name, reference, targets, ends))
             outcomes += found
             accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
             _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", category, len(found), n_targets, 100 * accuracy)
@@ -171,14 +171,13 @@ def collect_outcomes(
 
 
 def solve_views(
-    method: ZeroShotPose, category: str, reference: View, targets: Sequence[View], labels: tuple[PoseLabel, PoseLabel],
-    solver: VerifiedSolver,
-) -> Outcome:  # fmt: skip
-    """Run the verified solver on the views of a pair and compute the errors of its hypotheses."""
+    method: ZeroShotPose, category: str, reference: View, targets: Sequence[View], labels: tuple[PoseLabel, PoseLabel]
+) -> Outcome:
+    """Run a method's verified solver on the views of a pair and compute the errors of its hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
     similarities = method.similarities(reference, targets)
     pairs = [method.match_pair(reference, target, sim) for target, sim in zip(targets, similarities)]
-    solution = solver.solve(reference, targets, pairs, method.seed)
+    solution = method.solver.solve(reference, targets, pairs, method.seed)
 
     cameras = [target.frame.camera for target in targets]
     true = [relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3] for camera in cameras]

@@ -55,7 +55,7 @@ def sample_views() -> tuple[View, View]:
 def sample_solution() -> tuple[Solution, tuple[View, ...]]:
     """Solve a sample pair of toy trucks with three target views; returns the solution and the views."""
     dataset = Co3D(sample_data())
-    reference, targets, pairs = _matched(dataset, demo_pairs(dataset, n_targets=3)[-1])
+    reference, targets, pairs = _matched(dataset, demo_pairs(dataset, n_targets=3)[-1], "verified")
     return VerifiedSolver().solve(reference, targets, pairs), tuple(targets)
 
 
@@ -192,9 +192,9 @@ def _backbone() -> Backbone:
     return load_backbone("zsp-tiny", "cpu")
 
 
-def _matched(dataset: Co3D, pair: Pair):
-    """Load a pair and match its reference with every target view."""
-    method, (reference, targets) = ZeroShotPose(_backbone()), dataset.load_pair(pair)
+def _matched(dataset: Co3D, pair: Pair, solver: str = "paper"):
+    """Load a pair and match its reference with every target view, as a solver needs it."""
+    method, (reference, targets) = ZeroShotPose(_backbone(), solver=solver), dataset.load_pair(pair)
     reference, *targets = method.views([reference, *targets])
     sims = method.similarities(reference, targets)
     return reference, targets, [method.match_pair(reference, *one) for one in zip(targets, sims)]

@@ -192,6 +192,8 @@ class Solver(Protocol):
             return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
+
+    If its class has an attribute `kmeans`, that says whether k-means selects the matches, which is the default.
     """
 
     def __call__(

@@ -34,7 +34,8 @@ class ZeroShotPose:
     Attributes:
         backbone: Computes the features of images; any `FeatureExtractor`.
         k: Number of matches.
-        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best.
+        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best. None: as the
+            solver has it (see `estimates.Solver`), True for the paper's and False for the verified one.
         view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`.
         trials: Number of RANSAC trials.
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
@@ -64,7 +65,7 @@ class ZeroShotPose:
 
     backbone: FeatureExtractor
     k: int = 50
-    kmeans: bool = True
+    kmeans: bool | None = None
     view_selector: str | ViewSelector = "correspond"
     trials: int = 1000
     threshold: float = 0.2
@@ -86,7 +87,7 @@ class ZeroShotPose:
             ("foreground", ("saliency", "mask")),
             ("cycle_from", ("reference", "target")),
             ("solver", ("paper", *SOLVERS)),
-            ("kmeans", (True, False)),
+            ("kmeans", (True, False, None)),
             ("adaptive_threshold", (True, False)),
             ("binning", (True, False)),
             ("upright", (True, False)),
@@ -106,6 +107,11 @@ class ZeroShotPose:
             )
         check_number("threshold", self.threshold, above=0)
         check_number("saliency_threshold", self.saliency_threshold)
+
+    @property
+    def clusters(self) -> bool:
+        """Whether k-means selects the matches (see `kmeans`)."""
+        return getattr(type(self._solver()), "kmeans", True) if self.kmeans is None else self.kmeans
 
     @checked
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
@@ -226,7 +232,7 @@ class ZeroShotPose:
     def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
         """Match the reference with one target view (sec. 4.1), from their similarities."""
         matches = match(
-            reference.features, target.features, self.k, self.kmeans, self.seed, self.cycle_from,
+            reference.features, target.features, self.k, self.clusters, self.seed, self.cycle_from,
             ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
             binning=self.binning,
         )  # fmt: skip

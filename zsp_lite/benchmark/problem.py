@@ -23,8 +23,8 @@ from zsp_lite.views import View
 RESERVED = (
     "error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two",
 )  # fmt: skip
-# Settings of ZeroShotPose that decide the matches: rows that agree in them share the matches.
-_MATCH_SETTINGS = ("k", "kmeans", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning")
+# What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
+_MATCH_SETTINGS = ("k", "clusters", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning")
 
 
 @dataclass(frozen=True, eq=False)

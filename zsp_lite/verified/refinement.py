@@ -49,8 +49,8 @@ class SearchSchedule:
 
 
 COARSE = SearchSchedule(rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65)
-FINE = SearchSchedule(rounds=6, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
-POLISH = SearchSchedule(rounds=5, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
+FINE = SearchSchedule(rounds=5, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
+POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
 
 
 def refine_coarse_to_fine(

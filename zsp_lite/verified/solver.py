@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -76,8 +77,10 @@ class VerifiedSolver:
         feature_weight: Weight of the feature similarity in the soft ICP; 0 aligns by shape alone.
         icp: Whether to run the soft ICP.
         refinement: Whether to run the refinement.
+        kmeans: The matches are the k best ones (see `ZeroShotPose.kmeans`).
     """
 
+    kmeans: ClassVar[bool] = False
     weights: ScoreWeights = ScoreWeights()
     calibration: Calibration = Calibration()
     feature_weight: float = FEATURE_WEIGHT
