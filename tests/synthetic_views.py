@@ -117,5 +117,5 @@ def matched_scene(views: list[View]) -> Scene:
     """The verified solver's scene of a reference view and its target views."""
     reference, *targets = views
     found = similarities(reference.features, [target.features for target in targets])
-    matches = [match(reference.features, target.features, sim=sim) for target, sim in zip(targets, found)]
+    matches = [match(reference.features, target.features, kmeans=False, sim=sim) for target, sim in zip(targets, found)]
     return build_scene(reference, targets, found, matches)

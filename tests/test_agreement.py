@@ -1,5 +1,6 @@
 """The term `agreement`: photo features at the points of a scene, compared under a pose, with fitted channel weights."""
 
+import re
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -129,7 +130,7 @@ def test_the_default_backbone_has_photo_features_and_the_term_enters_the_score(v
         replace(view, features=replace(view.features, photo=torch.rand(14, 14, 320, generator=rng))) for view in views
     ]
     found = similarities(some[0].features, [target.features for target in some[1:]])
-    matches = [match(some[0].features, target.features, sim=sim) for target, sim in zip(some[1:], found)]
+    matches = [match(some[0].features, target.features, kmeans=False, sim=sim) for target, sim in zip(some[1:], found)]
     pairs = [
         ViewPair(some[0].features, one.features, some[0].foreground, one.foreground, sim, matched, 50)
         for one, sim, matched in zip(some[1:], found, matches)
@@ -173,8 +174,11 @@ def test_the_channel_that_tells_is_found():
     assert fitted[0] > 5 * np.abs(fitted[1:]).max()
     smaller = fit_agreement(outcomes, ScoreWeights(), ridge=1.0)
     assert 0 < smaller[0] < fitted[0]
-    report = report_beside(outcomes, channel_columns, ScoreWeights(), lambda some: fit_agreement(some, ScoreWeights()))
-    assert "pairs won" in report[2] and report[3].startswith("5 weights")
+    report = report_beside(
+        outcomes, channel_columns, ScoreWeights(), fitted, lambda some: fit_agreement(some, ScoreWeights(), ridge=0.01)
+    )
+    won, lost = map(int, re.search(r"(\d+) pairs won, (\d+) lost", report[2]).groups())
+    assert won > 50 and won > 10 * lost and report[3].startswith("5 weights")
     for one in outcomes:
         one.terms[:] *= -1
     with pytest.raises(InputError, match="score without the term has no positive weight"):

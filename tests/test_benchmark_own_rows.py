@@ -165,6 +165,8 @@ def test_a_function_with_source_is_known_by_it_whatever_the_bytecode(monkeypatch
     assert digest_of(own_method) == before != digest_of(one_way)
     first, second = lambda problem: 1, lambda problem: 2
     assert digest_of(first) != digest_of(second)
+    monkeypatch.setattr(own_method, "kmeans", False, raising=False)
+    assert digest_of(own_method) != before
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,12 @@ def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog):
     assert len(backbone.seen) == len(set(backbone.seen))  # features of an image are extracted once
     assert f"ellipsoid: 2 pairs of 3 views, Acc30 {50 * correct} %" in caplog.messages
     assert min(one.errors[0] for one in outcomes[:2]) < 5
+    nothing, (again, _) = (
+        collect_outcomes(ellipsoids.root, 2, backbone, VerifiedSolver(), (3,), categories=[name])
+        for name in ("ellipsoid", f"{ellipsoids.root.name}/ellipsoid")
+    )
+    assert nothing == []
+    np.testing.assert_array_equal(again.errors, outcomes[0].errors)
     for one in outcomes:
         m = len(one.errors)
         assert one.terms.shape == (m, len(TERM_NAMES)) and one.angles.shape == (m, m)
@@ -181,7 +187,11 @@ def test_the_weight_of_a_term_beside_the_score_is_recovered():
     assert found == pytest.approx([TRUE_WEIGHTS.orientation], abs=0.3)
     half = fit_beside(outcomes, orientation_column, ScoreWeights(*np.array(astuple(base)) / 2), ridge=0)
     assert half == pytest.approx(found / 2, rel=1e-3)  # in nats of the score
-    text = "\n".join(report_beside(outcomes, orientation_column, base, lambda some: found))
+
+    def fit(some):
+        return fit_beside(some, orientation_column, base, ridge=0)
+
+    text = "\n".join(report_beside(outcomes, orientation_column, base, found, fit))
     assert "1200 pairs of 4 categories" in text and f"weight {found[0]:.2f}" in text
 
 

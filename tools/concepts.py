@@ -9,7 +9,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
 
 CONCEPTS = Path(__file__).with_suffix(".csv")
-DATA_HELP = "folder of categories in CO3D's layout with pose labels, and pairs of each category"
+DATA_HELP = "folder of categories in CO3D's layout with pose labels, and number of pairs of each category"
 
 
 def folder_and_pairs(text: str) -> tuple[Path, int]:
@@ -20,7 +20,7 @@ def folder_and_pairs(text: str) -> tuple[Path, int]:
     """
     folder, _, pairs = text.rpartition(":")
     if not folder or not pairs.isdecimal() or int(pairs) < 1:
-        raise ArgumentTypeError(f"{text}: expected FOLDER:PAIRS")
+        raise ArgumentTypeError(f"{text}: expected FOLDER:PAIRS, PAIRS at least 1")
     return Path(folder), int(pairs)
 
 

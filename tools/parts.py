@@ -90,8 +90,9 @@ def read_errors(files: Sequence[Path]) -> dict[str, dict[str, float]]:
     """Return the rotation errors in degrees by row and pair of several exported runs."""
     errors: dict[str, dict[str, float]] = {}
     for results in map(read_results, files):
-        for name in filter(results.rows.__contains__, _PARTS):
-            errors.setdefault(name, {}).update(results.errors(name))
+        for name in _PARTS:
+            if name in results.rows:
+                errors.setdefault(name, {}).update(results.errors(name))
     return errors
 
 
@@ -141,12 +142,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="folder of the runs and their exports")
     parser.add_argument("data", type=folder_and_pairs, nargs="+", metavar="FOLDER:PAIRS", help=DATA_HELP)
     parser.add_argument(
-        "--without", action="append", choices=list(_PARTS)[1:], metavar="PART", help="rows to run (default all)"
+        "--without",
+        action="append",
+        choices=list(_PARTS)[1:],
+        metavar="PART",
+        help="run the row without this part; may be repeated (default: all rows)",
     )
     parser.add_argument("--backbone", default=DEFAULT, metavar="NAME", help=f"default {DEFAULT}")
     given = parser.parse_args(arguments)
     try:
-        errors = read_errors(measure(given.data, given.out, given.backbone, rows(given.without or _PARTS)))
+        errors = read_errors(measure(given.data, given.out, given.backbone, rows(given.without or tuple(_PARTS))))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

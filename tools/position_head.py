@@ -73,6 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         backbone = load_backbone(BACKBONE)
         examples = [one for folder in given.data for one in read_examples(folder, backbone)]
         unseen = [one for folder in given.validation for one in read_examples(folder, backbone)]
+        if unknown := set(given.without) - {one.category for one in examples}:
+            raise InputError(f"--without {' '.join(sorted(unknown))}: not in the data, expected FOLDER/CATEGORY")
         head = train([one for one in examples if one.category not in given.without], unseen, given.steps)
         weights = {name: value.half().contiguous() for name, value in head.state_dict().items()}
         save_file(weights, given.out, {WITHOUT: " ".join(given.without)})

@@ -1,4 +1,4 @@
-"""Fit the constants of the verified solver: weights of the score and of the channels of `agreement`, the calibration.
+"""Fit the constants of the verified solver: weights of the score, of the channels of `agreement`, and the calibration.
 
 Run from the root of the repository. The weights are fitted on training categories, the calibration on validation
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
@@ -13,11 +13,11 @@ side (`concepts.csv`) are refused. The tool prints the fitted values and how wel
 fit; the constants in `zsp_lite/verified` are these, rounded.
 
 The terms `orientation` and `agreement` were trained on training categories themselves. Therefore the fit of the weights
-leaves both out, in the search for hypotheses as well, and prints 0 for them. So does that of the weight of
-`orientation`, on the categories that the position head FILE was trained without (`tools/position_head.py --without`).
-The fit of the agreement searches without `agreement`, and leaves `orientation` out of the score.
+leaves both out, in the search for hypotheses as well, and prints 0 for them. That of `orientation` searches without
+both, too, and uses only the categories that the position head FILE was trained without (`tools/position_head.py
+--without`). That of the agreement searches without `agreement`, and leaves `orientation` out of the score.
 
-Both kinds of weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
+All weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
 that one is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present
 weights; if the fitted ones differ much, run the tool again with these as defaults.
 """
@@ -124,7 +124,7 @@ def use_head(backbone: Backbone, file: Path) -> list[str]:
     Raises:
         InputError: The backbone has no position head, or the file is damaged or does not name such categories.
     """
-    if backbone.position_head is None:
+    if getattr(backbone, "position_head", None) is None:
         raise InputError(f"backbone {backbone.name} has no position head, expected one with it")
     dims = backbone.position_head.key.in_features, backbone.position_head.photo.in_features
     backbone.position_head = load_position_head(file, *dims)
@@ -402,7 +402,7 @@ def report_weights(outcomes: Sequence[Outcome]) -> list[str]:
 
 def report_beside(
     outcomes: Sequence[Outcome], columns: Callable[[Outcome], Float[np.ndarray, "m k"] | None], weights: ScoreWeights,
-    fit: Callable[[Sequence[Outcome]], Float[np.ndarray, " k"]],
+    fitted: Float[np.ndarray, " k"], fit: Callable[[Sequence[Outcome]], Float[np.ndarray, " k"]],
 ) -> list[str]:  # fmt: skip
     """Format what further columns gain beside a score (`fit_beside`), on categories that the fit has not seen."""
     used = [one for one in outcomes if columns(one) is not None]
@@ -411,7 +411,6 @@ def report_beside(
     before = np.array([one.errors[s.argmax()] for one, s in zip(used, score)])
     after = np.array([one.errors[(s + columns(one) @ w).argmax()] for one, s, w in zip(used, score, held_out)])
     won, lost = ((one < CORRECT_ANGLE) & (two >= CORRECT_ANGLE) for one, two in ((after, before), (before, after)))
-    fitted = fit(used)
     size = f"root mean square {np.sqrt(np.mean(fitted**2)):.2f} nats"
     return [
         f"{len(used)} pairs of {len({one.category for one in used})} categories",
@@ -495,17 +494,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     root, pairs, backbone, solver, _VIEWS if fit == "calibration" else (5,), categories=categories
                 )
             ]
-        present = ScoreWeights()
+        if not outcomes:
+            raise InputError(f"no pairs of {', '.join(categories or ['any category'])} in the data")
         if fit == "weights":
             lines = report_weights([replace(one, terms=one.terms * _UNTRAINED) for one in outcomes])
         elif fit == "orientation":
-            lines = report_beside(outcomes, orientation_column, solver.weights, fit_orientation)
+            fitted = fit_orientation(outcomes)
+            lines = report_beside(outcomes, orientation_column, solver.weights, fitted, fit_orientation)
         elif fit == "agreement":
-            weights = present.without("orientation", "agreement")
-            lines = report_beside(outcomes, channel_columns, weights, lambda some: fit_agreement(some, weights))
-            save_file({"weights": torch.from_numpy(fit_agreement(outcomes, weights)).float()}, given.out)
+            weights = ScoreWeights().without("orientation", "agreement")
+            fitted = fit_agreement(outcomes, weights)
+            lines = report_beside(outcomes, channel_columns, weights, fitted, lambda some: fit_agreement(some, weights))
+            save_file({"weights": torch.from_numpy(fitted).float()}, given.out)
         else:
-            lines = report_calibration(outcomes, present)
+            lines = report_calibration(outcomes, ScoreWeights())
         print("\n".join(lines))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -193,7 +193,8 @@ class Solver(Protocol):
 
         ZeroShotPose(backbone, solver=first_view)
 
-    If its class has an attribute `kmeans`, that says whether k-means selects the matches, which is the default.
+    A solver with an attribute `kmeans = False` gets the k best matches. Without this attribute, k-means selects the
+    matches (see `ZeroShotPose.kmeans`).
     """
 
     def __call__(

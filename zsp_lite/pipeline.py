@@ -34,8 +34,8 @@ class ZeroShotPose:
     Attributes:
         backbone: Computes the features of images; any `FeatureExtractor`.
         k: Number of matches.
-        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best. None: as the
-            solver has it (see `estimates.Solver`), True for the paper's and False for the verified one.
+        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best. None uses
+            the solver's setting (see `estimates.Solver`): True for the paper's, False for the verified one.
         view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`.
         trials: Number of RANSAC trials.
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
@@ -111,7 +111,7 @@ class ZeroShotPose:
     @property
     def clusters(self) -> bool:
         """Whether k-means selects the matches (see `kmeans`)."""
-        return getattr(type(self._solver()), "kmeans", True) if self.kmeans is None else self.kmeans
+        return getattr(self._solver(), "kmeans", True) if self.kmeans is None else self.kmeans
 
     @checked
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:

@@ -42,11 +42,11 @@ def backbone_digest(backbone: Backbone) -> str:
 def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     """Describe a value as text.
 
-    A function is described by its source, defaults and closure, without comments, docstrings and the globals it uses;
-    a lambda or a function without source by its bytecode, which depends on the version of Python. Functions and classes
-    of the library are described by their names: a run records the library's version. An object is described by its
-    `__repr__`, if its class defines one, otherwise by its class and its public attributes except cached properties.
-    Arrays and weights are described by hashes.
+    A function is described by its source, defaults, closure and attributes, without comments, docstrings and the
+    globals it uses; a lambda or a function without source by its bytecode, which depends on the version of Python.
+    Functions and classes of the library are described by their names: a run records the library's version. An object is
+    described by its `__repr__`, if its class defines one, otherwise by its class and its public attributes except
+    cached properties. Arrays and weights are described by hashes.
     """
     value = inspect.unwrap(value) if callable(value) else value
     if id(value) in _within:
@@ -77,7 +77,8 @@ def description(value: Any, _within: tuple[int, ...] = ()) -> str:
     if inspect.isfunction(value):
         cells = [cell.cell_contents for cell in value.__closure__ or () if cell != types.CellType()]
         code = _library_name(value) or _source(value) or _code(value.__code__, value.__doc__)
-        return code + description((value.__defaults__, value.__kwdefaults__, cells), _within)
+        attributes = description(vars(value), _within) if vars(value) else ""
+        return code + description((value.__defaults__, value.__kwdefaults__, cells), _within) + attributes
     if inspect.isclass(value):
         if name := _library_name(value):
             return name

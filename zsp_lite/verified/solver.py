@@ -77,7 +77,7 @@ class VerifiedSolver:
         feature_weight: Weight of the feature similarity in the soft ICP; 0 aligns by shape alone.
         icp: Whether to run the soft ICP.
         refinement: Whether to run the refinement.
-        kmeans: The matches are the k best ones (see `ZeroShotPose.kmeans`).
+        kmeans: Whether k-means selects the matches (see `ZeroShotPose.kmeans`).
     """
 
     kmeans: ClassVar[bool] = False
