@@ -39,12 +39,12 @@ class Calibration:
         none_shape: \beta_3.
     """
 
-    scale: float = -1.91
-    scale_views: float = 0.62
+    scale: float = -2.02
+    scale_views: float = 0.67
     none: float = 0.76
-    none_views: float = -1.54
-    none_std: float = -31.3
-    none_shape: float = -0.148
+    none_views: float = -1.49
+    none_std: float = -33.0
+    none_shape: float = -0.159
 
     def probabilities(
         self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
