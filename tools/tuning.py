@@ -59,7 +59,6 @@ CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
-_ORIENTATION_RIDGE = 1e-2
 _AGREEMENT_RIDGE, _FOLDS = 2.0, 5
 _CALIBRATION_RIDGE = 1e-3
 _VIEWS = (1, 2, 3, 5, 7, 10)  # of the calibration
@@ -225,7 +224,7 @@ def channel_columns(outcome: Outcome) -> Float[np.ndarray, "m channels"] | None:
     return outcome.channels
 
 
-def fit_orientation(outcomes: Sequence[Outcome], ridge: float = _ORIENTATION_RIDGE) -> Float[np.ndarray, " 1"]:
+def fit_orientation(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Float[np.ndarray, " 1"]:
     """Fit the weight of the term `orientation`, beside the score without it and without `agreement` (`fit_beside`)."""
     return fit_beside(outcomes, orientation_column, ScoreWeights().without("orientation", "agreement"), ridge)
 
