@@ -4,7 +4,7 @@ Run from the root of the repository. The weights are fitted on training categori
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
-    python -m tools.tuning orientation outputs/training_poses:36 --head outputs/head_without.safetensors
+    python -m tools.tuning orientation outputs/training_poses:36 --head outputs/head_{1,2,3,4}.safetensors
     python -m tools.tuning agreement outputs/training8:16 outputs/variants:8 --out outputs/agreement.safetensors
     python -m tools.tuning calibration outputs/{validation:10,validation_poses:20,validation_variants:4}
 
@@ -14,7 +14,7 @@ fit; the constants in `zsp_lite/verified` are these, rounded.
 
 The terms `orientation` and `agreement` were trained on training categories themselves. Therefore the fit of the weights
 leaves both out, in the search for hypotheses as well, and prints 0 for them. That of `orientation` searches without
-both, too, and uses only the categories that the position head FILE was trained without (`tools/position_head.py
+both, too, and uses each position head on the categories that it was trained without (`tools/position_head.py
 --without`). That of the agreement searches without `agreement`, and leaves `orientation` out of the score.
 
 All weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability
@@ -28,6 +28,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -468,7 +469,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("constants", choices=_UNUSED, help="what to fit")
     parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS", help=DATA_HELP)
     parser.add_argument("--backbone", action="append", metavar="NAME", help=f"may be repeated (default {DEFAULT})")
-    parser.add_argument("--head", type=Path, metavar="FILE", help="position head to use, for orientation")
+    parser.add_argument("--head", type=Path, nargs="+", metavar="FILE", help="position heads to use, for orientation")
     parser.add_argument("--out", type=Path, metavar="FILE", help="weights to write, for agreement")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -481,20 +482,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.out is not None and not given.out.absolute().parent.is_dir():
             raise InputError(f"--out {given.out}: folder {given.out.parent} does not exist")
         check_sides([folder for folder, _ in given.data], "validation" if fit == "calibration" else "training")
-        backbones, categories = [load_backbone(name) for name in given.backbone or [DEFAULT]], None
-        if given.head is not None:
-            categories = [name for backbone in backbones for name in use_head(backbone, given.head)]
-        with torch.no_grad():
-            outcomes = [
-                one
-                for backbone in backbones
-                for root, pairs in given.data
-                for one in collect_outcomes(
-                    root, pairs, backbone, solver, _VIEWS if fit == "calibration" else (5,), categories=categories
-                )
-            ]
-        if not outcomes:
-            raise InputError(f"no pairs of {', '.join(categories or ['any category'])} in the data")
+        views, outcomes = _VIEWS if fit == "calibration" else (5,), []
+        for backbone, head in product(map(load_backbone, given.backbone or [DEFAULT]), given.head or [None]):
+            categories = None if head is None else use_head(backbone, head)
+            with torch.no_grad():
+                found = [
+                    collect_outcomes(root, pairs, backbone, solver, views, categories=categories)
+                    for root, pairs in given.data
+                ]
+            if not any(found):
+                raise InputError(f"no pairs of {', '.join(categories or ['any category'])} in the data")
+            outcomes += chain(*found)
         if fit == "weights":
             lines = report_weights([replace(one, terms=one.terms * _UNTRAINED) for one in outcomes])
         elif fit == "orientation":
