@@ -208,3 +208,21 @@ def test_a_head_is_used_on_categories_it_was_trained_without(tmp_path, capsys):
         use_head(load_backbone("zsp-tiny"), tmp_path / "part.safetensors")
     assert tuning.main(["orientation", f"{tmp_path}:2"]) == 2
     assert "--head FILE is required for `orientation`" in capsys.readouterr().err
+
+
+def test_every_head_is_used_on_its_own_categories(tmp_path, monkeypatch, capsys):
+    state = load_backbone("zsp-tiny-photo").position_head.state_dict()
+    heads = [tmp_path / "first.safetensors", tmp_path / "second.safetensors"]
+    for value, (file, left_out) in enumerate(zip(heads, ("data/desk data/tv", "data/shoe"))):
+        save_file({name: torch.full_like(one, value) for name, one in state.items()}, file, {"without": left_out})
+    used = []
+
+    def collect(root, pairs, backbone, solver, views, categories):
+        used.append((next(backbone.position_head.parameters()).mean().item(), categories))
+        return sample_outcomes(300, np.random.default_rng(len(used)))
+
+    monkeypatch.setattr(tuning, "collect_outcomes", collect)
+    monkeypatch.setattr(tuning, "check_sides", lambda folders, side: None)
+    assert tuning.main(["orientation", f"{tmp_path}:2", "--head", *map(str, heads)]) == 0
+    assert used == [(0, ["data/desk", "data/tv"]), (1, ["data/shoe"])]
+    assert "600 pairs of 4 categories" in capsys.readouterr().out
