@@ -39,12 +39,12 @@ class Calibration:
         none_shape: \beta_3.
     """
 
-    scale: float = -2.02
-    scale_views: float = 0.67
-    none: float = 0.76
-    none_views: float = -1.49
-    none_std: float = -33.0
-    none_shape: float = -0.159
+    scale: float = -1.33
+    scale_views: float = 0.62
+    none: float = 0.82
+    none_views: float = -1.16
+    none_std: float = -30.9
+    none_shape: float = -0.269
 
     def probabilities(
         self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],

@@ -104,21 +104,21 @@ FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint", "orien
 
 @dataclass(frozen=True)
 class ScoreWeights:
-    """The weight of each term, in nats. The defaults were fitted on objects of training categories and rounded.
+    """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`).
 
     That of `agreement` is 1, because its channel weights are in nats.
     """
 
-    forward_similarity: float = 60.0
-    forward_overlap: float = 5.0
-    forward_silhouette: float = -25.0
-    forward_free_space: float = -20.0
-    reverse_similarity: float = 20.0
-    reverse_overlap: float = 35.0
-    reverse_silhouette: float = -10.0
-    reverse_free_space: float = -30.0
-    viewpoint: float = 20.0
-    orientation: float = 6.5
+    forward_similarity: float = 15.9
+    forward_overlap: float = 5.5
+    forward_silhouette: float = -14.7
+    forward_free_space: float = -16.7
+    reverse_similarity: float = 20.3
+    reverse_overlap: float = 18.0
+    reverse_silhouette: float = -6.1
+    reverse_free_space: float = -13.7
+    viewpoint: float = 21.5
+    orientation: float = 3.05
     agreement: float = 1.0
 
     def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
