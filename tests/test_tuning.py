@@ -22,6 +22,7 @@ from tools.tuning import (
     report_beside,
     report_calibration,
     report_weights,
+    unseen_categories,
     use_head,
 )
 from zsp_lite.backbones.load import load_backbone
@@ -199,11 +200,14 @@ def test_a_head_is_used_on_categories_it_was_trained_without(tmp_path, capsys):
     backbone = load_backbone("zsp-tiny-photo")
     weights = {name: torch.zeros_like(value) for name, value in backbone.position_head.state_dict().items()}
     save_file(weights, tmp_path / "part.safetensors", {"without": "data/desk data/shoe"})
-    assert use_head(backbone, tmp_path / "part.safetensors") == ["data/desk", "data/shoe"]
+    assert unseen_categories([tmp_path / "part.safetensors"]) == [["data/desk", "data/shoe"]]
+    use_head(backbone, tmp_path / "part.safetensors")
     assert not any(value.any() for value in backbone.position_head.state_dict().values())
     save_file(weights, tmp_path / "all.safetensors", {"without": ""})
     with pytest.raises(InputError, match="all.safetensors: trained on all categories, expected"):
-        use_head(backbone, tmp_path / "all.safetensors")
+        unseen_categories([tmp_path / "all.safetensors"])
+    with pytest.raises(InputError, match="part.safetensors: trained without data/desk, as an earlier head"):
+        unseen_categories([tmp_path / "part.safetensors"] * 2)
     with pytest.raises(InputError, match="zsp-tiny has no position head"):
         use_head(load_backbone("zsp-tiny"), tmp_path / "part.safetensors")
     assert tuning.main(["orientation", f"{tmp_path}:2"]) == 2

@@ -118,20 +118,31 @@ class Outcome:
         return self.n_views, self.view_std, float(best @ np.array(astuple(weights.without(*FEATURE_TERMS))))
 
 
-def use_head(backbone: Backbone, file: Path) -> list[str]:
-    """Replace a backbone's position head by that of a file, and return the categories the head was trained without.
+def unseen_categories(heads: Sequence[Path]) -> list[list[str]]:
+    """Return for each file of a position head the categories that the head was trained without.
 
     Raises:
-        InputError: The backbone has no position head, or the file is damaged or does not name such categories.
+        InputError: A file is damaged or names no such categories, or two files name the same one.
+    """
+    found = [read_checkpoint(file)[1].get(WITHOUT, "").split() for file in heads]
+    for index, (file, names) in enumerate(zip(heads, found)):
+        if not names:
+            raise InputError(f"{file}: trained on all categories, expected a head of tools.position_head --without")
+        if repeated := set(names).intersection(chain(*found[:index])):
+            raise InputError(f"{file}: trained without {sorted(repeated)[0]}, as an earlier head, expected one of them")
+    return found
+
+
+def use_head(backbone: Backbone, file: Path) -> None:
+    """Replace a backbone's position head by that of a file.
+
+    Raises:
+        InputError: The backbone has no position head, or the file is damaged.
     """
     if getattr(backbone, "position_head", None) is None:
         raise InputError(f"backbone {backbone.name} has no position head, expected one with it")
     dims = backbone.position_head.key.in_features, backbone.position_head.photo.in_features
     backbone.position_head = load_position_head(file, *dims)
-    categories = read_checkpoint(file)[1].get(WITHOUT, "").split()
-    if not categories:
-        raise InputError(f"{file}: trained on all categories, expected a head of tools.position_head --without")
-    return categories
 
 
 def collect_outcomes(
@@ -483,8 +494,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError(f"--out {given.out}: folder {given.out.parent} does not exist")
         check_sides([folder for folder, _ in given.data], "validation" if fit == "calibration" else "training")
         views, outcomes = _VIEWS if fit == "calibration" else (5,), []
-        for backbone, head in product(map(load_backbone, given.backbone or [DEFAULT]), given.head or [None]):
-            categories = None if head is None else use_head(backbone, head)
+        heads = list(zip(given.head, unseen_categories(given.head))) if given.head else [(None, None)]
+        for backbone, (head, categories) in product(map(load_backbone, given.backbone or [DEFAULT]), heads):
+            if head is not None:
+                use_head(backbone, head)
             with torch.no_grad():
                 found = [
                     collect_outcomes(root, pairs, backbone, solver, views, categories=categories)
