@@ -11,7 +11,8 @@ from zsp_lite.verified.confidence import reliability
 
 RESULTS = REPOSITORY / "notebooks" / "results"
 SECTIONS = {
-    "verified_run": "The verified solver with matches without k-means",
+    "verified_run": "The verified solver with all weights fitted again",
+    "matches_run": "The verified solver with matches without k-means",
     "around_run": "The verified solver with proposals around the object",
     "agreement_run": "The verified solver with agreement of photo features",
     "position_head_run": "The verified solver with a position head",
