@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_integer, check_magnitude, check_seed, real_array
 
 # Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
@@ -77,7 +76,6 @@ class Sim3:
         matrix[:3, 3] = self.t
         return matrix
 
-    @checked
     def apply(self, points: ArrayLike) -> Float[np.ndarray, "*batch 3"]:
         """Transform points (..., 3)."""
         return self.scale * np.asarray(points, dtype=np.float64) @ self.R.T + self.t
@@ -86,13 +84,11 @@ class Sim3:
         """Return the inverse transform."""
         return Sim3(1 / self.scale, self.R.T, -(self.R.T @ self.t) / self.scale)
 
-    @checked
     def __matmul__(self, other: "Sim3") -> "Sim3":
         """Compose two transforms: `(a @ b).apply(x) == a.apply(b.apply(x))`."""
         return Sim3(self.scale * other.scale, self.R @ other.R, self.apply(other.t))
 
 
-@checked
 def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Sim3:
     """Fit the similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4; Umeyama 1991).
 
@@ -156,7 +152,6 @@ def umeyama_batch(
     return scale, rotation, translation, conditioning
 
 
-@checked
 def ransac(
     source: ArrayLike,
     target: ArrayLike,

@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 
-from zsp_lite.arguments import checked
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches, cyclical_distances
 
@@ -66,7 +65,6 @@ class ViewSelector(Protocol):
         ...
 
 
-@checked
 def correspondence_score(matches: Matches, k: int) -> float:
     """Score the matches of a view (eq. 3, "CorrespondSim"): the sum of -d over the k matches.
 
@@ -80,28 +78,24 @@ def correspondence_score(matches: Matches, k: int) -> float:
     return score_from_cosines(torch.as_tensor(matches.similarity), k)
 
 
-@checked
 def score_from_cosines(cosines: Float[torch.Tensor, " n"], k: int) -> float:
     """Compute `correspondence_score` from the cosines of at most k matches."""
     distances = (2 - 2 * cosines).clamp_min(0).sqrt()
     return -float(distances.sum()) - max(k - len(cosines), 0) * _ORTHOGONAL
 
 
-@checked
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:
     """Compute the cosine of the two images' global features ("GlobalSim")."""
     first, second = torch.as_tensor(reference.global_feature), torch.as_tensor(target.global_feature)
     return float(F.cosine_similarity(first, second, dim=0))
 
 
-@checked
 def mask_iou(first: Mask, second: Mask) -> float:
     """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two foregrounds)."""
     first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
 
-@checked
 def cyclical_iou(
     similarity: Float[torch.Tensor, "reference target"],
     reference_foreground: Bool[torch.Tensor, "rows cols"],

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.arguments import checked
 from zsp_lite.best_view import ViewPair
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.html import picture_html
@@ -161,7 +160,6 @@ class PoseEstimate:
     def _repr_html_(self) -> str:
         return picture_html(repr(self), self.reference_view.frame.rgb, self.target_views[self.view].frame.rgb)
 
-    @checked
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6).
 
@@ -224,7 +222,6 @@ class Solver(Protocol):
         ...
 
 
-@checked
 def match_points(
     reference: View, target: View, matches: Matches
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
@@ -233,7 +230,6 @@ def match_points(
     return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
 
 
-@checked
 def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) -> PoseEstimate:
     """Express an estimate for a turned reference in the camera of the reference as it is.
 

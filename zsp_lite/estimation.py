@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.arguments import checked
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
@@ -98,7 +97,6 @@ class OwnPair:
             "degrees_between_solvers": self.result.disagreement,
         }  # fmt: skip
 
-    @checked
     def write(self, out: str | Path) -> list[Path]:
         """Write the report and the point clouds.
 
@@ -131,7 +129,6 @@ class OwnPair:
         return [write_pair_report(out / "report.html", self.result, self.backbone, self.masks), *paths]
 
 
-@checked
 def estimate_pose(
     reference: str | Path | Source,
     target: str | Path | Source,

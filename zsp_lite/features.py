@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import FatalError, InputError, real_array
 from zsp_lite.io.html import picture_html
 
@@ -183,7 +182,6 @@ def average_pool(x: Tensor, axis: int) -> Tensor:
     return total.div_(count.view(-1, *[1] * (x.ndim - 1 - axis)))
 
 
-@checked
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
     """Compute the log-binned descriptor of every patch: its 17 bins, concatenated in the order of `bin_indices`.
 

@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zsp_lite.arguments import checked
-
 
 @runtime_checkable
 class Matcher(Protocol):
@@ -58,7 +56,6 @@ TRANSPORT_REGULARISATION = 0.05
 TRANSPORT_STEPS = 100
 
 
-@checked
 def mutual_nearest_neighbours(
     similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
@@ -72,7 +69,6 @@ def mutual_nearest_neighbours(
     return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
-@checked
 def dual_softmax(
     similarity: Float[Tensor, "n1 n2"],
     foreground1: Bool[Tensor, " n1"],
@@ -93,7 +89,6 @@ def dual_softmax(
     return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
-@checked
 def optimal_transport(
     similarity: Float[Tensor, "n1 n2"],
     foreground1: Bool[Tensor, " n1"],
@@ -113,7 +108,6 @@ def optimal_transport(
     return _match_foreground(choose, similarity, foreground1, foreground2)
 
 
-@checked
 def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
     """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013).
 

@@ -25,7 +25,6 @@ from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_integer, check_seed
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap, Grid, average_pool, bin_indices, finite_tensor
 from zsp_lite.matchers import MATCHERS, Matcher
@@ -62,7 +61,6 @@ class Matches:
         )
 
 
-@checked
 def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     """Compute the cosine similarity of the log-binned descriptors of all pairs of patches.
 
@@ -79,7 +77,6 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     return similarities(ref, [target])[0]
 
 
-@checked
 def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute `similarity` of one reference with several targets."""
     keys1 = _keys(ref, "ref")
@@ -99,7 +96,6 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     return results
 
 
-@checked
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see `similarities`)."""
     first = F.normalize(_keys(ref, "ref").flatten(0, 1), dim=1)
@@ -109,7 +105,6 @@ def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n
     ]
 
 
-@checked
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
 ) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
@@ -118,7 +113,6 @@ def nearest_neighbours(
     return sim.argmax(dim=1), sim.argmax(dim=0)
 
 
-@checked
 def cyclical_distances(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
     grid1: Grid,
@@ -157,7 +151,6 @@ def cyclical_distances(
     return _cycles(sim, grid1, on1, on2, published)[0].view(grid1)
 
 
-@checked
 def match(
     ref: FeatureMap,
     target: FeatureMap,

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_magnitude, real_array
 
 RESAMPLES = 2000
@@ -19,7 +18,6 @@ _FEWEST_OBJECTS = 3
 _ROTATION_TOLERANCE = 1e-2  # largest entry of |R @ R.T - I|
 
 
-@checked
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the geodesic angle between rotations, exact near 0 and 180 degrees.
 
@@ -48,7 +46,6 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
-@checked
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the Euclidean distance between translations (..., 3), in their unit.
 
@@ -64,7 +61,6 @@ def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float
     return np.linalg.norm(first - second, axis=-1)[()]
 
 
-@checked
 def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = None) -> np.ndarray | float:
     """Compute the percentage of errors strictly below the threshold; Acc30 is threshold=30.
 
@@ -79,7 +75,6 @@ def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = No
     return 100 * _mean(_errors(errors) < threshold, weights)
 
 
-@checked
 def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | float:
     """Compute the median of errors, optionally weighted.
 
@@ -104,7 +99,6 @@ def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | 
     return ((ordered[lower] + ordered[upper]) / 2)[()]
 
 
-@checked
 def object_weights(
     objects: Sequence[tuple[str, str]] | np.ndarray,
     categories: Sequence[str] | np.ndarray | None = None,
@@ -158,13 +152,11 @@ def object_weights(
     return weights
 
 
-@checked
 def pair_weights(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
     """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
     return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
 
 
-@checked
 def bootstrap_ci(
     errors: ArrayLike,
     statistic: Callable[[np.ndarray, np.ndarray], np.ndarray],
@@ -187,7 +179,6 @@ def bootstrap_ci(
     return _interval(statistic(errors, pair_weights(len(errors)) if weights is None else weights), level)
 
 
-@checked
 def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
     """Compute the paper's figures of rotation errors, with 95 % bootstrap intervals.
 
@@ -215,7 +206,6 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
     return summary | {"above150": float(100 * np.mean(errors > 150))}
 
 
-@checked
 def mean_category_median(
     errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Float[np.ndarray, "resamples n"]
 ) -> tuple[float, tuple[float, float]]:
@@ -232,7 +222,6 @@ def mean_category_median(
     return float(np.mean([median(errors[one]) for one in members])), _interval(replicates)
 
 
-@checked
 def paired_difference(
     first: ArrayLike,
     second: ArrayLike,
@@ -274,7 +263,6 @@ def paired_difference(
     return result
 
 
-@checked
 def paired_test(
     first: ArrayLike,
     second: ArrayLike,
@@ -314,7 +302,6 @@ def paired_test(
     }
 
 
-@checked
 def sign_test(first: ArrayLike, second: ArrayLike) -> float:
     """Compute the exact two-sided p value of McNemar's test.
 

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
-from zsp_lite.arguments import checked
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
 from zsp_lite.data.frames import Frame, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
@@ -113,7 +112,6 @@ class ZeroShotPose:
         """Whether k-means selects the matches (see `kmeans`)."""
         return getattr(self._solver(), "kmeans", True) if self.kmeans is None else self.kmeans
 
-    @checked
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
 
@@ -133,7 +131,6 @@ class ZeroShotPose:
         turns, views = self.pair_views(reference, targets, timings)
         return self.estimate_from_turns(turns, views, timings)
 
-    @checked
     def pair_views(
         self, reference: Frame, targets: Sequence[Frame], timings: dict[str, float] | None = None
     ) -> tuple[list[View], list[View]]:
@@ -156,13 +153,11 @@ class ZeroShotPose:
             views = extract_views(self.backbone, [*turns, *crops], self.foreground, self.saliency_threshold)
         return views[: len(turns)], views[len(turns) :]
 
-    @checked
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, as `estimate` does."""
         crops = [object_crop(frame, crop_size(self.backbone)) for frame in frames]
         return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
 
-    @checked
     def estimate_from_views(
         self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
     ) -> PoseEstimate:
@@ -182,7 +177,6 @@ class ZeroShotPose:
                 turns += extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
         return self.estimate_from_turns(turns, targets, timings)
 
-    @checked
     def estimate_from_turns(
         self, turns: Sequence[View], targets: Sequence[View], timings: dict[str, float] | None = None
     ) -> PoseEstimate:
@@ -222,13 +216,11 @@ class ZeroShotPose:
             pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
         return self.estimate_from_pairs(reference, targets, pairs, timings)
 
-    @checked
     def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
         """Compute the cosine similarities between the reference's and each target's patch descriptors."""
         function = similarities if self.binning else key_similarities
         return function(reference.features, [target.features for target in targets])
 
-    @checked
     def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
         """Match the reference with one target view (sec. 4.1), from their similarities."""
         matches = match(
@@ -240,7 +232,6 @@ class ZeroShotPose:
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
         )
 
-    @checked
     def estimate_from_pairs(
         self,
         reference: View,
@@ -285,7 +276,6 @@ class ZeroShotPose:
         return self.solver
 
 
-@checked
 def align_best_view(
     reference: View,
     targets: Sequence[View],
@@ -325,7 +315,6 @@ def align_best_view(
     return PoseEstimate(sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags)
 
 
-@checked
 def view_alignment(reference: View, target: View) -> Sim3:
     """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
 

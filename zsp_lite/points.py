@@ -6,7 +6,6 @@ Patches on the object are `View.foreground`; the functions here work on pixels a
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
@@ -15,7 +14,6 @@ from zsp_lite.views import View
 _INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
-@checked
 def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
     """Select the pixels on the object that have known depth; a frame without a mask is all object.
 
@@ -32,14 +30,12 @@ def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray
     return known if frame.mask is None else known & (frame.mask > threshold)
 
 
-@checked
 def object_points(frame: Frame, threshold: float = ON_OBJECT) -> Float[np.ndarray, "n 3"]:
     """Unproject the pixels of `object_pixels` to camera-frame points; N may be 0."""
     pixels = object_pixels(frame, threshold)
     return unproject_depth(frame.depth, frame.camera)[pixels]
 
 
-@checked
 def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:
     """Select the points that are not outliers.
 
@@ -53,13 +49,11 @@ def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndar
     return distance <= factor * np.median(distance)
 
 
-@checked
 def standard_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     """Compute the standard deviation of points: the root of the mean variance of the three axes."""
     return float(np.sqrt(np.square(points - points.mean(axis=0)).sum(axis=1).mean() / 3))
 
 
-@checked
 def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D (supplement).
 
@@ -68,7 +62,6 @@ def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     return float(points.std(axis=0).mean())
 
 
-@checked
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Gather a view's object points for display, without outliers.
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import Co3D
@@ -59,7 +58,6 @@ class Source:
         frames = ", ".join(str(self.numbers[position]) for position in positions)
         return f"{self.kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
-    @checked
     def load(self, positions: Sequence[int]) -> list[Frame]:
         """Load frames with masks of the object.
 
@@ -80,7 +78,6 @@ class Source:
         found = dict(zip(ordered, masked))
         return [found[position] for position in positions]
 
-    @checked
     def position(self, number: int) -> int:
         """Return the position of a frame number.
 
@@ -119,7 +116,6 @@ class Source:
         return frame
 
 
-@checked
 def open_source(
     path: str | Path,
     intrinsics: tuple[float, float, float, float] | None = None,
@@ -171,7 +167,6 @@ def open_source(
     return Source(path, kind, numbers, read, mask, box)
 
 
-@checked
 def open_pair(reference: str | Path, target: str | Path, options: Mapping[str, Sequence]) -> tuple[Source, Source]:
     """Open two sources with the options of a command line.
 

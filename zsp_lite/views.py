@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, resize_frame, turn_frame
 from zsp_lite.errors import InputError, check_integer
@@ -83,7 +82,6 @@ class View:
         return np.asarray(self.foreground.cpu()) & self.measured_points[1]
 
 
-@checked
 def crop_size(backbone: FeatureExtractor | None) -> int:
     """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one.
 
@@ -95,13 +93,11 @@ def crop_size(backbone: FeatureExtractor | None) -> int:
     return size
 
 
-@checked
 def has_saliency(backbone: FeatureExtractor | None) -> bool:
     """Tell whether a backbone separates the object from the background: its `has_saliency`, or True without one."""
     return getattr(backbone, "has_saliency", True)
 
 
-@checked
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
 
@@ -114,7 +110,6 @@ def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
     return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
 
 
-@checked
 def extract_views(
     backbone: FeatureExtractor,
     frames: Sequence[Frame],
@@ -135,7 +130,6 @@ def extract_views(
     return [frame_view(frame, features, foreground, saliency_threshold) for frame, features in zip(frames, maps)]
 
 
-@checked
 def frame_view(
     frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = SALIENCY_THRESHOLD
 ) -> View:
@@ -159,7 +153,6 @@ def frame_view(
     return View(frame, features, features.foreground(saliency_threshold), soft)
 
 
-@checked
 def turn_view(view: View, quarters: int) -> View:
     """Turn a view with its feature maps and masks by quarter turns; features are not computed again.
 
@@ -177,7 +170,6 @@ def turn_view(view: View, quarters: int) -> View:
     return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 
-@checked
 def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used for pose estimation.
 
@@ -191,7 +183,6 @@ def frame_defect(frame: Frame) -> str:
     return "" if (frame.depth > 0).any() else "no known depth"
 
 
-@checked
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
     """Select the target views that a pose can be estimated in.
 
@@ -217,7 +208,6 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
     return usable, tuple(flags)
 
 
-@checked
 def soft_saliency(
     features: FeatureMap, size: tuple[int, int], threshold: float = SALIENCY_THRESHOLD
 ) -> Float[np.ndarray, "height width"]:
@@ -232,7 +222,6 @@ def soft_saliency(
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-@checked
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
     """Select the patches of which the frame's mask covers at least a quarter.
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_magnitude, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
@@ -78,7 +77,6 @@ class Camera:
         )
 
     @classmethod
-    @checked
     def from_pytorch3d(
         cls,
         R: Real[np.ndarray, "3 3"] | Sequence,
@@ -110,7 +108,6 @@ class Camera:
         # NDC axes point left and up, pixel axes right and down: hence the minus.
         return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
 
-    @checked
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
         """Convert to a PyTorch3D camera; the inverse of `from_pytorch3d`.
 
@@ -144,17 +141,14 @@ class Camera:
         """Camera centre in world coordinates."""
         return -self.R.T @ self.t
 
-    @checked
     def to_camera(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Transform points (..., 3) from world to camera coordinates."""
         return np.asarray(points, dtype=np.float64) @ self.R.T + self.t
 
-    @checked
     def to_world(self, points: Real[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Transform points (..., 3) from camera to world coordinates."""
         return (np.asarray(points, dtype=np.float64) - self.t) @ self.R
 
-    @checked
     def project(
         self, points: Real[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
@@ -175,7 +169,6 @@ class Camera:
             pixels = in_camera[..., :2] / depth[..., None] * self.focal_length + self.principal_point
         return pixels, depth
 
-    @checked
     def unproject_camera(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
@@ -192,20 +185,17 @@ class Camera:
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
 
-    @checked
     def unproject(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
         """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
 
-    @checked
     def crop(self, box: Box) -> "Camera":
         """Return the camera of the image cropped to `box` (top, left, height, width): the principal point moves."""
         top, left, height, width = box
         return replace(self, principal_point=self.principal_point - (left, top), size=(height, width))
 
-    @checked
     def resize(self, size: Sequence[int]) -> "Camera":
         """Return the camera of the image resized to (height, width): the intrinsics are scaled per axis."""
         size = _image_size(size)
@@ -214,7 +204,6 @@ class Camera:
             self, focal_length=self.focal_length * scale, principal_point=self.principal_point * scale, size=size
         )
 
-    @checked
     def turn(self, quarters: int) -> "Camera":
         """Return the camera of the image turned by quarter turns: the camera rotates about its optical axis.
 

@@ -7,12 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number
 
 
-@checked
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
     """Decode CO3D's depth: the bits of each 16-bit value are those of a float16.
 
@@ -33,7 +31,6 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-@checked
 def encode_depth(
     depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
 ) -> UInt16[np.ndarray, "h w"]:
@@ -57,7 +54,6 @@ def encode_depth(
     return (encoded + step // 2) // step * step
 
 
-@checked
 def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
     """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting.
 
@@ -83,7 +79,6 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     return np.where(known, depth, filled.clip(low, high))
 
 
-@checked
 def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """Compute the point (H, W, 3) of each pixel in camera coordinates; unknown depth (0) gives the origin."""
     depth = np.asarray(depth, dtype=np.float64)
@@ -93,7 +88,6 @@ def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.
     return camera.unproject_camera(np.stack([x, y], axis=-1), depth)
 
 
-@checked
 def patch_points(
     depth: Real[np.ndarray, "h w"], camera: Camera, grid: tuple[int, int], inpaint: bool = True
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:

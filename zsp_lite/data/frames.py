@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
@@ -76,7 +75,6 @@ class Frame:
         return f"frame {self.name}" if self.name else "frame"
 
 
-@checked
 def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
     """Compute the bounding box of the mask above a threshold, padded and clipped to the image.
 
@@ -103,7 +101,6 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
     return top, left, bottom - top, right - left
 
 
-@checked
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
     """Crop a frame to the bounding box of its object mask (see `mask_to_bbox`).
 
@@ -118,7 +115,6 @@ def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -
         raise InputError(f"{frame._label}: {error}") from error
 
 
-@checked
 def crop_frame(frame: Frame, box: Box) -> Frame:
     """Crop a frame and its camera.
 
@@ -143,7 +139,6 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
     )
 
 
-@checked
 def turn_frame(frame: Frame, quarters: int) -> Frame:
     """Turn a frame and its camera by quarter turns; depths and points in the world stay the same.
 
@@ -160,7 +155,6 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=frame.camera.turn(quarters))
 
 
-@checked
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio.
 
@@ -192,7 +186,6 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
 
 
-@checked
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read the colours (H, W, 3) of an image file.
 
@@ -204,7 +197,6 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-@checked
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1].
 
@@ -214,7 +206,6 @@ def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
-@checked
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
     """Read a CO3D depth file: a 16-bit PNG that holds the bits of float16 values.
 
@@ -231,7 +222,6 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
     return decode_depth(read_grey16(path), scale_adjustment)
 
 
-@checked
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     """Read the values (H, W) of a 16-bit greyscale PNG.
 
@@ -244,19 +234,16 @@ def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     return bits
 
 
-@checked
 def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
     """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
     _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-@checked
 def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
     """Write probabilities (H, W) in [0, 1] as an 8-bit PNG."""
     _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
 
 
-@checked
 def write_depth(
     path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
 ) -> None:
@@ -267,7 +254,6 @@ def write_depth(
     _encode(path, ".png", encode_depth(depth, scale_adjustment, bits), [])
 
 
-@checked
 def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
     """Write a boolean mask (H, W) as a 1-bit PNG, which reads as 255 and 0."""
     _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.arguments import checked
 from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_magnitude
@@ -64,7 +63,6 @@ class PoseLabel:
         object.__setattr__(self, "trans", trans)
 
 
-@checked
 def label_folder(root: str | Path, category: str) -> Path:
     """Return the folder of a category's labels.
 
@@ -75,7 +73,6 @@ def label_folder(root: str | Path, category: str) -> Path:
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
-@checked
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     """Read the labels of a category.
 
@@ -93,7 +90,6 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     return labels
 
 
-@checked
 def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
     """Read the labels of a category, also if they have several reference sequences (see `read_labels`)."""
     labels = {}
@@ -105,7 +101,6 @@ def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
     return labels
 
 
-@checked
 def parse_label(data: bytes, where: str) -> PoseLabel:
     """Parse the content of a label file.
 
@@ -123,7 +118,6 @@ def parse_label(data: bytes, where: str) -> PoseLabel:
         raise InputError(f"{where}: {error}") from error
 
 
-@checked
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
     """Write a label atomically, replacing an earlier one of the same sequence, and return the path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
@@ -131,14 +125,12 @@ def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
     return path
 
 
-@checked
 def label_bytes(label: PoseLabel) -> bytes:
     """Encode a label as JSON in the format of the published code."""
     content = {"trans": label.trans.tolist(), "seq": label.seq, "reference_seq": label.reference_seq}
     return json.dumps(content).encode()
 
 
-@checked
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
     """Convert a similarity between two worlds to a label with the same rotation and the same image of `centre`.
 
@@ -158,7 +150,6 @@ def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> 
     return PoseLabel(trans, seq, reference_seq)
 
 
-@checked
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from zsp_lite.arguments import checked
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
@@ -57,7 +56,6 @@ class Pair:
         return _stable_hash(self.key)
 
 
-@checked
 def sample_pairs(
     dataset: Co3D, category: str, n: int, n_targets: int, seed: int | np.random.Generator = 0
 ) -> list[Pair]:
@@ -105,7 +103,6 @@ def sample_pairs(
     return pairs
 
 
-@checked
 def labelled_categories(dataset: Co3D) -> list[str]:
     """List the categories with at least two labelled sequences.
 
@@ -123,14 +120,12 @@ def labelled_categories(dataset: Co3D) -> list[str]:
     )
 
 
-@checked
 def upstream_pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
     """Return the path of an evaluation set of `n` pairs: ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt."""
     folder = Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt"
     return folder / f"{plain_name(category, 'category')}.pt"
 
 
-@checked
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
     """Read an evaluation set that is part of the data folder.
 
@@ -154,7 +149,6 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
     return []
 
 
-@checked
 def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     """Read an evaluation set of the published code, whose ids are positions in `dataset.frame_list(category)`.
 
@@ -180,7 +174,6 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     return pairs
 
 
-@checked
 def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
     """Load an evaluation set of the published code and check its structure, without executing code in it.
 
@@ -212,7 +205,6 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
     return items
 
 
-@checked
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
     """Write pairs as an evaluation set in the format of the published code.
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
-from zsp_lite.arguments import checked
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
@@ -15,7 +14,6 @@ _COLOURS = ("red", "green", "blue")
 _VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in _COLOURS])
 
 
-@checked
 def write_ply(
     path: str | Path,
     points: Real[np.ndarray, "n 3"],
@@ -47,7 +45,6 @@ def write_ply(
     write_atomic(path, header.encode("ascii") + vertices.tobytes())
 
 
-@checked
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
     """Read the vertices of a binary or ASCII PLY file.
 
