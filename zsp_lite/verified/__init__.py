@@ -6,13 +6,12 @@ all of them have depth, so a pose can be tested in every view. Each stage is a f
     scene         points, feature similarities and maps of all views, in normalised frames
     proposals     poses from three matches of one view, and from viewpoints around the object
     soft_icp      local alignment with soft correspondences, weighted by feature similarity
-    verification  the score: a weighted sum of eleven terms on features, silhouettes, free space and views as a whole
-    agreement     the eleventh term: photo features near each point, with a weight for every channel
+    verification  the score: a weighted sum of nine terms on features, silhouettes, free space and views as a whole
     refinement    random search that increases the score
     solver        the ranked hypotheses, and the `VerifiedSolver` that runs all stages
     confidence    calibrated probability that a hypothesis is correct
 
-docs/solvers.md compares it with the paper's solver and lists variants that were tried and not kept.
+docs/solvers.md compares it with the paper's solver.
 """
 
 from zsp_lite.verified.solver import Solution, VerifiedSolver

@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from zsp_lite import alignment
+from zsp_lite.metrics import rotation_angle
 
 # Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds have unit spread, so
 # a scale differs from 1 only where the views show different parts of the two objects, or their proportions differ.
@@ -55,31 +59,17 @@ def concatenate(batches: Sequence[Poses]) -> Poses:
 
 
 def nearest_rotation(covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
-    """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
-
-    Args:
-        covariance: Sum of target @ source^T over corresponding centred points.
-    """
-    left, _, right = torch.linalg.svd(covariance)
-    sign = torch.ones_like(covariance[..., 0])
-    # If the best orthogonal matrix is a reflection, flip the direction of the smallest singular value.
-    sign[..., 2] = (torch.linalg.det(left) * torch.linalg.det(right)).sign()
-    return (left * sign[:, None]) @ right
+    """Solve the orthogonal Procrustes problem (`alignment.nearest_rotation`) for a batch of covariances."""
+    return _tensor(alignment.nearest_rotation(covariance.double().numpy())[0])
 
 
 def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) -> Poses:
-    """Fit a similarity to each of m sets of n corresponding points by least squares (Umeyama 1991).
+    """Fit a similarity to each of m sets of n corresponding points (`alignment.umeyama_batch`)."""
+    return Poses(*map(_tensor, alignment.umeyama_batch(source.double().numpy(), target.double().numpy())[:3]))
 
-    Returns:
-        m poses; the scale is 0 where all source points of a set are equal.
-    """
-    source_mean, target_mean = source.mean(1, keepdim=True), target.mean(1, keepdim=True)
-    x, y = source - source_mean, target - target_mean
-    covariance = y.transpose(1, 2) @ x
-    rotation = nearest_rotation(covariance)
-    scale = (rotation * covariance).sum((1, 2)) / x.square().sum((1, 2)).clamp_min(1e-12)
-    rotated_mean = (rotation @ source_mean.transpose(1, 2))[..., 0]
-    return Poses(scale, rotation, target_mean[:, 0] - scale[:, None] * rotated_mean)
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values).float()
 
 
 def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -89,8 +79,7 @@ def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
     """Compute the geodesic angle in degrees between each rotation of one batch and each of the other."""
-    cosine = (first.flatten(1) @ second.flatten(1).T - 1) / 2
-    return torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))
+    return torch.from_numpy(rotation_angle(first[:, None].numpy(), second[None].numpy()))
 
 
 def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.agreement import agreement_term
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import ScoreWeights, score_terms
@@ -58,8 +57,7 @@ def refine_coarse_to_fine(
 ) -> Poses:
     """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
 
-    Scores are computed from a subset of the points. The term `agreement` is 0 while a pose climbs; it counts in the
-    suppression.
+    Scores are computed from a subset of the points.
 
     Args:
         scene: Scene to score against.
@@ -74,7 +72,6 @@ def refine_coarse_to_fine(
     score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
-        reached = reached + weights.agreement * agreement_term(scene, poses)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
     polished, _ = refine(poses[:_MAX_POLISHED], fine_score, POLISH, rng)
     return concatenate([polished, poses[_MAX_POLISHED:]])

@@ -20,7 +20,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.maps import ViewMaps, build_maps
-from zsp_lite.verified.poses import Poses, exp_, nearest_rotation
+from zsp_lite.verified.poses import Poses, exp_
 from zsp_lite.views import View
 
 # Points farther from the median point than this many median distances are outliers: patches at a silhouette may have
@@ -52,11 +52,6 @@ class Scene:
         matches: Per target, the matched points of reference and target, working units.
         view_similarity: (v,) feature similarity of each target view to the reference less their mean (see
             `view_similarity`).
-        reference_axes: Rotation from the working frame of the reference to its object's axes, as predicted from the
-            reference view (see `object_axes`); None if the features have no positions.
-        target_axes: (v,) the same of each target view, from the working frame of the targets; None if one has none.
-        reference_photo: (n, c) photo features at the reference's points (see `features.FeatureMap`); None without them.
-        target_photo: (m, c) the same at the targets' points.
     """
 
     reference_points: Float[Tensor, "n 3"]
@@ -72,10 +67,6 @@ class Scene:
     target_cameras: tuple[Camera, ...]
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     view_similarity: Float[Tensor, " v"]
-    reference_axes: Float[Tensor, "3 3"] | None = None
-    target_axes: Float[Tensor, "v 3 3"] | None = None
-    reference_photo: Float[Tensor, "n c"] | None = None
-    target_photo: Float[Tensor, "m c"] | None = None
 
     @property
     def view_similarity_std(self) -> float:
@@ -88,13 +79,6 @@ class Scene:
         pose = Sim3(float(poses.scale[index]), left @ right, poses.translation[index].double().numpy())
         rotation, translation = _relative_pose(self.target_cameras[0], self.target_cameras[view])
         return Sim3(1.0, rotation, translation) @ self.target_to_working.inverse() @ pose @ self.reference_to_working
-
-    def from_sim3(self, sim3s: Sequence[Sim3], view: int) -> Poses:
-        """Convert similarities from the reference camera to a target view's camera to poses in working units."""
-        rotation, translation = _relative_pose(self.target_cameras[view], self.target_cameras[0])
-        to_first = Sim3(1.0, rotation, translation)
-        poses = [self.target_to_working @ to_first @ sim3 @ self.reference_to_working.inverse() for sim3 in sim3s]
-        return Poses(*(_tensor([getattr(pose, name) for pose in poses]) for name in ("scale", "R", "t")))
 
 
 def build_scene(
@@ -138,15 +122,6 @@ def build_scene(
     for target, cloud, match in zip(targets, clouds, matches):
         u, v = _matched_patches(reference, target, match)
         matched.append((_tensor(reference_to_working.apply(source[u])), _tensor(target_to_working.apply(cloud[v]))))
-    axes = [object_axes(view) for view in (reference, *targets)]
-    reference_axes = target_axes = None
-    if all(one is not None for one in axes):
-        reference_axes = axes[0]
-        target_axes = torch.stack([one @ _tensor(R) for one, (R, _) in zip(axes[1:], to_camera)])
-    reference_photo = target_photo = None
-    if all(view.features.photo is not None for view in (reference, *targets)):
-        reference_photo = photo_features(reference, source_valid)
-        target_photo = torch.cat([photo_features(view, chosen) for view, chosen in zip(targets, valid)])
     target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
     return Scene(
         reference_points=_tensor(reference_to_working.apply(source[source_valid])),
@@ -164,10 +139,6 @@ def build_scene(
         target_cameras=tuple(target.frame.camera for target in targets),
         matches=tuple(matched),
         view_similarity=view_similarities - view_similarities.mean(),
-        reference_axes=reference_axes,
-        target_axes=target_axes,
-        reference_photo=reference_photo,
-        target_photo=target_photo,
     )
 
 
@@ -195,32 +166,6 @@ def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
     if not similarity.numel():
         return similarity.new_tensor(-1.0)
     return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
-
-
-def object_axes(view: View) -> Float[Tensor, "3 3"] | None:
-    """Fit the axes of a view's object to the positions that its features predict (orthogonal Procrustes).
-
-    Returns:
-        Rotation from the camera's frame to the object's (front +x, left +y, up +z); None if the features have no
-        positions, or the view fewer than MIN_POINTS foreground patches of known depth.
-    """
-    known = view.known_foreground
-    if view.features.positions is None or known.sum() < MIN_POINTS:
-        return None
-    positions = view.features.positions.cpu()[torch.from_numpy(known)]
-    points = _tensor(view.measured_points[0][known])
-    points = points - points.mean(dim=0)
-    return nearest_rotation((positions.T @ points)[None])[0]
-
-
-def photo_features(view: View, chosen: Bool[np.ndarray, " patches"]) -> Float[Tensor, "n c"]:
-    """Return the photo features at the centres of the chosen patches (row-major) of a view."""
-    photo, grid = view.features.photo.cpu(), view.features.grid
-    row, column = (
-        torch.from_numpy((2 * index + 1) * size // (2 * n))
-        for index, size, n in zip(np.unravel_index(np.flatnonzero(chosen), grid), photo.shape, grid)
-    )
-    return photo[row, column]
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:

@@ -18,28 +18,21 @@ from torch import Tensor
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, nearest_rotation
 from zsp_lite.verified.scene import Scene
 
-ITERATIONS = 6
-FEATURE_WEIGHT = 8.0  # lambda
+_ITERATIONS = 6
+_FEATURE_WEIGHT = 8.0  # lambda
 _MAX_POINTS = 100, 300  # of the reference, of the targets
 _SIGMAS = 0.5, 0.15  # first and last, working units
 _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 
 
-def soft_icp(scene: Scene, poses: Poses, iterations: int = ITERATIONS, feature_weight: float = FEATURE_WEIGHT) -> Poses:
-    """Align every pose to the local optimum, independently of the others.
-
-    Args:
-        scene: Scene with the point clouds and their feature similarity.
-        poses: Poses to start from.
-        iterations: Number of iterations.
-        feature_weight: Factor lambda in the affinity; 0 aligns by shape alone.
-    """
+def soft_icp(scene: Scene, poses: Poses) -> Poses:
+    """Align every pose to the local optimum, independently of the others."""
     rows = evenly_spaced_indices(len(scene.reference_points), _MAX_POINTS[0])
     columns = evenly_spaced_indices(len(scene.target_points), _MAX_POINTS[1])
     source, target = scene.reference_points[rows], scene.target_points[columns]
-    feature_term = feature_weight * scene.similarity[rows][:, scene.target_column[columns]]
+    feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
     target_square = target.square().sum(dim=1)
-    for sigma in np.geomspace(*_SIGMAS, iterations):
+    for sigma in np.geomspace(*_SIGMAS, _ITERATIONS):
         moved = poses.apply(source)
         square = moved.square().sum(dim=2, keepdim=True) + target_square
         square = torch.baddbmm(square, moved, target.T.expand(len(moved), 3, -1), alpha=-2).clamp_min_(0)

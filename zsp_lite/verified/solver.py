@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +12,6 @@ from jaxtyping import Float
 from zsp_lite.best_view import ViewPair
 from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.agreement import agreement_term
 from zsp_lite.verified.confidence import (
     Calibration,
     hypothesis_probabilities,
@@ -24,7 +23,7 @@ from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_ang
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
-from zsp_lite.verified.soft_icp import FEATURE_WEIGHT, soft_icp
+from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import ScoreTerms, ScoreWeights, score_terms
 from zsp_lite.views import View
 
@@ -74,18 +73,12 @@ class VerifiedSolver:
     Attributes:
         weights: Weights of the score's terms.
         calibration: Coefficients of the probabilities.
-        feature_weight: Weight of the feature similarity in the soft ICP; 0 aligns by shape alone.
-        icp: Whether to run the soft ICP.
-        refinement: Whether to run the refinement.
         kmeans: Whether k-means selects the matches (see `ZeroShotPose.kmeans`).
     """
 
     kmeans: ClassVar[bool] = False
     weights: ScoreWeights = ScoreWeights()
     calibration: Calibration = Calibration()
-    feature_weight: float = FEATURE_WEIGHT
-    icp: bool = True
-    refinement: bool = True
 
     def __call__(
         self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
@@ -139,16 +132,14 @@ class VerifiedSolver:
             with timed(timings, "proposals"):
                 poses = propose_poses(scene, rng)
             with timed(timings, "alignment"):
-                if self.icp:
-                    poses = soft_icp(scene, poses, feature_weight=self.feature_weight)
+                poses = soft_icp(scene, poses)
             with timed(timings, "verification"):
                 score = self.weights.score(score_terms(scene, poses))
                 poses = poses[non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)]
             with timed(timings, "refinement"):
-                if self.refinement:
-                    poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
+                poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
             with timed(timings, "ranking"):
-                terms = replace(score_terms(scene, poses), agreement=agreement_term(scene, poses))
+                terms = score_terms(scene, poses)
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)

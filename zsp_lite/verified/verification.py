@@ -1,10 +1,9 @@
-r"""The score of a pose: a weighted sum of eleven terms that compare it with everything that the views show.
+r"""The score of a pose: a weighted sum of nine terms that compare it with everything that the views show.
 
     S(T) = \sum_k w_k \phi_k(T)
 
 Four terms project the n reference points into the V target views (`forward_*`), four project the target points into
-the reference view (`reverse_*`, then V = 1), two compare views as a whole, and one compares photo features near each
-point.
+the reference view (`reverse_*`, then V = 1), and one compares views as a whole.
 
 Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth d of weight m (the
 soft mask, 0 where the depth is unknown), at distance r from the silhouette. With \delta = z - d (positive behind the
@@ -32,18 +31,6 @@ and the ninth, with l_v the feature similarity of target view v to the reference
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
-The tenth needs a backbone that predicts where on its object each patch lies (`backbones.positions`). From these
-positions and the measured points, every view gives the axes of its object by itself (`scene.object_axes`): the rotation
-A_0 from the reference's frame and A_v from the targets', both to the axes of their object. With R the rotation of T and
-\psi_v the angle between A_0 and A_v R,
-
-    orientation = (1/V) \sum_v \exp(-(\psi_v / 50 degrees)^2),
-
-and 0 without such a backbone. Axes that are wrong in the same way in both objects do not matter.
-
-The eleventh, `agreement`, compares photo features near each point under the pose (`verified.agreement`). It counts
-in the suppression during the refinement and in the ranking; it is 0 in the first suppression and while a pose climbs.
-
 The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
 probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
 """
@@ -62,7 +49,6 @@ from zsp_lite.verified.scene import Scene
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
-ORIENTATION_SIGMA = 50.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
 # Projected points at a time, so that intermediate results stay in the processor's cache.
 _CHUNK = 250_000
@@ -81,8 +67,6 @@ class ScoreTerms:
     reverse_silhouette: Float[Tensor, " m"]
     reverse_free_space: Float[Tensor, " m"]
     viewpoint: Float[Tensor, " m"]
-    orientation: Float[Tensor, " m"]
-    agreement: Float[Tensor, " m"]
 
     def __getitem__(self, index) -> "ScoreTerms":
         """Select the terms of some poses by an index array, slice or mask."""
@@ -99,15 +83,12 @@ class ScoreTerms:
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
 # Terms that need features; the others compare shapes.
-FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint", "orientation", "agreement")
+FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 
 
 @dataclass(frozen=True)
 class ScoreWeights:
-    """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`).
-
-    That of `agreement` is 1, because its channel weights are in nats.
-    """
+    """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
 
     forward_similarity: float = 15.9
     forward_overlap: float = 5.5
@@ -118,8 +99,6 @@ class ScoreWeights:
     reverse_silhouette: float = -6.1
     reverse_free_space: float = -13.7
     viewpoint: float = 21.5
-    orientation: float = 3.05
-    agreement: float = 1.0
 
     def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
@@ -179,7 +158,7 @@ def reverse_terms(scene: Scene, poses: Poses, indices: Int[Tensor, " n"] | None 
 
 
 def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> ScoreTerms:
-    """Compute the terms of every pose, all but `agreement`, which is 0.
+    """Compute the terms of every pose.
 
     Args:
         scene: The scene to score against.
@@ -197,7 +176,7 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
     return ScoreTerms(
         *(torch.cat(term) for term in zip(*chunks)),
-        viewpoint_term(scene, poses), orientation_term(scene, poses), torch.zeros(len(poses)),
+        viewpoint_term(scene, poses),
     )  # fmt: skip
 
 
@@ -209,15 +188,6 @@ def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
     """
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
     return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
-
-
-def orientation_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the orientation term: high if the object axes that the views predict agree under the pose."""
-    if scene.reference_axes is None or scene.target_axes is None:
-        return torch.zeros(len(poses))
-    # The angle between A_0 and A_v R is that between R and A_v^T A_0.
-    angle = rotation_angles(poses.rotation, scene.target_axes.transpose(1, 2) @ scene.reference_axes)
-    return torch.exp(-((angle / ORIENTATION_SIGMA) ** 2)).mean(dim=1)
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
