@@ -15,7 +15,7 @@ from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
-from zsp_lite.io.images import PIXELS_VARIABLE, decode_image, max_pixels
+from zsp_lite.io.images import MAX_PIXELS, decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 
@@ -170,8 +170,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
         InputError: The size is not positive or too large.
     """
     camera = frame.camera.resize(size)
-    if camera.size[0] * camera.size[1] > (most := max_pixels()):
-        raise InputError(f"resize_frame: size is {camera.size}, expected at most {most} pixels ({PIXELS_VARIABLE})")
+    if camera.size[0] * camera.size[1] > MAX_PIXELS:
+        raise InputError(f"resize_frame: size is {camera.size}, expected at most {MAX_PIXELS} pixels")
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
     rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)

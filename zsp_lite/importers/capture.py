@@ -12,7 +12,7 @@ from jaxtyping import Float, Real
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
 from zsp_lite.errors import InputError, check_magnitude, check_number
-from zsp_lite.io.files import path_inside, read_bytes, read_npy
+from zsp_lite.io.files import path_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -172,8 +172,8 @@ def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     if path.suffix == ".npy":
         data = read_bytes(path, "depth")
         try:
-            values = read_npy(io.BytesIO(data), len(data))
-        except InputError as error:
+            values = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, OSError, EOFError, MemoryError) as error:
             raise InputError(f"depth {path} cannot be read as .npy: {error}, expected numbers (H, W)") from error
     else:
         values = read_grey16(path)

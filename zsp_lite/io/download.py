@@ -1,24 +1,18 @@
-"""Download of a file over HTTP, with resume, checksum and a limit on its size.
-
-Written here because pooch cannot resume a download.
-"""
+"""Download of a file over HTTP, with resume, checksum and a limit on its size (pooch cannot resume)."""
 
 import hashlib
 import http.client
-import logging
 import os
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tqdm import tqdm
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, sha256, write_atomic
-
-logger = logging.getLogger(__name__)
 
 CHUNK = 1 << 18  # bytes
 
@@ -44,18 +38,15 @@ def fetch(
 
     Args:
         url: URL of the file.
-        path: Where to store it.
+        path: Where to store it, and the result.
         size: Expected size, bytes; None if unknown.
         md5_prefix: Expected first digits of the MD5 digest.
         digest: Expected SHA-256 digest; empty if unknown.
         timeout: Timeout of the connection, seconds.
         most: Largest size, bytes, where `size` is unknown. A longer download is stopped and removed.
 
-    Returns:
-        `path`.
-
     Raises:
-        InputError: The server cannot be reached, the download was interrupted three times or is too long, or the size
+        InputError: The server cannot be reached, the download is interrupted three times or is too long, or the size
             or checksum differs.
     """
     path = Path(path)
@@ -75,18 +66,18 @@ def fetch(
             received = part.stat().st_size
             part.unlink()  # resuming from wrong data would never succeed
             checksum = f"SHA-256 {digest}" if digest else f"MD5 {md5_prefix or '(any)'}..."
+            length = "any number of" if size is None else size
             raise InputError(
-                f"download of {url} gave another file of {received} bytes, expected "
-                f"{size if size is not None else 'any number of'} bytes with {checksum}; removed"
+                f"download of {url} gave another file of {received} bytes, expected {length} bytes with {checksum}; "
+                "removed"
             )
         os.replace(part, path)
     except urllib.error.HTTPError as error:
         raise InputError(f"download of {url} failed: HTTP {error.code} {error.reason}") from error
+    except InputError:
+        raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = getattr(error, "reason", error)
-        raise InputError(f"download of {url} failed: {reason}") from error
+        raise InputError(f"download of {url} failed: {getattr(error, 'reason', error)}") from error
     return path
 
 
@@ -103,12 +94,9 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
 
 @contextmanager
 def pinned(path: Path) -> Iterator[None]:
-    """Use a file of which no digest was published: its SHA-256 is stored beside it at the first use without an error.
+    """Use a file without a published digest; InputError if it differs from that of the first use without an error.
 
-    Every later use compares it. PATH.sha256 has the format of the program sha256sum.
-
-    Raises:
-        InputError: The file differs from that of the first use.
+    The SHA-256 of the first use is stored beside it: PATH.sha256, in the format of the program sha256sum.
     """
     pin, found = path.with_name(path.name + ".sha256"), sha256(path, "weights")
     if known := pin.is_file():
@@ -120,19 +108,15 @@ def pinned(path: Path) -> Iterator[None]:
             )
     yield
     if not known:
-        try:
+        with suppress(OSError):  # a folder that cannot be written
             write_atomic(pin, f"{found}  {path.name}\n".encode())
-        except OSError as error:
-            logger.warning("%s cannot be written (%s): later changes of %s will not be noticed", pin, error, path.name)
 
 
 def _fetch_rest(url: str, part: Path, size: int | None, timeout: float, most: int | None) -> bool:
     """Request the missing rest of `part`. Returns True if the file is complete, False if interrupted."""
     start = part.stat().st_size if part.exists() else 0
-    if size is not None and start == size:
+    if size is not None and start >= size:
         return True
-    if size is not None and start > size:
-        start = 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
     try:
         response = urllib.request.urlopen(request, timeout=timeout)
@@ -150,7 +134,7 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float, most: in
             start = 0  # the server ignored the Range header and sends the whole file
         length = response.headers.get("Content-Length")
         total = start + int(length) if length is not None else None
-        if most is not None and total is not None and total > most:
+        if most is not None and (total or 0) > most:
             raise InputError(f"download of {url} has {total} bytes, expected at most {most}")
         bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)
         with bar, open(part, "ab" if start else "wb") as file:
@@ -159,11 +143,8 @@ def _fetch_rest(url: str, part: Path, size: int | None, timeout: float, most: in
                     file.write(chunk)
                     bar.update(len(chunk))
                     if most is not None and file.tell() > most:
-                        break
+                        part.unlink()
+                        raise InputError(f"download of {url} has more than {most} bytes, expected no more; removed")
             except (http.client.IncompleteRead, ConnectionError, TimeoutError):
                 return False
-            received = file.tell()
-    if most is not None and received > most:
-        part.unlink()
-        raise InputError(f"download of {url} has more than {most} bytes, expected no more; removed")
-    return total is None or received >= total
+            return total is None or file.tell() >= total

@@ -12,14 +12,9 @@ _BORDER = (0.01, 0.99)  # quantiles that are shown black and white
 
 
 def picture_html(text: str, *images: UInt8[np.ndarray, "_ _ 3"] | Float[np.ndarray, "_ _"]) -> str:
-    """Format images in a row above a text.
+    """Return HTML of images in a row, as inline PNG, above a plain text of any number of lines.
 
-    Args:
-        text: Plain text, of any number of lines.
-        images: RGB images, or maps, which are shown in grey from their 1st to their 99th percentile.
-
-    Returns:
-        HTML with the images as inline PNG, 128 pixels high.
+    Maps are shown in grey from their 1st to their 99th percentile.
     """
     tags = []
     for image in images:

@@ -1,7 +1,4 @@
-"""Size and parts of a file on a server, without downloading all of it.
-
-Written here because the package `remotezip` brings another HTTP library.
-"""
+"""Size and parts of a file on a server, without downloading all of it."""
 
 import http.client
 import io
@@ -14,19 +11,9 @@ _ATTEMPTS = 3  # requests of one part before it is given up
 
 
 def remote_size(url: str, timeout: float = 30.0) -> int | None:
-    """Ask a server for the size of a file in bytes; None if it does not tell.
-
-    Raises:
-        InputError: The server cannot be reached, or has no such file.
-    """
+    """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
     try:
-        try:
-            response = urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=timeout)
-        except urllib.error.HTTPError as error:
-            if error.code not in (403, 405, 501):  # servers that refuse HEAD only
-                raise
-            response = urllib.request.urlopen(url, timeout=timeout)  # closed before the content is read
-        with response:
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=timeout) as response:
             length = response.headers.get("Content-Length")
         return None if length is None else int(length)
     except (OSError, http.client.HTTPException, ValueError) as error:
@@ -40,11 +27,7 @@ class RemoteFile(io.RawIOBase):
     """
 
     def __init__(self, url: str, timeout: float = 30.0):
-        """Ask for the size of the file.
-
-        Raises:
-            InputError: The server cannot be reached or does not tell the size.
-        """
+        """Ask for the size of the file; InputError if the server cannot be reached or does not tell it."""
         super().__init__()
         size = remote_size(url, timeout)
         if size is None:
@@ -72,11 +55,7 @@ class RemoteFile(io.RawIOBase):
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview) -> int:
-        """Read up to `len(buffer)` bytes.
-
-        Raises:
-            InputError: The server cannot be reached, or does not send parts of files.
-        """
+        """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not send parts."""
         end = min(self._position + len(buffer), self.size)
         if end <= self._position:
             return 0
