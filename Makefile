@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 LAB := my_notebooks
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks site browser hostile fuzz exercises doctor render-env clean
+.PHONY: help demo test check lint format lab notebooks site browser hostile fuzz exercises doctor clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -24,7 +24,6 @@ help:
 	@echo "make fuzz       ten minutes of damaged and invented files for every reader"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
-	@echo "make render-env Blender's module in .render-env, for zsp-lite synth --engine cycles (Python 3.11, 1 GB)"
 	@echo "make clean      remove .venv, caches and outputs/"
 	@echo "PYTHON=/path/to/python3.12 make demo   chooses the interpreter (3.11 or newer)"
 
@@ -99,13 +98,6 @@ exercises: $(STAMP)
 
 doctor: $(STAMP)
 	$(RUN) -m zsp_lite doctor
-
-# Blender's module (GPL) needs Python 3.11 and numpy below 2: an environment of its own.
-render-env:
-	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
-	  { echo "Blender's module bpy 5.0.1 needs Python 3.11; '$(PYTHON)' is another one (set PYTHON=/path/to/python3.11)" >&2; exit 1; }
-	"$(PYTHON)" -m venv .render-env
-	.render-env/bin/python -m pip install --disable-pip-version-check bpy==5.0.1
 
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .hypothesis *.egg-info

@@ -7,8 +7,10 @@ import numpy as np
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
+from zsp_lite.synthetic.photography import CheapCamera
 from zsp_lite.synthetic.primitives import Mesh, box
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
+from zsp_lite.synthetic.room import Room
 
 # Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
 _QUAD = """mtllib {stem}.mtl
@@ -69,3 +71,13 @@ def view(vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size:
     """A camera that frames the vertices; angles in degrees."""
     pose = orbit_pose(np.radians(azimuth), np.radians(elevation), 0.05, 6.0, vertices.mean(0))
     return framed_camera(vertices, *pose, size, margin=1.3)
+
+
+def studio() -> Room:
+    """Return plain, light grey surroundings with one soft light, for pictures of single models."""
+    plain = np.full((8, 8, 3), 0.55, np.float32)
+    light = np.array([0.55, 0.45, 0.7])
+    light /= np.linalg.norm(light)
+    camera = CheapCamera(exposure=0.42, noise=0.0, blur=0.3, vignetting=0.0)
+    size = np.array([14.0, 14, 12])
+    return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), np.ones(3), 0.0, camera)

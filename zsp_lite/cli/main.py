@@ -11,22 +11,19 @@ from pathlib import Path
 
 import click
 
-from zsp_lite.cli.benchmark import benchmark, compare, profile, tables
+from zsp_lite.cli.benchmark import benchmark, compare, tables
 from zsp_lite.cli.common import (
     COUNT,
     PATH,
-    SEED,
     backbone_config,
     backbone_options,
     examples,
     out_option,
-    positive,
     seed_option,
 )
-from zsp_lite.cli.data import data, label
+from zsp_lite.cli.data import data
 from zsp_lite.cli.download import download as data_download
 from zsp_lite.cli.estimate import SOLVERS, estimate
-from zsp_lite.cli.models import models, print_left_out
 from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
@@ -35,6 +32,7 @@ SYNTHETIC_NOTE = (
 )
 MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D."
 USER_NOTE = "the given folder in CO3D's layout."
+DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 @click.group(
@@ -47,7 +45,7 @@ def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (estimate, benchmark, tables, compare, profile, data, label, models):
+for command in (estimate, benchmark, tables, compare, data):
     cli.add_command(command)
 data.add_command(data_download)
 
@@ -166,7 +164,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
         "synth --category chair --category car --sequences 2 --seed 7 --out outputs/mine",
         "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
         "synth --models path/to/models --image-size 320 --out outputs/models",
-        "synth --models path/to/models --engine cycles --image-size 240 --landscape --out outputs/photographs",
+        "synth --models path/to/models --front -x --up +z --out outputs/models",
     )
 )
 @click.option(
@@ -180,8 +178,15 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 )  # fmt: skip
 @click.option(
     "--models", "models_folder", type=PATH, metavar="FOLDER",
-    help="Your own textured meshes, CATEGORY/NAME.EXT with EXT one of obj, glb, gltf, ply, stl, dae: a sequence each. "
-    "See `zsp-lite models` for their orientation.",
+    help="Your own textured meshes, CATEGORY/NAME.EXT with EXT one of obj, glb, gltf, ply, stl, dae: a sequence each.",
+)  # fmt: skip
+@click.option(
+    "--front", type=click.Choice(DIRECTIONS), show_default="+z; -y for stl",
+    help="With --models: the front of the models, as an axis of their files. models.json overrides it.",
+)  # fmt: skip
+@click.option(
+    "--up", type=click.Choice(DIRECTIONS), show_default="+y; +z for stl",
+    help="With --models: the top of the models, likewise.",
 )  # fmt: skip
 @click.option("--sequences", type=COUNT, metavar="N", show_default="4", help="With --category: sequences per category.")
 @click.option(
@@ -191,38 +196,19 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     "--image-size", type=click.IntRange(min=32), metavar="PX", show_default="256",
     help="With --models: shorter image side in pixels.",
 )  # fmt: skip
-@click.option(
-    "--engine",
-    type=click.Choice(["raycasting", "cycles"]),
-    default="raycasting",
-    show_default=True,
-    help="With --models: the renderer. cycles traces paths with Blender's module, which `make render-env` installs.",
-)
-@click.option("--landscape", is_flag=True, help="With --models: all pictures are 4:3 landscape.")
-@click.option(
-    "--depth-bits",
-    type=click.IntRange(1, 10),
-    default=10,
-    metavar="N",
-    show_default=True,
-    help="With --models: bits of precision of stored depth; fewer bits make smaller files.",
-)
 @seed_option
 @click.option("--out", type=PATH, metavar="DIR", required=True, help="Folder to write.")
 def synth(
-    preset: str | None, categories: tuple[str, ...], models_folder: Path | None, sequences: int | None,
-    frames: int | None, image_size: int | None, engine: str, landscape: bool, depth_bits: int, seed: int, out: Path,
+    preset: str | None, categories: tuple[str, ...], models_folder: Path | None, front: str | None, up: str | None,
+    sequences: int | None, frames: int | None, image_size: int | None, seed: int, out: Path,
 ) -> None:  # fmt: skip
-    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files.
-
-    With --engine cycles, the colours are the same only up to the rounding of the path tracer.
-    """
+    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files."""
     if bool(preset) + bool(categories) + bool(models_folder) != 1:
         raise click.UsageError("expected either --preset or --category or --models")
     if image_size and not models_folder:
         raise InputError("--image-size goes with --models; --preset and --category fix the size of the images")
-    if (engine != "raycasting" or landscape or depth_bits < 10) and not models_folder:
-        raise InputError("--engine, --landscape and --depth-bits go with --models")
+    if (front or up) and not models_folder:
+        raise InputError("--front and --up go with --models")
     from tqdm import tqdm
 
     from zsp_lite.io.locks import writing
@@ -231,22 +217,12 @@ def synth(
     if models_folder:
         if sequences:
             raise InputError("--sequences goes with --category; --models makes one sequence per model")
-        from zsp_lite.data.co3d import Co3D
         from zsp_lite.synthetic.model_export import export_models
-        from zsp_lite.synthetic.model_sheet import write_contact_sheet, write_label_overlay
-        from zsp_lite.synthetic.path_tracing import path_traced_views, render_python
-        from zsp_lite.synthetic.sequences import render_views
 
-        if engine == "cycles":
-            render_python()  # missing: say so before any work
         with writing(out):
-            left_out = export_models(
-                models_folder, out, frames or 24, seed, image_size or 256, landscape=landscape, depth_bits=depth_bits,
-                renderer=path_traced_views if engine == "cycles" else render_views, progress=tqdm,
-            )  # fmt: skip
-            print_left_out(left_out)
-            write_contact_sheet(models_folder, out / "models.html")
-            write_label_overlay(out / "label_overlay.jpg", Co3D(out))
+            left_out = export_models(models_folder, out, frames or 24, seed, image_size or 256, front, up, tqdm)
+        for key, reason in left_out.items():
+            print(f"Left out {key}: {reason}")
     elif preset:
         if sequences or frames:
             raise InputError("a preset fixes its sequences and frames; --sequences and --frames go with --category")
@@ -293,126 +269,6 @@ def verify(name: str) -> None:
 
     load.verify(name)
     print(f"{name}: complete, loads")
-
-
-@cli.command(
-    epilog=examples(
-        "train --out outputs/first",
-        "train --out outputs/second --start-from outputs/first/checkpoint.pt",
-        "train --out outputs/further --start-from zsp-tiny --seed 1 --objects 2400",
-        "train --out outputs/photo --start-from zsp-tiny --photo --models outputs/training_models "
-        "--backgrounds outputs/backgrounds.npz",
-        "train --out outputs/longer --start-from outputs/photo/checkpoint.pt --photo --batch-seed 1 "
-        "--models outputs/training_models --backgrounds outputs/backgrounds.npz",
-        "train --out outputs/try --shorten 0.02 --objects 60",
-        "train --self-distillation --out outputs/dino --renders outputs/first/renders",
-    )
-)
-@out_option("outputs/train", "Folder for configuration, log, checkpoint and weights. An existing run is resumed.")
-@click.option("--renders", type=PATH, metavar="DIR", show_default="OUT/renders", help="Folder of the training renders.")
-@click.option(
-    "--start-from", metavar="WEIGHTS",
-    help="Continue with the second part of the recipe from a run's checkpoint.pt, exported .safetensors, or the name "
-    "of embedded weights, such as zsp-tiny.",
-)  # fmt: skip
-@click.option(
-    "--photo", is_flag=True,
-    help="Train the input of photo features too, with the third part of the recipe; needs --start-from.",
-)  # fmt: skip
-@click.option(
-    "--models", type=PATH, metavar="DIR",
-    help="Folder of textured models to train on beside procedural objects.  [default: procedural objects only]",
-)  # fmt: skip
-@click.option(
-    "--backgrounds", type=PATH, metavar="FILE",
-    help="Photographs to put objects in front of (tools/backgrounds.py).  [default: rendered rooms only]",
-)  # fmt: skip
-@click.option(
-    "--self-distillation", is_flag=True,
-    help="Train with DINO's objective instead, which uses no geometry: a comparison at the same number of steps.",
-)  # fmt: skip
-@click.option(
-    "--objects", type=COUNT, metavar="N", show_default="5600; 2400 with --photo",
-    help="Training objects; each takes 1.4 MB on disk and in memory.",
-)  # fmt: skip
-@click.option("--shorten", type=positive, metavar="F", default=1.0, help="Multiply the steps of every stage by F.")
-@click.option(
-    "--batch-seed",
-    type=SEED,
-    metavar="N",
-    default=0,
-    help="Second seed of the batches, to go on with the same objects.",
-)
-@seed_option
-def train(
-    out: Path, renders: Path | None, start_from: str | None, photo: bool, models: Path | None,
-    backgrounds: Path | None, self_distillation: bool, objects: int | None, shorten: float, batch_seed: int, seed: int,
-) -> None:  # fmt: skip
-    """Train the embedded backbone or resume its training; takes hours on a CPU."""
-    if self_distillation and (start_from or photo or models or backgrounds):
-        raise InputError(
-            "--self-distillation has its own recipe; expected it without --start-from, --photo, --models, --backgrounds"
-        )
-    if photo and start_from is None:
-        raise InputError("--photo has no weights to start from; expected --start-from")
-    from dataclasses import replace
-
-    from zsp_lite.io.locks import writing
-    from zsp_lite.training.loop import keep_freed_memory
-    from zsp_lite.training.recipe import CONTINUATION, PHOTO_INFORMED, TrainingConfig
-    from zsp_lite.training.train import train as train_backbone
-
-    recipe = PHOTO_INFORMED if photo else TrainingConfig() if start_from is None else CONTINUATION
-    config = replace(recipe, seed=seed, batch_seed=batch_seed).shortened(shorten)
-    if objects:
-        config = replace(config, objects=objects)
-    keep_freed_memory()
-    if self_distillation:
-        from zsp_lite.training.distillation import LONG_RUN, distil
-
-        run = replace(LONG_RUN, seed=seed, steps=max(1, round(LONG_RUN.steps * shorten)))
-        with writing(out):
-            written = distil(run, config, out, renders)
-    else:
-        with writing(out):
-            written = train_backbone(
-                config, out, renders, start_from=start_from, models=models, backgrounds=backgrounds
-            )
-    print(f"Written: {written}")
-
-
-@cli.command(
-    epilog=examples(
-        "train-baseline swav-tiny --out outputs/swav-tiny",
-        "train-baseline posecontrast-tiny --out outputs/posecontrast-tiny",
-    )
-)
-@click.argument("name", type=click.Choice(("swav-tiny", "posecontrast-tiny")))
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="DIR",
-    show_default="outputs/NAME",
-    help="Folder for renders, log, checkpoint and weights. An existing run is resumed.",
-)
-@click.option("--objects", type=COUNT, metavar="N", show_default="the configuration's", help="Training objects.")
-@click.option("--steps", type=COUNT, metavar="N", show_default="the configuration's", help="Training steps.")
-@seed_option
-def train_baseline(name: str, out: Path | None, objects: int | None, steps: int | None, seed: int) -> None:
-    """Train a small network for one of the learned baselines."""
-    if name == "swav-tiny":
-        from zsp_lite.training.swav import SwavConfig as Config
-        from zsp_lite.training.swav import train
-    else:
-        from zsp_lite.training.posecontrast import PoseContrastConfig as Config
-        from zsp_lite.training.posecontrast import train
-    from zsp_lite.io.locks import writing
-
-    given = {key: value for key, value in (("objects", objects), ("steps", steps)) if value}
-    folder = out or Path("outputs") / name
-    with writing(folder):
-        written = train(Config(seed=seed, **given), folder)
-    print(f"Written: {written}")
 
 
 @cli.command(epilog=examples("doctor", "doctor --data path/to/co3d"))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsp_lite.data.annotations import decode
-from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import read_bytes, write_atomic
@@ -33,7 +32,6 @@ GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
 RENDERER = 2  # folders that another renderer began are not completed
 _MOST_SEQUENCES = 900  # of a category: their names have three digits
-LAYOUTS = {"v1": NDC_NORM_IMAGE_BOUNDS, "v2": NDC_ISOTROPIC}
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,6 @@ def export_categories(
     frames: int,
     seed: int,
     image_size: int = 256,
-    layout: str = "v1",
     progress: Callable[[Iterable], Iterable] | None = None,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
@@ -119,31 +116,28 @@ def export_categories(
         frames: Frames per sequence.
         seed: Seed of the export.
         image_size: Shorter image side in pixels.
-        layout: "v1" or "v2", the version of CO3D's annotations.
         progress: Wraps the loop over sequences, as tqdm does.
 
     Raises:
-        InputError: A category or the layout is unknown, or the folder was written with other settings.
+        InputError: A category is unknown, or the folder was written with other settings.
     """
     categories = list(dict.fromkeys(name for given in categories for name in SPLITS.get(given, [given])))
     for category in categories:
         if category not in GENERATORS:
             raise InputError(f"category is {category!r}, expected one of {', '.join([*SPLITS, *sorted(GENERATORS)])}")
-    if layout not in LAYOUTS:
-        raise InputError(f"layout is {layout!r}, expected one of {', '.join(LAYOUTS)}")
     check_integer("sequences", sequences, 1, _MOST_SEQUENCES)
     check_integer("frames", frames, 1, MOST_FRAMES)
     check_integer("image_size", image_size, 32, MOST_PIXELS)
     check_integer("seed", seed, 0)
     out = Path(out)
-    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": layout, "renderer": RENDERER}
+    settings = {"seed": seed, "frames": frames, "image_size": image_size, "layout": "v1", "renderer": RENDERER}
     _write_settings(out, settings)
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs) if progress else jobs:
         name = sequence_name(seed, category, index)
         if name not in read_poses(out, category) or name not in _complete_sequences(out, category):
             recorded = make_sequence(category, index, frames, seed, image_size)
-            write_sequence(out, category, make_object(category, name, seed), recorded, LAYOUTS[layout])
+            write_sequence(out, category, make_object(category, name, seed), recorded)
     for category in categories:
         write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 

@@ -1,8 +1,8 @@
 """Textured meshes from files: one record for OBJ, glTF, PLY, STL and COLLADA."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -23,15 +23,6 @@ _HALF_CREASE = np.cos(np.radians(20))
 _INVISIBLE = 0.02  # opacity below which a face is removed
 
 
-@runtime_checkable
-class Pattern(Protocol):
-    """Colour as a function of the position on an object."""
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return the sRGB colours, in [0, 1], of points in object coordinates."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Material:
     """Surface of a part of a mesh.
@@ -39,7 +30,7 @@ class Material:
     Attributes:
         colour: sRGB colour and opacity in [0, 1], a factor of the texture. An opacity below 1 means glass.
         texture: sRGB colour and opacity, rows from top to bottom. Opacity below 0.5 means a hole (cut-out).
-        pattern: Colour by position, another factor.
+        pattern: Another factor: the sRGB colours (n, 3) in [0, 1] of points (n, 3) in object coordinates.
         specular: Reflectance at normal incidence, in [0, 1].
         roughness: Width of the highlight as in glTF: 0 for a mirror, 1 for a matte surface.
         metallic: 1 for metals, whose reflection has the colour of the surface.
@@ -47,7 +38,7 @@ class Material:
 
     colour: Float[np.ndarray, "4"]
     texture: UInt8[np.ndarray, "h w 4"] | None = None
-    pattern: Pattern | None = None
+    pattern: Callable[[np.ndarray], np.ndarray] | None = None
     specular: float = 0.04
     roughness: float = 0.7
     metallic: float = 0.0

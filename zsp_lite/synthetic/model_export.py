@@ -15,7 +15,6 @@ from zsp_lite.synthetic.models import Model, list_models
 from zsp_lite.synthetic.recording import (
     MOST_FRAMES,
     MOST_PIXELS,
-    Sensor,
     read_poses,
     record_sequence,
     stable_hash,
@@ -23,8 +22,6 @@ from zsp_lite.synthetic.recording import (
     write_pairs,
     write_sequence,
 )
-from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import Renderer, render_views
 
 RENDERED_FILE = "rendered_models.json"  # in the data folder: the settings, and the model of each sequence
 _PAIRS, _TARGETS = 20, (1, 3, 5)
@@ -60,10 +57,8 @@ def export_models(
     frames: int = 24,
     seed: int = 0,
     image_size: int = 256,
-    renderer: Renderer = render_views,
-    sensor: Sensor = simulate_capture,
-    landscape: bool = False,
-    depth_bits: int = 10,
+    front: str | None = None,
+    up: str | None = None,
     progress: Callable[[Iterable], Iterable] | None = None,
 ) -> dict[str, str]:
     """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
@@ -78,10 +73,8 @@ def export_models(
         frames: Frames per sequence.
         seed: Seed of rooms, cameras, noise and pairs.
         image_size: Shorter image side in pixels.
-        renderer: Makes the pictures and their geometry.
-        sensor: Makes depth, masks and point cloud from the exact renderings.
-        landscape: Whether all pictures are 4:3 landscape; otherwise each sequence draws its format.
-        depth_bits: Bits of the mantissa of stored depth to keep, 1 to 10. Less precise depth makes smaller files.
+        front: Front of the models for which `models.json` gives none, see `list_models`.
+        up: Top of these models.
         progress: Wraps the loop over models, as tqdm does.
 
     Returns:
@@ -94,15 +87,8 @@ def export_models(
     check_integer("frames", frames, 1, MOST_FRAMES)
     check_integer("image_size", image_size, 32, MOST_PIXELS)
     check_integer("seed", seed, 0)
-    check_integer("depth_bits", depth_bits, 1, 10)
-    models, out = list_models(folder), Path(out)
-    settings = {"seed": seed, "frames": frames, "image_size": image_size}
-    for key, given, own in (("renderer", renderer, render_views), ("sensor", sensor, simulate_capture)):
-        if given is not own:
-            settings[key] = getattr(given, "__qualname__", type(given).__qualname__)
-    settings |= {"landscape": 1} if landscape else {}
-    settings |= {"depth_bits": depth_bits} if depth_bits < 10 else {}
-    rendered = _read_rendered(out, settings)
+    models, out = list_models(folder, front, up), Path(out)
+    rendered = _read_rendered(out, {"seed": seed, "frames": frames, "image_size": image_size})
     left_out = {}
     for model in progress(models) if progress else models:
         record = _record(model, Path(folder))
@@ -115,8 +101,8 @@ def export_models(
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
         key = stable_hash(seed, model.category, model.name)
-        recorded = record_sequence(mesh, model.name, key, frames, image_size, renderer, sensor, landscape)
-        write_sequence(out, model.category, mesh, recorded, depth_bits=depth_bits)
+        recorded = record_sequence(mesh, model.name, key, frames, image_size)
+        write_sequence(out, model.category, mesh, recorded)
         # The record is written last; a sequence with a record is complete.
         rendered.sequences.setdefault(model.category, {})[model.name] = record
         write_atomic(out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1))

@@ -7,14 +7,13 @@ A model with several files may have its own folder, `FOLDER/CATEGORY/NAME/FILE.o
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import plain_name, read_bytes
 from zsp_lite.synthetic.meshes import EXTENSIONS, TexturedMesh, canonical_mesh, read_mesh
 
 MODELS_FILE = "models.json"
@@ -77,8 +76,13 @@ class Model:
             raise InputError(f"{MODELS_FILE}, {self.category}/{self.name}: {error}") from error
 
 
-def list_models(folder: str | Path) -> list[Model]:
+def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
     """Return the models of a folder, sorted by category and name.
+
+    Args:
+        folder: Folder of models.
+        front: Front of the models whose entry in `models.json` gives none, such as "-x". Default: see `ModelInfo.axes`.
+        up: Top of these models, likewise.
 
     Raises:
         InputError: If the folder does not exist or holds no model, `models.json` is damaged or names a model that
@@ -96,6 +100,7 @@ def list_models(folder: str | Path) -> list[Model]:
             if key in models:
                 raise InputError(f"model {key} has two files, {models[key].path.name} and {path.name}, expected one")
             info = infos.get(key, ModelInfo())
+            info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
             models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
     if not models:
         raise InputError(
@@ -113,36 +118,6 @@ def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
     return decode(read_bytes(path, "model list"), dict[str, ModelInfo], path) if path.is_file() else {}
 
 
-def turn_model(folder: str | Path, key: str, axis: str, degrees: float) -> ModelInfo:
-    """Rotate a model in its canonical frame and store the new orientation in `models.json`.
-
-    Args:
-        folder: Folder of models.
-        key: "CATEGORY/NAME".
-        axis: Canonical axis of the rotation: "front", "left" or "up".
-        degrees: Angle, counter-clockwise as seen from the tip of the axis.
-
-    Returns:
-        The new entry.
-
-    Raises:
-        InputError: If the folder has no such model, or the axis is unknown.
-    """
-    models = {f"{model.category}/{model.name}": model for model in list_models(folder)}
-    if key not in models:
-        raise InputError(f"model is {key!r}, expected one of {', '.join(models)}")
-    about = ("front", "left", "up")
-    if axis not in about:
-        raise InputError(f"axis is {axis!r}, expected one of {', '.join(about)}")
-    turn = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[about.index(axis)])[0]
-    rotation = turn @ models[key].info.axes(models[key].path.suffix)
-    info = msgspec.structs.replace(models[key].info, front=_axis_name(rotation[0]), up=_axis_name(rotation[2]))
-    infos = read_infos(folder) | {key: info}
-    encoded = msgspec.json.format(msgspec.json.encode(dict(sorted(infos.items()))), indent=1)
-    write_atomic(Path(folder) / MODELS_FILE, encoded)
-    return info
-
-
 def _direction(given: _Direction) -> np.ndarray:
     """Return the unit vector of "+x" ... "-z" or of three numbers."""
     if isinstance(given, str):
@@ -155,11 +130,3 @@ def _direction(given: _Direction) -> np.ndarray:
     if not 1e-6 < length < np.inf:
         raise InputError(f"direction is {given}, expected three finite numbers that are not all zero")
     return vector / length
-
-
-def _axis_name(vector: np.ndarray) -> _Direction:
-    """Return "+x" ... "-z" if a unit vector is one of them, otherwise three numbers."""
-    axis = int(np.abs(vector).argmax())
-    if abs(vector[axis]) > 1 - 1e-9:
-        return "-+"[int(vector[axis] > 0)] + "xyz"[axis]
-    return tuple(np.round(vector, 9).tolist())

@@ -53,7 +53,6 @@ class Quality:
     shadow_map: int = 320
 
 
-HARD_SHADOWS = Quality(shadow_rays=1, ambient_rays=0)
 FASTEST = Quality(samples=1, shadow_rays=1, ambient_rays=0, shadow_map=96)
 
 
@@ -144,14 +143,6 @@ class MeshScene:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(rng.normal(0, 0.025)), rng)
         return Rendering(rgb=rgb, camera=camera, **exact)
-
-    def geometry(self, camera: Camera) -> dict:
-        """Return the exact depth, mask, object coordinates and normals of a view, as in `Rendering`."""
-        top, left, bottom, right = self._object_box(camera)
-        rays = _pixel_rays(camera, (0, 0, *camera.size), 1)
-        inside = rays[top:bottom, left:right]
-        hits = self._first_hits(camera, inside.reshape(-1, 3))
-        return self._exact(camera, (top, left), inside, hits, self._background(camera, rays)[1])
 
     def _raycasting(self, o3d, faces: np.ndarray):
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)

@@ -4,34 +4,21 @@ import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from zsp_lite.data.annotations import decode
-from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import RenderedSequence, Renderer, render_sequence, render_views
+from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 JPEG_QUALITY = 88
 MOST_FRAMES, MOST_PIXELS = 10_000, 4096  # of a sequence; of a side of an image
-
-
-@runtime_checkable
-class Sensor(Protocol):
-    """Converts exact renderings to recorded frames, for instance `zsp_lite.synthetic.sensor.simulate_capture`."""
-
-    def __call__(
-        self, sequence: RenderedSequence, name: str, seed: np.random.Generator
-    ) -> tuple[SequenceData, RenderedSequence]:
-        """Return the recorded sequence, and the exact one in the same unit."""
-        ...
 
 
 def stable_hash(seed: int, category: str, item: int | str) -> int:
@@ -40,14 +27,7 @@ def stable_hash(seed: int, category: str, item: int | str) -> int:
 
 
 def record_sequence(
-    mesh: TexturedMesh,
-    name: str,
-    key: int,
-    frames: int,
-    image_size: int,
-    renderer: Renderer = render_views,
-    sensor: Sensor = simulate_capture,
-    landscape: bool = False,
+    mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int
 ) -> tuple[SequenceData, RenderedSequence]:
     """Render an object and simulate the sensor.
 
@@ -57,24 +37,16 @@ def record_sequence(
         key: Seed of room, cameras and noise.
         frames: Number of frames.
         image_size: Shorter image side in pixels.
-        renderer: Makes the pictures and their geometry.
-        sensor: Makes depth, masks and point cloud from the exact renderings.
-        landscape: Whether the pictures are 4:3 landscape; otherwise their format is drawn.
 
     Returns:
         The recorded sequence, and the exact one in the same unit.
     """
-    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, renderer, landscape)
-    return sensor(exact, name, np.random.default_rng([key, 2]))
+    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size)
+    return simulate_capture(exact, name, np.random.default_rng([key, 2]))
 
 
 def write_sequence(
-    out: Path,
-    category: str,
-    mesh: TexturedMesh,
-    recorded: tuple[SequenceData, RenderedSequence],
-    intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
-    depth_bits: int = 10,
+    out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, RenderedSequence]
 ) -> None:
     """Add a recorded sequence, with the pose and the bounding box of its object, to a data folder.
 
@@ -85,7 +57,7 @@ def write_sequence(
     poses = read_poses(out, category)
     poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
     write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-    write_co3d(out, category, [data], JPEG_QUALITY, intrinsics_format, depth_bits)
+    write_co3d(out, category, [data], JPEG_QUALITY)
 
 
 def read_poses(out: Path, category: str) -> dict:

@@ -59,15 +59,10 @@ class Room:
     camera: CheapCamera
 
 
-def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
-    """Draw surroundings, independent of the object: mostly rooms, sometimes a yard.
-
-    Args:
-        seed: Seed or source of the draws.
-        plain: Whether it is always a room, with pale walls and without painted furniture.
-    """
+def random_room(seed: int | np.random.Generator) -> Room:
+    """Draw surroundings, independent of the object: mostly rooms, sometimes a yard."""
     rng = np.random.default_rng(seed)
-    outdoors = rng.random() < 0.2 and not plain
+    outdoors = rng.random() < 0.2
     extent = rng.uniform(11.5, 17, 4) * (1.5 if outdoors else 1.0)
     height = rng.uniform(9, 12) * (2 if outdoors else 1)
     low, high = np.array([-extent[0], -extent[1], 0]), np.array([extent[2], extent[3], height])
@@ -87,13 +82,13 @@ def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
     floors = (asphalt, paving, paving, grass, concrete) if outdoors else (
         planks, planks, planks, tiles, tiles, carpet, concrete)  # fmt: skip
     make = floors[rng.integers(len(floors))]
-    floor = _floor_image(make, rng, not outdoors and rng.random() < 0.25, plain)
-    wall_colour = _wall_colour(rng, plain)
+    floor = _floor_image(make, rng, not outdoors and rng.random() < 0.25)
+    wall_colour = _wall_colour(rng)
     sides = [(high - low)[1], (high - low)[1], (high - low)[0], (high - low)[0]]
     # The side of the window is the one that the light comes from.
     lit = int(np.abs(light[:2]).argmax()) * 2 + int(light[np.abs(light[:2]).argmax()] > 0)
     walls = [_facade(rng, width, height) if outdoors else
-             _wall(rng, width, height, wall_colour, (k == lit) or rng.random() < 0.15, plain)
+             _wall(rng, width, height, wall_colour, (k == lit) or rng.random() < 0.15)
              for k, width in enumerate(sides)]  # fmt: skip
     ceiling = np.empty((64, 64, 3), np.float32)
     ceiling[:] = (0.9, 1.15, 1.5) if outdoors else (0.72, 0.71, 0.69)
@@ -111,24 +106,15 @@ def random_room(seed: int | np.random.Generator, plain: bool = False) -> Room:
     return Room(low, high, (*walls, floor, ceiling), light, float(radius), colour, ambient, gloss, camera)
 
 
-def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, plain: bool) -> np.ndarray:
-    """Return the linear albedo of the whole floor, with a rug below the object where `rug` is set.
-
-    With `plain`, the texture is finer, and carpet and rug have muted colours.
-    """
-    repeats, texture = _FLOOR_PIXELS // textures.TILE, np.clip(make(rng), 0, 1)
-    texture = srgb_to_linear(_muted(texture) if plain and make is carpet else texture)
-    if plain:
-        repeats, texture = 2 * repeats, cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+def _floor_image(make: Callable, rng: np.random.Generator, rug: bool) -> np.ndarray:
+    """Return the linear albedo of the whole floor, with a rug below the object where `rug` is set."""
+    repeats, texture = _FLOOR_PIXELS // textures.TILE, srgb_to_linear(np.clip(make(rng), 0, 1))
     if rng.random() < 0.5:
         texture = texture.swapaxes(0, 1)
     image = np.tile(texture, (repeats, repeats, 1))
     if rug:
-        cloth = np.clip(carpet(rng), 0, 1)
-        cloth = srgb_to_linear(_muted(cloth) if plain else cloth)
-        border = srgb_to_linear(
-            hsv(rng.uniform(0, 360), rng.uniform(0.03, 0.4) * (0.4 if plain else 1), rng.uniform(0.2, 0.7))
-        )
+        cloth = srgb_to_linear(np.clip(carpet(rng), 0, 1))
+        border = srgb_to_linear(hsv(rng.uniform(0, 360), rng.uniform(0.03, 0.4), rng.uniform(0.2, 0.7)))
         half, middle = (rng.uniform(0.09, 0.22, 2) * _FLOOR_PIXELS).astype(int), _FLOOR_PIXELS // 2
         (top, left), (bottom, right) = middle - half, middle + half
         patch = np.tile(cloth, (repeats, repeats, 1))[: bottom - top, : right - left].copy()
@@ -140,18 +126,11 @@ def _floor_image(make: Callable, rng: np.random.Generator, rug: bool, plain: boo
     return np.clip(image * stains[..., None], 0, 0.85)
 
 
-def _muted(texture: np.ndarray, limit: float = 0.08) -> np.ndarray:
-    """Reduce the saturation of a texture, so that the saturation of its mean colour is at most `limit`."""
-    mean, grey = texture.mean((0, 1)), texture.mean(-1, keepdims=True)
-    saturation = 1 - mean.min() / mean.max()
-    return texture if saturation <= limit else grey + (texture - grey) * (limit / saturation)
-
-
-def _wall_colour(rng: np.random.Generator, plain: bool) -> np.ndarray:
-    """Draw the sRGB colour of a painted wall: mostly, or with `plain` always, white, cream and pale tones."""
+def _wall_colour(rng: np.random.Generator) -> np.ndarray:
+    """Draw the sRGB colour of a painted wall: mostly white, cream and pale tones."""
     if rng.random() < 0.75:
         return hsv(rng.uniform(25, 60), rng.uniform(0.01, 0.14), rng.uniform(0.72, 0.92))
-    return hsv(rng.uniform(0, 360), rng.uniform(0.12, 0.4) * (0.3 if plain else 1), rng.uniform(0.45, 0.8))
+    return hsv(rng.uniform(0, 360), rng.uniform(0.12, 0.4), rng.uniform(0.45, 0.8))
 
 
 def _canvas(width: float, height: float) -> tuple[int, int]:
@@ -170,9 +149,7 @@ def _box(image: np.ndarray, x: float, z: float, width: float, height: float, col
     return area
 
 
-def _wall(
-    rng: np.random.Generator, width: float, height: float, colour: np.ndarray, window: bool, plain: bool
-) -> np.ndarray:
+def _wall(rng: np.random.Generator, width: float, height: float, colour: np.ndarray, window: bool) -> np.ndarray:
     """Return the radiance of an inner wall: paint, skirting board, and furniture, pictures, a door or a window."""
     rows, cols = _canvas(width, height)
     image = np.empty((rows, cols, 3), np.float32)
@@ -185,9 +162,7 @@ def _wall(
     while x < width - 2:
         kind, wide = rng.integers(5), rng.uniform(2, 4.5)
         wide = min(wide, width - x - 0.2)
-        if plain and (window or kind in (0, 2)):
-            pass
-        elif kind == 0:  # shelf with books
+        if kind == 0:  # shelf with books
             top = rng.uniform(3, 7)
             wood = srgb_to_linear(hsv(rng.uniform(20, 40), rng.uniform(0.05, 0.5), rng.uniform(0.2, 0.9)))
             _box(image, x, 0, wide, top, wood)
@@ -276,13 +251,3 @@ def _facade(rng: np.random.Generator, width: float, height: float) -> np.ndarray
                 _box(image, x, floor, 2.5, 3.5, np.float32([0.08, 0.1, 0.12]) * rng.uniform(0.5, 3))
                 _box(image, x + 1.2, floor, 0.1, 3.5, 0.6)
     return np.asarray(image, np.float32)
-
-
-def studio() -> Room:
-    """Return plain, light grey surroundings with one soft light, for pictures of single models."""
-    plain = np.full((8, 8, 3), 0.55, np.float32)
-    light = np.array([0.55, 0.45, 0.7])
-    light /= np.linalg.norm(light)
-    camera = CheapCamera(exposure=0.42, noise=0.0, blur=0.3, vignetting=0.0)
-    size = np.array([14.0, 14, 12])
-    return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), np.ones(3), 0.0, camera)

@@ -1,9 +1,7 @@
 """Rendered sequences: a hand-held camera moves once around an object."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +9,7 @@ from jaxtyping import Float
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
-from zsp_lite.synthetic.raytracing import MeshScene, Quality
+from zsp_lite.synthetic.raytracing import MeshScene
 from zsp_lite.synthetic.render import Rendering, orbit_pose
 from zsp_lite.synthetic.room import random_room
 
@@ -38,15 +36,6 @@ class RenderedSequence:
     def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map canonical object coordinates to world coordinates."""
         return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
-
-
-@runtime_checkable
-class Renderer(Protocol):
-    """Renders a mesh from several cameras, for instance `render_views`."""
-
-    def __call__(self, mesh: TexturedMesh, cameras: Sequence[Camera], rng: np.random.Generator) -> Iterable[Rendering]:
-        """Return one rendering per camera; the cameras map from the coordinates of the mesh."""
-        ...
 
 
 def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
@@ -102,30 +91,10 @@ def handheld_sweep(
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
 
-def render_views(
-    mesh: TexturedMesh, cameras: Sequence[Camera], rng: np.random.Generator, quality: Quality = Quality()
-) -> Iterable[Rendering]:
-    """Render a mesh in a random room with the ray-casting renderer, see `zsp_lite.synthetic.raytracing`.
-
-    Args:
-        mesh: Mesh in canonical coordinates.
-        cameras: Cameras that map from these coordinates.
-        rng: Source of the room and of the noise.
-        quality: Numbers of rays.
-    """
-    scene = MeshScene(mesh, random_room(rng), quality, int(rng.integers(2**32)))
-    return [scene.render(camera, rng) for camera in cameras]
-
-
 def render_sequence(
-    mesh: TexturedMesh,
-    seed: int | np.random.Generator,
-    frames: int,
-    image_size: int,
-    renderer: Renderer = render_views,
-    landscape: bool = False,
+    mesh: TexturedMesh, seed: int | np.random.Generator, frames: int, image_size: int
 ) -> RenderedSequence:
-    """Render views around an object; the same seed gives the same cameras.
+    """Render views around an object in a random room.
 
     The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
 
@@ -134,21 +103,17 @@ def render_sequence(
         seed: Seed or source of the draws.
         frames: Number of views.
         image_size: Shorter image side in pixels.
-        renderer: Makes the pictures and their geometry.
-        landscape: Whether the pictures are 4:3 landscape; otherwise their format is drawn.
-
-    Returns:
-        The exact views.
     """
     rng = np.random.default_rng(seed)
-    size = (image_size, round(image_size * 4 / 3)) if landscape else image_shape(image_size, rng)
-    cameras = handheld_sweep(mesh.vertices, rng, frames, size)
+    cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
+    scene = MeshScene(mesh, random_room(rng), seed=int(rng.integers(2**32)))
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
     rounded = partial(np.round, decimals=9)
     views = []
-    for view in renderer(mesh, cameras, rng):
+    for camera in cameras:
+        view = scene.render(camera, rng)
         pose = rounded(view.camera.matrix @ to_object) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
