@@ -1,6 +1,6 @@
 """The paper's benchmark on any folder in CO3D's layout, on one processor or many machines.
 
-    run          `evaluate`, which runs the benchmark, and `plan_run`
+    run          `evaluate`, which runs the benchmark
     methods      rows of the tables, as data; groups of rows; user-defined rows
     problem      argument and results of a row
     store cache  frames and their features, in memory and on disk
@@ -8,7 +8,6 @@
     execution    chunks of pairs in this process, a pool, Dask, or any `concurrent.futures.Executor`
     database     folder of a run
     summary tables formats figures compare results reports      evaluation of a run
-    plan         estimate of time, memory and disk space
 
 docs/scale.md shows how to run it on several processes and machines, with Dask or MPI.
 """

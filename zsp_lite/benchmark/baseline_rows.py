@@ -54,15 +54,10 @@ def sift(problem: Problem) -> Answer:
     return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})
 
 
-def posecontrast(problem: Problem, features: str = "posecontrast") -> Answer:
+def posecontrast(problem: Problem) -> Answer:
     """Run "PoseContrast": the relative rotation of the viewpoints of the reference and the most similar view."""
     first: Viewpoint
-    first, *others = problem.descriptions(features)
+    first, *others = problem.descriptions("posecontrast")
     similarity = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
     view = int(np.argmax(similarity))
     return Answer(others[view].rotation @ first.rotation.T, view)
-
-
-def posecontrast_tiny(problem: Problem) -> Answer:
-    """Run `posecontrast` with the small network of this project."""
-    return posecontrast(problem, "posecontrast-tiny")

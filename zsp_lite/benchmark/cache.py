@@ -1,5 +1,6 @@
 """Feature maps on disk, shared between runs."""
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,8 +8,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from zsp_lite.benchmark.extractors import fingerprint
-from zsp_lite.benchmark.identity import digest_of
+from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.provenance import library_version
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
@@ -16,15 +16,16 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.io.files import make_folder, write_atomic
 
 _PARTS = ("keys", "saliency", "global_feature")
-_OPTIONAL = ("positions", "photo")  # where the backbone has them
 _UNCACHED = ("rootsift",)  # computed faster than read
 
 
 class FeatureCache:
     """A folder of feature maps in full precision: results with it equal those without it.
 
-    A file's name is a hash of the library's version, of the extractor and of its input: the crop's pixels, and for
-    extractors with `describe` also the depth, the mask and the camera. Only results of the type FeatureMap are kept.
+    A file's name is a hash of the library's version, of the extractor's fingerprint and of its input: the crop's
+    pixels, and for extractors with `describe` also the depth, the mask and the camera. Only results of the type
+    FeatureMap are kept. The fingerprint of a user-defined extractor without weights is its name: use another folder
+    when its code changes.
 
     Args:
         folder: The folder; made where it does not exist.
@@ -44,7 +45,10 @@ class FeatureCache:
         if hasattr(self.extractors[features], "describe"):
             camera = frame.camera
             seen += [frame.depth, frame.mask, camera.R, camera.t, camera.focal_length, camera.principal_point]
-        name = digest_of((library_version(), self._fingerprints[features], seen))
+        digest = hashlib.sha256(f"{library_version()} {self._fingerprints[features]}".encode())
+        for array in seen:
+            digest.update(b"none" if array is None else f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        name = digest.hexdigest()[:16]
         return self.folder / name[:2] / f"{name}.safetensors"
 
     def read(self, features: str, frame: Frame) -> FeatureMap | None:
@@ -53,13 +57,12 @@ class FeatureCache:
             return None
         try:
             tensors = load(self.path(features, frame).read_bytes())
-            return FeatureMap(*(tensors[part] for part in _PARTS), *(tensors.get(part) for part in _OPTIONAL))
+            return FeatureMap(*(tensors[part] for part in _PARTS))
         except (OSError, SafetensorError, KeyError, InputError):
             return None
 
     def write(self, features: str, frame: Frame, found: Any) -> None:
         """Store features of the type FeatureMap."""
         if features in self._fingerprints and isinstance(found, FeatureMap):
-            parts = {part: getattr(found, part) for part in (*_PARTS, *_OPTIONAL)}
-            tensors = {part: values.cpu().contiguous() for part, values in parts.items() if values is not None}
+            tensors = {part: getattr(found, part).cpu().contiguous() for part in _PARTS}
             write_atomic(self.path(features, frame), save(tensors))

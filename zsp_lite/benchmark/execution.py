@@ -24,7 +24,8 @@ from threadpoolctl import threadpool_limits
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.evaluation import evaluate_pair
-from zsp_lite.benchmark.extractors import fingerprint, make_extractors
+from zsp_lite.benchmark.extractors import make_extractors
+from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import Method, import_object
 from zsp_lite.benchmark.store import FrameStore, torch_threads
 from zsp_lite.data.co3d import Co3D

@@ -1,4 +1,4 @@
-"""Feature extractors of the benchmark's rows by name, and fingerprints that identify them."""
+"""Feature extractors of the benchmark's rows by name."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -7,13 +7,11 @@ import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.baselines.posecontrast import load_posecontrast, load_posecontrast_tiny
+from zsp_lite.baselines.posecontrast import load_posecontrast
 from zsp_lite.baselines.rootsift import RootSift
 from zsp_lite.baselines.sift import Sift
-from zsp_lite.baselines.swav import load_swav, load_swav_tiny
-from zsp_lite.benchmark.identity import backbone_digest, digest_of
+from zsp_lite.baselines.swav import load_swav
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 
@@ -25,14 +23,10 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "none": lambda backbone: None,  # for rows that use depth only
     "backbone": lambda backbone: backbone,
     "random": lambda backbone: random_backbone(backbone),
-    "zsp-tiny": lambda backbone: load_backbone("zsp-tiny"),
-    "effnet-lite0": lambda backbone: load_backbone("effnet-lite0"),
     "rootsift": lambda backbone: RootSift(),
     "sift": lambda backbone: Sift(),
     "swav": lambda backbone: load_swav(),
-    "swav-tiny": lambda backbone: load_swav_tiny(),
     "posecontrast": lambda backbone: load_posecontrast(),
-    "posecontrast-tiny": lambda backbone: load_posecontrast_tiny(),
 }
 
 
@@ -58,14 +52,3 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
         fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
     same = dict(facet=like.facet, image_size=like.image_size, mean=like.mean, std=like.std)
     return Backbone(fresh, f"random like {like.name}", like.layer, like.saliency_heads, like.device, **same)
-
-
-def fingerprint(extractor: Any) -> str:
-    """Return the name of an extractor and a hash of its weights and settings.
-
-    For a user-defined extractor, the hash is that of its code and attributes (see `identity.description`).
-    """
-    name = getattr(extractor, "name", type(extractor).__name__)
-    if extractor is None:
-        return name
-    return f"{name} {backbone_digest(extractor) if isinstance(extractor, Backbone) else digest_of(extractor)}"

@@ -4,20 +4,16 @@ A row is the paper's method with some settings changed, or a function (`solve`).
 results of such functions.
 """
 
-import hashlib
 import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
-from zsp_lite.benchmark.identity import digest_of
-from zsp_lite.benchmark.robustness import DAMAGES, Damaged
+from zsp_lite.benchmark.identity import described
 from zsp_lite.errors import InputError, describe_failure
-from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 
 
 @dataclass(frozen=True)
@@ -41,48 +37,14 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-def _numbers_of_views() -> dict[str, Method]:
-    rows = {}
-    for n in (1, 3, 5, 10, 20):
-        rows |= {f"ours-n{n}": Method(targets=n), f"ours-bv-n{n}": Method(answer="best view", targets=n)}
-    return rows
-
-
 _MASK = {"foreground": "mask"}
 _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
-
 _VERIFIED = {"solver": "verified"}
 
 
-def _verified_rows() -> dict[str, Method]:
-    """Return the rows of the verified solver: with fewer views, with the true mask, and with single parts disabled."""
-    rows = {"verified": Method(settings=_VERIFIED), "verified-mask": Method(settings=_VERIFIED | _MASK)}
-    rows |= {f"verified-n{n}": Method(settings=_VERIFIED, targets=n) for n in (1, 3, 5, 10, 20)}
-    rows |= {f"verified-mask-n{n}": Method(settings=_VERIFIED | _MASK, targets=n) for n in (1, 3, 5, 10)}
-    weights = ScoreWeights()
-    ablations = {
-        "nosilhouette": VerifiedSolver(weights.without("forward_silhouette", "reverse_silhouette")),
-        "nofreespace": VerifiedSolver(weights.without("forward_free_space", "reverse_free_space")),
-        "noview": VerifiedSolver(weights.without("viewpoint")),
-        "noorientation": VerifiedSolver(weights.without("orientation")),
-        "noagreement": VerifiedSolver(weights.without("agreement")),
-        "simonly": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "similarity" not in name))),
-        "forward": VerifiedSolver(weights.without(*(name for name in TERM_NAMES if "forward" not in name))),
-        "nofeatures": VerifiedSolver(weights.without(*FEATURE_TERMS), feature_weight=0.0),
-        "noicp": VerifiedSolver(icp=False),
-        "norefinement": VerifiedSolver(refinement=False),
-    }
-    return rows | {f"verified-{name}": Method(settings={"solver": one}) for name, one in ablations.items()}
-
-
-def _damaged_rows() -> dict[str, Method]:
-    """Return the rows of both solvers on corrupted data. Rows with a wrong mask use it as the foreground."""
-    rows = {}
-    for name in ("clean", *DAMAGES):
-        mask = _MASK if name.startswith("mask") else {}
-        rows[f"ours-{name}"] = Method(solve=Damaged(name, mask))
-        rows[f"verified-{name}"] = Method(solve=Damaged(name, _VERIFIED | mask))
-    return rows
+def _by_number_of_views(row: str, method: Method, numbers: Sequence[int]) -> dict[str, Method]:
+    """Return a row at fixed numbers of target views: ROW-n1, ROW-n3 and so on."""
+    return {f"{row}-n{n}": replace(method, targets=n) for n in numbers}
 
 
 METHODS: dict[str, Method] = {
@@ -117,24 +79,20 @@ METHODS: dict[str, Method] = {
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
     "swav": Method("swav", settings=_MUTUAL),
-    "swav-tiny": Method("swav-tiny", settings=_MUTUAL),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
-    "posecontrast-tiny": Method("posecontrast-tiny", solve=baseline_rows.posecontrast_tiny),
     # Table 2 and supplement, "Number of target views".
-    **_numbers_of_views(),
-    # What photographs add: the embedded transformer alone, and a network supervised by ImageNet's class labels alone.
-    "tiny": Method("zsp-tiny"),
-    "tiny-mask": Method("zsp-tiny", settings=_MASK),
-    "effnet-mask": Method("effnet-lite0", settings=_MASK),
+    **_by_number_of_views("ours", Method(), (1, 3, 5, 10, 20)),
+    **_by_number_of_views("ours-bv", Method(answer="best view"), (1, 3, 5, 10, 20)),
     # Beyond the paper.
-    "ours-adaptive": Method(settings={"adaptive_threshold": True}),
-    **_verified_rows(),
-    **_damaged_rows(),
+    "verified": Method(settings=_VERIFIED),
+    "verified-mask": Method(settings=_VERIFIED | _MASK),
+    **_by_number_of_views("verified", Method(settings=_VERIFIED), (1, 3, 5, 10)),
+    **_by_number_of_views("verified-mask", Method(settings=_VERIFIED | _MASK), (1, 3, 5, 10)),
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "default": ("ours", "ours-bv", "rootsift"),
-    "table1": ("icp", "sift", "swav-tiny", "icp-bv", "posecontrast-tiny", "ours-k30", "ours"),
+    "table1": ("icp", "sift", "icp-bv", "ours-k30", "ours"),
     "table2": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5)),
     "table3": ("ours-cyclicaliou", "ours-globalsim", "ours-saliencyiou", "ours"),
     "views": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5, 10, 20)),
@@ -145,14 +103,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
-    "photographs": ("tiny", "ours", "effnet-mask", "tiny-mask", "ours-mask"),
     "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
-    "verified-ablations": ("ours", "verified", *(f"verified-{name}" for name in (
-        "mask", "n1", "nosilhouette", "nofreespace", "noview", "simonly", "forward", "nofeatures", "noicp",
-        "norefinement",
-    ))),
-    "robustness": tuple(f"{row}{damage}" for damage in ("", "-mask", "-clean", *(f"-{name}" for name in DAMAGES))
-                        for row in ("ours", "verified")),
 }  # fmt: skip
 
 
@@ -161,11 +112,12 @@ def _union(*names: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
-# All ablations of the paper at one number of views; all its tables, with small networks instead of the large ones.
+# All ablations of the paper at one number of views, and all its tables. "swav" and "posecontrast" are in no group: they
+# need checkpoints that have to be downloaded.
 GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
 GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
-# The paper's tables and the rows beyond the paper, on data that are not corrupted.
-GROUPS["all"] = _union("paper", "verified-views", "oracle-view", "ours-adaptive", "photographs")
+# The paper's tables and the rows beyond the paper.
+GROUPS["all"] = _union("paper", "verified-views", "oracle-view")
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
@@ -188,17 +140,15 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
     return {str(name): _method(str(name), meant) for name, meant in methods.items()}
 
 
-def fingerprint(method: Method) -> str:
-    """Return a hash of all that determines a row's results: its settings, functions and objects.
+def description(method: Method) -> str:
+    """Describe a row as text: its extractor, answer, settings, number of views, and its function as "module:name".
 
-    The code of the library is not part of it (see `provenance.library_version`).
-
-    Two rows with the same name and different fingerprints must not be stored in one run.
+    Rows with the same name and different descriptions must not be stored in one run.
     """
-    if method.solve is not None or any(callable(value) for value in method.settings.values()):
-        return digest_of((method.features, method.answer, method.settings, method.targets, method.solve))
-    text = f"{method.features} {method.answer} {sorted(method.settings.items(), key=str)!r} {method.targets}"
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    settings = ", ".join(f"{name}={described(value)}" for name, value in sorted(method.settings.items()))
+    parts = [method.features, method.answer, settings, f"{method.targets} views" if method.targets else ""]
+    parts.append("" if method.solve is None else described(method.solve))
+    return "; ".join(part for part in parts if part)
 
 
 def _method(name: str, meant: Any) -> Method:
@@ -247,6 +197,9 @@ class _Estimator:
     """Adapter of a user-defined object with `estimate(reference, targets)`, which gets the whole frames."""
 
     estimator: Any
+
+    def __repr__(self) -> str:
+        return f"estimate of {described(self.estimator)}"
 
     def __call__(self, problem: Any) -> Any:
         reference, *targets = problem.full_frames()

@@ -9,7 +9,7 @@ from typing import Any
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.database import RunFolder, check_settings, finished_results
+from zsp_lite.benchmark.database import RunFolder
 from zsp_lite.benchmark.execution import (
     CHUNK_SIZE,
     MOST_WORKERS,
@@ -19,14 +19,11 @@ from zsp_lite.benchmark.execution import (
     make_chunks,
     open_workers,
 )
-from zsp_lite.benchmark.extractors import Extractor, fingerprint, make_extractors
-from zsp_lite.benchmark.identity import digest_of
-from zsp_lite.benchmark.methods import GROUPS, Method, resolve
-from zsp_lite.benchmark.methods import fingerprint as method_fingerprint
-from zsp_lite.benchmark.plan import Plan, make_plan
+from zsp_lite.benchmark.extractors import Extractor, make_extractors
+from zsp_lite.benchmark.identity import array_digest, fingerprint
+from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
 from zsp_lite.benchmark.provenance import environment, library_version
 from zsp_lite.benchmark.results import results_of
-from zsp_lite.benchmark.robustness import Damaged
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
@@ -125,29 +122,6 @@ def evaluate(
     return summary
 
 
-def plan_run(
-    root: str | Path,
-    backbone: Backbone | Extractor | str | BackboneConfig,
-    methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
-    pairs: int = 100,
-    targets: int = 5,
-    seed: int = 0,
-    out: str | Path = "outputs/benchmark",
-    categories: Sequence[str] | None = None,
-    allow_other_version: bool = False,
-) -> Plan:
-    """Estimate the remaining cost of `evaluate` with these arguments. Writes nothing; raises the same errors."""
-    rows = resolve(methods)
-    row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
-    backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-    extractors = make_extractors(backbone, [row.features for row in rows.values()])
-    settings = _settings(root, backbone, extractors, rows, row_pairs, pairs, targets, seed)
-    _check_rows(rows, extractors)
-    check_settings(out, settings, allow_other_version)
-    todo = _unfinished(rows_of_pairs(row_pairs), finished_results(out))
-    return make_plan(root, todo, rows, extractors)
-
-
 def pairs_of_rows(
     root: str | Path,
     rows: Mapping[str, Method],
@@ -200,10 +174,9 @@ def rows_of_pairs(row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, dict[Pai
 def _check_rows(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> None:
     """Raise InputError for settings with which `ZeroShotPose` would refuse every pair of a row."""
     for name, row in rows.items():
-        if row.solve is None or isinstance(row.solve, Damaged):
-            settings = row.settings if row.solve is None else row.solve.settings
+        if row.solve is None:
             try:
-                ZeroShotPose(extractors[row.features], **settings)
+                ZeroShotPose(extractors[row.features], **row.settings)
             except InputError as error:
                 raise InputError(f"method {name}: {error}") from error
 
@@ -234,12 +207,11 @@ def _settings(
     for pair in (pair for found in row_pairs.values() for pair in found):
         used.setdefault(pair.category, set()).update((pair.reference_sequence, pair.target_sequence))
     labels = {
-        f"{category}/{name}": digest_of((label.trans, label.reference_seq))
+        f"{category}/{name}": array_digest(label.trans, label.reference_seq)
         for category, names in used.items() for name, label in read_labels(root, category).items() if name in names
     }  # fmt: skip
     methods = {
-        name: method_fingerprint(row)
-        + ("" if row.features == "backbone" else f" {fingerprint(extractors[row.features])}")
+        name: description(row) + ("" if row.features == "backbone" else f"; {fingerprint(extractors[row.features])}")
         for name, row in rows.items()
     }
     return {

@@ -1,4 +1,4 @@
-"""The commands of the benchmark: `benchmark`, `tables`, `compare`, `profile`."""
+"""The commands of the benchmark: `benchmark`, `tables`, `compare`."""
 
 import logging
 from pathlib import Path
@@ -25,7 +25,7 @@ _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
         "benchmark",
         "benchmark --data outputs/eval --pairs 30 --methods ours,rootsift --out outputs/compared",
         "benchmark --data outputs/eval --layer last --facet token --out outputs/tokens",
-        "benchmark --data outputs/paper --methods paper --pairs 100 --workers 2 --plan",
+        "benchmark --data outputs/paper --methods paper --pairs 100 --workers 2",
         "benchmark --list",
     )
 )
@@ -64,12 +64,11 @@ _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 @click.option(
     "--allow-other-version", is_flag=True, help="Continue a run of another version of zsp-lite; run.json lists both."
 )
-@click.option("--plan", is_flag=True, help="Print the expected time, memory and disk space, and exit.")
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data: Path | None, categories: list[str] | None, pairs: int, targets: int, methods: list[str], list_only: bool,
     seed: int, out: Path, workers: int, executor: str | None, threads: int | None, cache: Path | None,
-    keep_hypotheses: bool, allow_other_version: bool, plan: bool, quiet: bool, **backbone,
+    keep_hypotheses: bool, allow_other_version: bool, quiet: bool, **backbone,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -81,7 +80,7 @@ def benchmark(
     from tqdm import tqdm
 
     from zsp_lite.benchmark.reports import write_reports
-    from zsp_lite.benchmark.run import evaluate, plan_run
+    from zsp_lite.benchmark.run import evaluate
     from zsp_lite.benchmark.tables import all_rows, best_two_tables, by_category, paper_tables
     from zsp_lite.cli.terminal import print_tables
     from zsp_lite.data.samples import data_folders, sample_data
@@ -89,10 +88,6 @@ def benchmark(
     origin, root = data_folders(data)[0]
     root = sample_data() if origin == "data_samples" else root
     config = backbone_config(**backbone)
-    if plan:
-        planned = plan_run(root, config, methods, pairs, targets, seed, out, categories, allow_other_version)
-        print("\n".join(planned.lines(workers)))
-        return None
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
     # `delay` keeps the terminal empty where the input is refused; `disable=None` hides the bar outside a terminal.
@@ -227,13 +222,3 @@ def compare(first: Path, second: Path, rows: list[str] | None, out: Path | None)
     print_tables([table])
     if out:
         write_tables([table], out)
-
-
-@click.command(epilog=examples("profile", "profile --repeats 2"))
-@click.option("--repeats", type=click.IntRange(1, 1000), metavar="N", default=5, help="Runs behind each median.")
-def profile(repeats: int) -> None:
-    """Measure time and memory of every stage, and of the plain loops that it replaces."""
-    from zsp_lite.cli.profile import measure_all
-
-    for measurement in measure_all(repeats):
-        print(measurement, flush=True)

@@ -91,10 +91,9 @@ def backbone_options(command: Command) -> Command:
     """Add --backbone, --layer, --facet and --image-size to a command; `backbone_config` takes their values."""
     options = (
         click.option(
-            "--backbone", metavar="NAME", default="zsp-tiny-photo",
-            help="zsp-tiny-photo, zsp-tiny, dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, effnet-lite0, a "
-            "checkpoint file, or hf:NAME for a vision transformer from the Hugging Face hub or a local folder in its "
-            "format; or several side by side, each with an optional weight, such as zsp-tiny+0.5*effnet-lite0.",
+            "--backbone", metavar="NAME", default="zsp-tiny",
+            help="zsp-tiny, dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, a checkpoint file, or hf:NAME for a "
+            "vision transformer from the Hugging Face hub or a local folder in its format.",
         ),
         click.option(
             "--layer", metavar="L", show_default="the backbone's own",
