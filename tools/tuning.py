@@ -37,6 +37,7 @@ from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, different_poses, modes, reliability
 from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 from zsp_lite.views import View, usable_targets
@@ -111,7 +112,7 @@ def collect_outcomes(
     for n_targets in view_numbers:
         found = []
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-            method = ZeroShotPose(backbone, solver="verified", seed=pair.seed)
+            method = ZeroShotPose(backbone, solver=VerifiedSolver(), seed=pair.seed)
             frames = [
                 (pair.reference_sequence, pair.reference_frame),
                 *((pair.target_sequence, number) for number in pair.target_frames),

@@ -43,8 +43,8 @@ class ZeroShotPose:
             for scenes in other units (supplement, "RANSAC parameters").
         sample_size: Points per RANSAC trial.
         saliency_threshold: A patch is foreground if its saliency is above this. The default is the published code's.
-        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency,
-            such as convolutional networks, need "mask".
+        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency
+            need "mask".
         cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the cycle step of the
             published code (see `matching.match`; docs/published_code.md lists all its differences).
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
@@ -100,10 +100,7 @@ class ZeroShotPose:
             check_integer(name, getattr(self, name), minimum)
         if self.foreground == "saliency" and not has_saliency(self.backbone):
             name = getattr(self.backbone, "name", type(self.backbone).__name__)
-            raise InputError(
-                f"foreground is 'saliency', which {name} does not have; expected 'mask' (rows such as ours-mask), or a "
-                "combination such as zsp-tiny+effnet-lite0"
-            )
+            raise InputError(f"foreground is 'saliency', which {name} does not have; expected 'mask'")
         check_number("threshold", self.threshold, above=0)
         check_number("saliency_threshold", self.saliency_threshold)
 
