@@ -90,21 +90,3 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
-
-
-@pytest.fixture(scope="session")
-def render_folder(tmp_path_factory):
-    """A folder with the renders of four training objects, one per file."""
-    from zsp_lite.training.renders import render_set
-
-    folder = tmp_path_factory.mktemp("renders")
-    render_set(folder, 4, shard=1)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def renders(render_folder):
-    """The renders of four training objects."""
-    from zsp_lite.training.renders import load_render_set, render_set
-
-    return load_render_set(render_set(render_folder, 4, shard=1))

@@ -1,1 +1,1 @@
-"""Training the embedded backbone on renders of the training categories."""
+"""Training of small transformers from random weights on rendered objects, as notebook 09 shows it."""

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
-# Normalisation of RGB values in [0, 1] during training. `export_checkpoint` replaces it by ImageNet's in the patch
-# embedding, and `starting_weights` reverses that.
-MEAN, STD = 0.45, 0.25
+MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class Batch:
     """Crops of several objects, the views of an object one after the other; n patches per crop, row by row.
 
     Attributes:
-        images: Normalised RGB images; `detail` times the side of the crops that the transformer sees.
+        images: Normalised RGB images.
         surface: Object coordinates at the centre of each patch, NaN on the background.
         geometry: Normal in the camera frame, and depth standardised over the object, at the centre of each patch.
         coverage: Fraction of each patch that the object covers.
@@ -34,23 +32,11 @@ class Batch:
     coverage: Float[Tensor, "crops n"]
     objects: int
 
-    def to(self, device: torch.device) -> "Batch":
-        """Copy the tensors to a device."""
-        tensors = (self.images, self.surface, self.geometry, self.coverage)
-        return Batch(*(tensor.to(device) for tensor in tensors), self.objects)
-
 
 def crop_grids(
     rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
 ) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
-    """Draw random, slightly rotated crops; all crops of an object are mirrored, or none.
-
-    Args:
-        rng: Random generator.
-        n: Number of crops.
-        per_object: Consecutive crops that belong to one object.
-        side: Side of the crops in pixels.
-        scale: Smallest and largest width of a crop as a fraction of the image's.
+    """Draw random, slightly rotated crops; each group of `per_object` crops is mirrored as a whole, or not at all.
 
     Returns:
         Sampling grids for `grid_sample`, and the matrices that map directions in the image to directions in the crop.
@@ -89,49 +75,6 @@ def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Ten
     return ((x - MEAN) / STD).contiguous()
 
 
-def on_photographs(
-    rng: np.random.Generator,
-    rgb: Float[Tensor, "n 3 size size"],
-    mask: Float[Tensor, "n 1 size size"],
-    backgrounds: UInt8[np.ndarray, "m height width 3"],
-    views: int,
-) -> Float[Tensor, "n 3 size size"]:
-    """Put half of the objects in front of random parts of photographs, half of these beside another object.
-
-    Args:
-        rng: Random generator.
-        rgb: Views in [0, 1].
-        mask: Pixels of the objects.
-        backgrounds: Photographs.
-        views: Consecutive views of one object.
-    """
-    chosen = np.flatnonzero(rng.random(len(rgb)) < 0.5)
-    if not len(chosen):
-        return rgb
-    n, size = len(chosen), rgb.shape[-1]
-
-    def affine(scale: np.ndarray, aspect: float, x: np.ndarray, y: np.ndarray) -> Tensor:
-        flip, zero = rng.choice([-1.0, 1.0], n), np.zeros(n)
-        rows = [np.stack([scale * aspect * flip, zero, x], 1), np.stack([zero, scale, y], 1)]
-        theta = torch.from_numpy(np.stack(rows, 1).astype(np.float32))
-        return F.affine_grid(theta, (n, 1, size, size), align_corners=False)
-
-    photos = torch.from_numpy(backgrounds[rng.integers(len(backgrounds), size=n)]).permute(0, 3, 1, 2).float() / 255
-    aspect = backgrounds.shape[1] / backgrounds.shape[2]
-    scale = rng.uniform(0.4, 1, n)
-    x, y = rng.uniform(-1, 1, n) * (1 - scale * aspect), rng.uniform(-1, 1, n) * (1 - scale)
-    behind = F.grid_sample(photos, affine(scale, aspect, x, y), align_corners=False)
-    # Another object at the side: the view of the next object in the batch, shifted by about its width.
-    other, angle = torch.from_numpy((chosen + views) % len(rgb)), rng.uniform(0, 2 * np.pi, n)
-    far = rng.uniform(1.0, 1.7, n) + 2.0 * (rng.random(n) < 0.5)  # half of them are shifted out of the image
-    where = affine(rng.uniform(0.8, 1.5, n), 1.0, far * np.cos(angle), far * np.sin(angle))
-    beside, share = (F.grid_sample(maps[other], where, align_corners=False) for maps in (rgb, mask))
-    behind = behind + share * (beside - behind)
-    soft = F.avg_pool2d(F.pad(mask[chosen], (1, 1, 1, 1), mode="replicate"), 3, 1)
-    rgb[chosen] = behind + soft * (rgb[chosen] - behind)
-    return rgb
-
-
 def sample_batch(
     renders: RenderSet,
     rng: np.random.Generator,
@@ -140,8 +83,6 @@ def sample_batch(
     side: int,
     scale: tuple[float, float],
     members: np.ndarray | None = None,
-    detail: int = 1,
-    backgrounds: UInt8[np.ndarray, "m height width 3"] | None = None,
 ) -> Batch:
     """Draw a batch of random crops.
 
@@ -153,8 +94,6 @@ def sample_batch(
         side: Side of the crops in pixels.
         scale: Smallest and largest width of a crop as a fraction of the image's.
         members: Indices of the objects. Default: random.
-        detail: Number of pixels of the images per pixel of the crops along each side.
-        backgrounds: Photographs that replace the room in half of the views. Default: every view shows its room.
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
@@ -162,13 +101,10 @@ def sample_batch(
         chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
     pick = (index[:, None], chosen)
     rgb = torch.from_numpy(renders.rgb[pick].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2).float() / 255
-    if backgrounds is not None:
-        mask = torch.from_numpy(renders.mask[pick].reshape(-1, 1, SIZE, SIZE)).float()
-        rgb = on_photographs(rng, rgb, mask, backgrounds, views)
     maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
             for m in (renders.surface, renders.geometry)]  # fmt: skip
     n, patches = objects * views, side // PATCH_SIZE
-    grid, turn = crop_grids(rng, n, views, detail * side, scale)
+    grid, turn = crop_grids(rng, n, views, side, scale)
     images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
 
     def at(resolution):

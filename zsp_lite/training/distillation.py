@@ -9,10 +9,8 @@ teacher's logits prevents the first and favours the second; sharpening, a low te
 """
 
 import copy
-import logging
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,18 +18,16 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from zsp_lite.backbones.precision import autocast, choose_precision
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.errors import InputError
 from zsp_lite.training.batches import crop_grids, recolour
-from zsp_lite.training.export import export_checkpoint
-from zsp_lite.training.loop import Task, claim_folder, cosine, run
-from zsp_lite.training.recipe import TrainingConfig
-from zsp_lite.training.renders import training_and_held_out
-from zsp_lite.training.train import held_out_accuracy
-from zsp_lite.training.trainee import Trainee, as_trainee, initialise
 
-logger = logging.getLogger(__name__)
+GLOBAL_SCALE, LOCAL_SCALE = (0.6, 1.0), (0.25, 0.6)  # widths of the crops as a fraction of the image's
+HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers
+STUDENT_TEMPERATURE = 0.1
+CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
+TEACHER_MOMENTUM = 0.99, 1.0  # decay of the teacher's average at the first and the last step
+WEIGHT_DECAY = 0.04, 0.4  # AdamW's, at the first and the last step
+MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 
 @dataclass(frozen=True)
@@ -44,19 +40,11 @@ class DistillationConfig:
         images: Images per step.
         local_crops: Local crops per image, in addition to two global ones.
         global_side, local_side: Sides of the crops in pixels.
-        global_scale, local_scale: Smallest and largest width of the crops as a fraction of the image's.
         outputs: Number K of outputs. DINO has 65,536.
-        hidden, bottleneck: Widths of the head's layers.
-        student_temperature, teacher_temperature: Temperatures of the softmax.
-        centre_momentum: Decay per step of the average of the teacher's logits.
-        teacher_momentum: Decay of the teacher's average at the first and the last step.
+        teacher_temperature: Temperature of the teacher's softmax.
         learning_rate: Largest learning rate.
-        weight_decay: AdamW's, at the first and the last step.
         centring: If false, the centre stays 0.
         sharpening: If false, the teacher has the student's temperature.
-
-    Raises:
-        InputError: For counts below 1 (local crops: below 0) and temperatures that are not positive.
     """
 
     seed: int = 0
@@ -65,36 +53,11 @@ class DistillationConfig:
     local_crops: int = 4
     global_side: int = 96
     local_side: int = 48
-    global_scale: tuple[float, float] = (0.6, 1.0)
-    local_scale: tuple[float, float] = (0.25, 0.6)
     outputs: int = 512
-    hidden: int = 256
-    bottleneck: int = 64
-    student_temperature: float = 0.1
     teacher_temperature: float = 0.04
-    centre_momentum: float = 0.9
-    teacher_momentum: tuple[float, float] = (0.99, 1.0)
     learning_rate: float = 1e-3
-    weight_decay: tuple[float, float] = (0.04, 0.4)
     centring: bool = True
     sharpening: bool = True
-
-    def __post_init__(self):
-        counts = ("steps", "images", "global_side", "local_side", "outputs", "hidden", "bottleneck")
-        for name in counts:
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.local_crops < 0:
-            raise InputError(f"local_crops: expected at least 0, got {self.local_crops}")
-        for name in ("student_temperature", "teacher_temperature"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-
-
-# Closer to DINO's own settings; takes hours on a CPU.
-LONG_RUN = DistillationConfig(
-    steps=7000, images=32, outputs=4096, hidden=1024, bottleneck=256, teacher_momentum=(0.996, 1.0), learning_rate=5e-4
-)  # fmt: skip
 
 
 class Head(nn.Module):
@@ -103,11 +66,11 @@ class Head(nn.Module):
     This is DINO's weight-normalised last layer with a fixed gain of 1, so that all logits are in [-1, 1].
     """
 
-    def __init__(self, dim: int, hidden: int, bottleneck: int, outputs: int):
+    def __init__(self, dim: int, outputs: int):
         super().__init__()
-        first, middle, last = nn.Linear(dim, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, bottleneck)
+        first, middle, last = nn.Linear(dim, HIDDEN), nn.Linear(HIDDEN, HIDDEN), nn.Linear(HIDDEN, BOTTLENECK)
         self.mlp = nn.Sequential(first, nn.GELU(), middle, nn.GELU(), last)
-        self.directions = nn.Parameter(torch.randn(outputs, bottleneck))
+        self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
         for module in (first, middle, last):
             nn.init.trunc_normal_(module.weight, std=0.02)
             nn.init.zeros_(module.bias)
@@ -117,15 +80,15 @@ class Head(nn.Module):
 
 
 class Network(nn.Module):
-    """Backbone and head. Only the backbone is exported."""
+    """Backbone and head."""
 
-    def __init__(self, backbone: VisionTransformer, config: DistillationConfig):
+    def __init__(self, backbone: VisionTransformer, outputs: int):
         super().__init__()
         self.backbone = backbone
-        self.head = Head(backbone.embed_dim, config.hidden, config.bottleneck, config.outputs)
+        self.head = Head(backbone.embed_dim, outputs)
 
-    def forward(self, images: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch outputs"]:
-        return self.head(self.backbone.extract(images, 0).cls)
+    def forward(self, images: Float[Tensor, "crops batch 3 side side"]) -> Float[Tensor, "crops batch outputs"]:
+        return self.head(self.backbone(images.flatten(0, 1))[:, 0]).unflatten(0, images.shape[:2])
 
 
 def multi_crop(
@@ -139,10 +102,10 @@ def multi_crop(
         cut = F.grid_sample(rgb.repeat(count, 1, 1, 1), grid, padding_mode="reflection", align_corners=False)
         return recolour(rng, cut).unflatten(0, (count, len(rgb)))
 
-    large = crops(2, config.global_side, config.global_scale)
+    large = crops(2, config.global_side, GLOBAL_SCALE)
     if config.local_crops == 0:
         return large, large.new_empty(0, len(rgb), 3, config.local_side, config.local_side)
-    return large, crops(config.local_crops, config.local_side, config.local_scale)
+    return large, crops(config.local_crops, config.local_side, LOCAL_SCALE)
 
 
 def distillation_loss(
@@ -178,112 +141,63 @@ def distillation_loss(
     return loss, dict(loss=loss.item(), teacher_entropy=entropy, kl=loss.item() - entropy, information=information)
 
 
-class Distillation(Task):
+class Distillation:
     """A run of DINO; the teacher's backbone is its result.
 
     Args:
         config: Configuration.
         backbone: Initial backbone; it is copied.
         rgb: Images, several views of each of n objects.
-        measure: Computes figures of the teacher's backbone for the log.
     """
 
-    max_gradient_norm = 3.0
-
     def __init__(
-        self,
-        config: DistillationConfig,
-        backbone: VisionTransformer,
-        rgb: UInt8[np.ndarray, "n views size size 3"],
-        measure: Callable[[VisionTransformer], dict[str, float]] = lambda backbone: {},
+        self, config: DistillationConfig, backbone: VisionTransformer, rgb: UInt8[np.ndarray, "n views size size 3"]
     ):
-        super().__init__()
         torch.manual_seed(config.seed)
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.precision = choose_precision(device.type)
-        self.config, self.rgb, self.measure, self.steps = config, rgb, measure, config.steps
-        self.student = Network(copy.deepcopy(backbone), config).to(device).requires_grad_(True)
+        self.config, self.rgb, self.steps_done = config, rgb, 0
+        self.student = Network(copy.deepcopy(backbone), config.outputs).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
-        self.register_buffer("centre", torch.zeros(config.outputs, device=device))
+        self.centre = torch.zeros(config.outputs)
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
         vectors = [p for p in self.student.parameters() if p.ndim <= 1]  # biases and norms: no weight decay
         groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
 
-    def schedule(self, step: int) -> dict[str, float]:
-        progress = step / self.steps
-        self.set_learning_rate(self.config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress))
-        self.optimizer.param_groups[0]["weight_decay"] = cosine(self.config.weight_decay, progress)
+    def step(self) -> dict[str, float]:
+        """Take one step and return its figures (see `distillation_loss`)."""
+        progress = self.steps_done / self.config.steps
+        rate = self.config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.param_groups[0]["weight_decay"] = cosine(WEIGHT_DECAY, progress)
         self.student.head.directions.requires_grad_(progress >= 0.05)  # DINO fixes the last layer in the first epoch
-        return {}
-
-    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
-        config, device = self.config, self.centre.device
-        rng = np.random.default_rng([config.seed, 3, step])
-        objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
-        large, small = (crops.to(device) for crops in multi_crop(self.rgb[objects, views], rng, config))
-        with autocast(device.type, self.precision):
-            with torch.no_grad():
-                teacher = self.teacher(large.flatten(0, 1)).unflatten(0, large.shape[:2]).float()
-            student = [self.student(crops.flatten(0, 1)).unflatten(0, crops.shape[:2]).float()
-                       for crops in (large, small) if len(crops)]  # fmt: skip
-        self.teacher_mean = teacher.mean((0, 1))
-        sharp = config.teacher_temperature if config.sharpening else config.student_temperature
-        return distillation_loss(torch.cat(student), teacher, self.centre, config.student_temperature, sharp)
-
-    @torch.no_grad()
-    def after_step(self, step: int) -> None:
-        momentum = cosine(self.config.teacher_momentum, step / self.steps)
-        for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
-            slow.lerp_(fast, 1 - momentum)
+        loss, figures, centre = self._loss()
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.student.parameters(), MAX_GRADIENT_NORM)
+        self.optimizer.step()
+        with torch.no_grad():
+            for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
+                slow.lerp_(fast, 1 - cosine(TEACHER_MOMENTUM, progress))
         if self.config.centring:
-            self.centre.lerp_(self.teacher_mean, 1 - self.config.centre_momentum)  # eq. 4
+            self.centre.lerp_(centre, 1 - CENTRE_MOMENTUM)  # eq. 4
+        self.steps_done += 1
+        return figures
 
-    def evaluate(self) -> dict[str, float]:
-        return self.measure(self.teacher.backbone)
+    def _loss(self) -> tuple[Tensor, dict[str, float], Tensor]:
+        """Compute the loss of a batch, its figures, and the mean of the teacher's logits."""
+        config = self.config
+        rng = np.random.default_rng([config.seed, 3, self.steps_done])
+        objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
+        large, small = multi_crop(self.rgb[objects, views], rng, config)
+        with torch.no_grad():
+            teacher = self.teacher(large)
+        student = torch.cat([self.student(crops) for crops in (large, small) if len(crops)])
+        sharp = config.teacher_temperature if config.sharpening else STUDENT_TEMPERATURE
+        loss, figures = distillation_loss(student, teacher, self.centre, STUDENT_TEMPERATURE, sharp)
+        return loss, figures, teacher.mean((0, 1))
 
 
-def distil(
-    config: DistillationConfig,
-    shape: TrainingConfig,
-    folder: Path,
-    renders: Path | None = None,
-    log: Callable[[str], None] = logger.info,
-    log_every: int = 50,
-    checkpoint_every: int = 250,
-) -> Path:
-    """Train a backbone by DINO or resume its training, and export `folder`/dino-tiny.safetensors.
-
-    Args:
-        config: Configuration of the run.
-        shape: Size of the backbone, the block that is evaluated, and the training objects; its other fields are not
-            used.
-        folder: Receives config.json, log.jsonl and checkpoint.pt (see `loop.run`) and the exported weights. A run in it
-            is resumed.
-        renders: Folder in which the renders are made or found. Default: `folder`/renders.
-        log: Called with each line of the log as readable text.
-        log_every: Steps between lines of the log; every tenth line has the figures of `held_out_accuracy`.
-        checkpoint_every: Steps between checkpoints.
-
-    Returns:
-        Path of the exported weights.
-
-    Raises:
-        InputError: If `folder` has a run with another configuration or a damaged checkpoint.
-    """
-    folder = Path(folder)
-    network = {name: getattr(shape, name) for name in ("embed_dim", "depth", "num_heads", "layer")}
-    rendered = {"proportions": shape.proportions, "deformation": shape.deformation}
-    objects = {"objects": shape.objects, "objects_seed": shape.seed}
-    claim_folder(folder, asdict(config) | objects | rendered | {"network": network})
-    training, held_out = training_and_held_out(renders or folder / "renders", shape.objects, shape.seed, **rendered)
-    start = Trainee(shape)
-    initialise(start, training, shape.seed)
-
-    def measure(backbone: VisionTransformer) -> dict[str, float]:
-        return held_out_accuracy(as_trainee(backbone, shape, training), held_out)
-
-    task = Distillation(config, start.backbone, training.rgb, measure)
-    run(task, folder, log, log_every, 10 * log_every, checkpoint_every)
-    trainee = as_trainee(task.teacher.backbone.cpu(), shape, training)
-    return export_checkpoint(trainee, held_out, shape, folder / "dino-tiny.safetensors")
+def cosine(ends: tuple[float, float], progress: float) -> float:
+    """Interpolate from ends[0] to ends[1] along half a cosine, for progress from 0 to 1."""
+    return ends[1] + (ends[0] - ends[1]) * 0.5 * (1 + math.cos(math.pi * progress))

@@ -1,7 +1,7 @@
-"""Training losses: correspondence, choice of the view, geometry per patch, and attention on the object.
+"""Training losses: correspondence, geometry per patch, and attention on the object.
 
-The losses use ground truth of the renderer for the views of one object: corresponding surface points and views from the
-same side. The object's proportions differ from view to view. No loss compares two objects or uses category names.
+The losses use ground truth of the renderer for the views of one object. The object's proportions differ from view to
+view. No loss compares two objects or uses category names.
 """
 
 import torch
@@ -9,7 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from zsp_lite.features import log_bin
+from zsp_lite.training.batches import Batch
+from zsp_lite.training.trainee import Trainee
+
+RADIUS = 0.15  # standard deviation of the correspondence targets, in object units
+TEMPERATURE = 0.1  # of the correspondence loss
+QUERIES = 256  # largest number of query patches per object
 
 
 def correspondence_loss(
@@ -55,64 +60,11 @@ def correspondence_loss(
         target = target * (target > 0.05)
         target = target / target.sum(1, keepdim=True)
         logits = (z[k, query] @ z[k].T / temperature).masked_fill(same_view[seen_again], -1e4)
-        divergence = F.kl_div(logits.log_softmax(1), target, reduction="batchmean")
-        losses.append(divergence)
+        losses.append(F.kl_div(logits.log_softmax(1), target, reduction="batchmean"))
         hits.append((target.gather(1, logits.argmax(1, keepdim=True)) > 0).float().mean())
     if not losses:
         return descriptors.sum() * 0, 0.0
     return torch.stack(losses).mean(), torch.stack(hits).mean().item()
-
-
-def view_loss(
-    keys: Float[Tensor, "crops h w dim"], on_object: Bool[Tensor, "crops n"], objects: int, temperature: float,
-    queries: int, generator: torch.Generator, log_binned: bool = True,
-) -> tuple[Tensor, float]:  # fmt: skip
-    """Compute the cross-entropy of selecting, among the views of the other instance, the one from the same side.
-
-    Views 2k and 2k + 1 show the same side, of two instances of the object: the even views are compared with the odd
-    ones. Views of the opposite side are among the negatives. The score of two views
-    is a differentiable form of the best-view score: the mean over patches of one view of their highest similarity in
-    the other view, made symmetric.
-
-    Args:
-        keys: Keys, ordered by object and view.
-        on_object: Patches on the object.
-        objects: Number of objects.
-        temperature: Temperature of the softmax over scores.
-        queries: Largest number of patches per view.
-        generator: Source of the random patches.
-        log_binned: Compare log-binned descriptors; False compares the keys.
-
-    Returns:
-        The loss, and the fraction of views whose partner has the highest score.
-    """
-    crops = len(keys)
-    views = crops // objects
-    partner = torch.arange(views, device=keys.device) ^ 1
-    scores = []
-    for k in range(objects):
-        part = slice(k * views, (k + 1) * views)
-        on = on_object[part]
-        described = log_bin(keys[part]) if log_binned else keys[part]
-        z = F.normalize(described.flatten(1, 2)[on], dim=1)
-        counts = on.sum(1).tolist()
-        chosen = [torch.randperm(n, generator=generator)[:queries] for n in counts]
-        starts = [sum(counts[:v]) for v in range(views)]
-        query = torch.cat([rows + start for rows, start in zip(chosen, starts, strict=True)]).to(z.device)
-        similar = (z[query] @ z.T).split(counts, 1)
-        highest = torch.stack([s.amax(1) if s.shape[1] else s.new_full(s.shape[:1], -1.0) for s in similar], 1)
-        taken = highest.split([len(rows) for rows in chosen])
-        score = torch.stack([rows.mean(0) if len(rows) else rows.new_full((views,), -1.0) for rows in taken])
-        scores.append((score + score.T) / 2)
-    seen = on_object.view(objects, views, -1).sum(2) > 3
-    parity = torch.arange(views, device=keys.device) % 2
-    excluded = (parity[:, None] == parity) | ~seen[:, None]
-    valid = seen & seen[:, partner]
-    if not valid.any():
-        return keys.sum() * 0, 0.0
-    logits = (torch.stack(scores) / temperature).masked_fill(excluded, -1e4)[valid]
-    labels = partner.expand(objects, -1)[valid]
-    return F.cross_entropy(logits, labels), (logits.argmax(1) == labels).float().mean().item()
 
 
 def geometry_loss(
@@ -134,10 +86,6 @@ def attention_loss(
     the attention over patches, plus a cross-entropy that separates object and background at 0.12 times the mean
     attention on the object.
 
-    Args:
-        cls_logits: Attention logits of the CLS token, CLS first.
-        coverage: Fraction of each patch that the object covers.
-
     Returns:
         The loss, and the mean IoU of the mask with the patches of min-max normalised attention above 0.05.
     """
@@ -156,3 +104,33 @@ def attention_loss(
         found, truth = (attention - low) / (high - low + 1e-12) > 0.05, coverage > 0.25
         iou = ((found & truth).sum(1) / (found | truth).sum(1).clamp_min(1)).mean().item()
     return spread + 0.25 * side, iou
+
+
+def losses(
+    model: Trainee, batch: Batch, generator: torch.Generator, helpers: float = 0.4
+) -> tuple[Tensor, dict[str, float]]:
+    """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one batch.
+
+    Args:
+        model: Network to train; its running mean of the keys is updated.
+        batch: Crops with their geometry.
+        generator: Draws the queries of the correspondence loss.
+        helpers: Weight of the geometry and attention losses.
+
+    Returns:
+        The sum, and the value of each loss with the match accuracy ("accuracy") and the IoU of the saliency ("iou").
+    """
+    out = model(batch.images)
+    on_object = ~batch.surface[..., 0].isnan()
+    geometry = 0.5 * sum(
+        geometry_loss(head(features), batch.geometry, on_object)
+        for head, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input))
+    )
+    attention, iou = attention_loss(out.cls_logits, batch.coverage)
+    descriptors = F.normalize(model.centred(out.keys, update_mean=True), dim=-1)
+    match, accuracy = correspondence_loss(
+        descriptors, batch.surface, batch.objects, RADIUS, TEMPERATURE, QUERIES, generator
+    )
+    total = match + helpers * (geometry + attention)
+    figures = {"loss": total, "match": match, "geometry": geometry, "attention": attention}
+    return total, {name: value.item() for name, value in figures.items()} | {"accuracy": accuracy, "iou": iou}

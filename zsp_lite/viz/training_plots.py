@@ -1,4 +1,4 @@
-"""Plots of trainings: pictures with the renderer's knowledge, distributions of answers, curves, and shipped logs.
+"""Plots of trainings: pictures with the renderer's knowledge, distributions of answers, and curves.
 
 Functions whose names begin with `show_` return whole figures.
 """
@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
-from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION, overlay_map, show_images
 
 _STYLES = ((BLUE, "-", "o"), (VERMILLION, "--", "s"), (ORANGE, ":", "^"), (GREEN, "-.", "D"), ("0.3", "-", "v"))
@@ -59,13 +58,7 @@ def show_answers(cases: Mapping[str, Float[np.ndarray, "pictures outputs"]]) -> 
 
 
 def smoothed(values: Sequence[float], window: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the running mean over `window` values (odd), and the steps, counted from 1, at its middles.
-
-    Raises:
-        InputError: Fewer values than the window.
-    """
-    if len(values) < window:
-        raise InputError(f"{len(values)} values, expected at least the window of {window}")
+    """Return the running mean over `window` values (odd), and the steps, counted from 1, at its middles."""
     means = np.convolve(np.asarray(values, float), np.ones(window) / window, "valid")
     return np.arange(len(means)) + (window + 1) / 2, means
 
@@ -195,38 +188,4 @@ def show_keys_and_attention(
         axes[2 * count * row].set_title(name, fontsize=9, loc="left")
         for axis in axes[2 * count * row + count : 2 * count * (row + 1)]:
             axis.images[0].set_cmap("viridis")
-    return figure
-
-
-def show_training_logs(logs: Mapping[str, Sequence[Mapping[str, float]]], panels: Mapping[str, str]) -> Figure:
-    """Show logged measurements of consecutive trainings over their minutes, one panel per measurement.
-
-    The first panel has the side of the crops, in pixels, at the first and the last measurement of each run.
-
-    Args:
-        logs: Rows of each training's log, in order, by name; rows have "seconds" and "side".
-        panels: Names of measurements in the log, each with its label; rows without one are left out.
-    """
-    figure, axes = plt.subplots(1, len(panels), figsize=(3.7 * len(panels), 3.6), layout="constrained", squeeze=False)
-    before = 0.0
-    for index, (name, rows) in enumerate(logs.items()):
-        colour, line, marker = _STYLES[index % len(_STYLES)]
-        for axis, panel in zip(axes[0], panels):
-            measured = [row for row in rows if panel in row]
-            if not measured:
-                continue
-            minutes = [before + row["seconds"] / 60 for row in measured]
-            values = [row[panel] for row in measured]
-            axis.plot(minutes, values, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
-            for at, above in ((0, -14), (-1, 7)) if axis is axes[0, 0] else ():
-                axis.annotate(
-                    f"{measured[at]['side']:.0f} px", (minutes[at], values[at]), (0, above), fontsize=8, ha="center",
-                    textcoords="offset points",
-                )  # fmt: skip
-        before += rows[-1]["seconds"] / 60
-    for axis, label in zip(axes[0], panels.values()):
-        highest = max((max(line.get_ydata()) for line in axis.lines), default=1)
-        axis.set(xlabel="minutes of training", ylabel=label, xlim=(-0.12 * before, 1.12 * before))
-        axis.set_ylim(0, 1.15 * highest)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(logs))
     return figure
