@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-# Largest coordinate, in any unit of length or in pixels.
-MAX_LENGTH = 1e9
+MAX_LENGTH = 1e9  # largest coordinate, in any unit of length or in pixels
 _LONGEST = 1000  # characters of a message
 
 
@@ -39,40 +38,24 @@ def describe_failure(error: BaseException) -> str:
     return " ".join(f"{place}{type(error).__name__}: {error}".split())
 
 
-def check_integer(name: str, value: object, minimum: int, maximum: int | None = None) -> None:
-    """Check that a value is an integer (a Python or NumPy one, not a bool) of at least `minimum`.
-
-    Raises:
-        InputError: The value is of another type, smaller, or greater than `maximum`.
-    """
-    if (
-        not isinstance(value, numbers.Integral)
-        or isinstance(value, bool)
-        or value < minimum
-        or (maximum is not None and value > maximum)
-    ):
-        limits = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
+def check_integer(name: str, value: object, minimum: int, maximum: float = math.inf) -> None:
+    """Raise InputError if a value is not an integer from `minimum` to `maximum`."""
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not minimum <= value <= maximum:
+        limits = f"of at least {minimum}" if maximum == math.inf else f"from {minimum} to {maximum}"
         raise InputError(f"{name} is {value!r}, expected an integer {limits}")
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
-    """Check that a value is a finite real number (a Python or NumPy one, not a bool) greater than `above`.
-
-    Raises:
-        InputError: The value is of another type, not finite, or not greater.
-    """
+    """Raise InputError if a value is not a finite real number greater than `above`."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not above < value < math.inf:
         expected = "a finite number" + (f" greater than {above:g}" if above > -math.inf else "")
         raise InputError(f"{name} is {value!r}, expected {expected}")
 
 
 def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None:
-    """Check that all numbers of an array are finite and not greater than `most` in magnitude.
+    """Raise InputError if a number of an array is not finite, or above `most` in magnitude.
 
     Beyond about 1e150, squares overflow and LAPACK's SVD may never return.
-
-    Raises:
-        InputError: A value is greater or not finite.
     """
     import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
 
@@ -82,11 +65,7 @@ def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None
 
 
 def real_array(name: str, values: object) -> "np.ndarray":
-    """Convert real numbers to a float64 array. Texts and complex numbers, which NumPy would convert, are refused.
-
-    Raises:
-        InputError: The values are of another type or of irregular shape.
-    """
+    """Convert real numbers to a float64 array; InputError for texts and complex numbers, which NumPy would convert."""
     import numpy as np
 
     try:
@@ -99,12 +78,8 @@ def real_array(name: str, values: object) -> "np.ndarray":
 
 
 def check_seed(name: str, value: object) -> None:
-    """Check that a value is a non-negative integer or a `numpy.random.Generator`.
-
-    Raises:
-        InputError: The value is neither.
-    """
-    import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
+    """Raise InputError if a value is neither a non-negative integer nor a `numpy.random.Generator`."""
+    import numpy as np
 
     if not isinstance(value, np.random.Generator):
         check_integer(name, value, 0)

@@ -112,11 +112,7 @@ class FrameIndex:
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """Decode the entry at a position.
-
-        Raises:
-            InputError: A field is missing or invalid; the message names the file, the frame and the field.
-        """
+        """Decode the entry at a position; InputError, which names file, frame and field, if a field is invalid."""
         key = self.keys[position]
         where = f"{self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
         return decode(self.entries[position], FrameAnnotation, where)
@@ -147,16 +143,7 @@ def read_frame_index(path: Path) -> FrameIndex:
 
 
 def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
-    """Decode and validate JSON.
-
-    Args:
-        data: The JSON.
-        kind: Type of the result, for msgspec.
-        where: Name of the file, for error messages.
-
-    Raises:
-        InputError: The JSON is invalid, or a field is missing or of another type.
-    """
+    """Decode JSON of the file `where` as a type of msgspec; InputError if it is invalid or lacks a field."""
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
@@ -166,11 +153,7 @@ def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
 
 
 def decompress(path: Path) -> bytes:
-    """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity.
-
-    Raises:
-        InputError: The file is missing or truncated, or grows too much.
-    """
+    """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity."""
     data = decompress_gzip(read_bytes(path, "annotations"), f"annotations {path}")
     # Python's json writes NaN and Infinity, which are not valid JSON. Null is then accepted by optional fields, and
     # refused by the others with the name of the field.

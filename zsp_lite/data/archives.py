@@ -28,30 +28,18 @@ from zsp_lite.io.remote import RemoteFile, remote_size
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
-# Largest archive, bytes, where the server does not tell its size. A chunk of v2 has up to 20 GB; an archive of v1 has
-# 28 GB on average.
-_LARGEST = {"co3d": 22 * 10**9, "co3d-v1": 280 * 10**9}
 _PART = 1 << 22  # bytes of a request for a part of an archive
 _WORK = ".download"  # in the data folder: archives in progress, and the list of what is unpacked
 
 
 @dataclass(frozen=True)
 class Archive:
-    """A published archive.
+    """A published archive: the file `name`, with its SHA-256 digest."""
 
-    Attributes:
-        dataset: "co3d" (v2) or "co3d-v1".
-        category: Name of the category.
-        subset: "full" or "single-sequence".
-        number: Number of the chunk, from 0.
-        name: Name of the file.
-        sha256: Its SHA-256 digest.
-    """
-
-    dataset: str
+    dataset: str  # "co3d" (v2) or "co3d-v1"
     category: str
-    subset: str
-    number: int
+    subset: str  # "full" or "single-sequence"
+    number: int  # of the chunk, from 0
     name: str
     sha256: str
 
@@ -83,10 +71,7 @@ def list_archives(
         chunks: Number of archives, from the first; None for all.
 
     Returns:
-        The archives; the one with the annotations is the first.
-
-    Raises:
-        InputError: The category is not in the list, or does not have so many archives.
+        The archives; the one with the annotations is the first. InputError if there are not so many.
     """
     if dataset not in URL_VARIABLES:
         raise InputError(f"data set is {dataset!r}, expected one of {', '.join(URL_VARIABLES)}")
@@ -108,11 +93,7 @@ def list_archives(
 
 
 def missing_archives(root: str | Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return the archives that are not unpacked in a data folder yet.
-
-    Raises:
-        InputError: The folder holds a category from elsewhere, from another data set or from another subset.
-    """
+    """Return the archives that are not unpacked yet; InputError if the folder has a category from elsewhere."""
     root, record = Path(root), _read_record(root)
     for archive in archives:
         place = root / archive.category
@@ -128,7 +109,7 @@ def missing_archives(root: str | Path, archives: Sequence[Archive]) -> list[Arch
 
 
 def missing_sequences(root: str | Path, archive: Archive, sequences: Iterable[str]) -> list[str]:
-    """Return the sequences of an archive that are not unpacked in a data folder yet. Raises as `missing_archives`."""
+    """Return the sequences of an archive that are not unpacked in a data folder yet."""
     if not missing_archives(root, [archive]):
         return []
     record = _read_record(Path(root))
@@ -137,31 +118,16 @@ def missing_sequences(root: str | Path, archive: Archive, sequences: Iterable[st
 
 
 def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
-    """Return the size of sequences and of the annotations in an archive on the server, bytes.
-
-    Raises:
-        InputError: The server cannot be reached or does not send parts of files, the archive is damaged, or has not
-            all of the sequences.
-    """
+    """Return the size of sequences and of the annotations in an archive on the server, bytes."""
     with _remote_archive(archive) as zipped:
         return sum(member.compress_size for member in _members(zipped, archive.category, archive.url, sequences))
 
 
 def check_disk(root: str | Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
-    """Check that archives fit on the disk. An archive is removed once it is unpacked.
+    """Return the number of bytes that missing archives need on the disk; InputError if it has less.
 
-    Args:
-        root: The data folder, which may not exist yet.
-        missing: The archives to download.
-        sizes: Their sizes in bytes; None if unknown.
-        whole: The archives are stored before they are unpacked; otherwise, parts of them are unpacked at once.
-
-    Returns:
-        Number of bytes that are needed in addition to what is on the disk: the unpacked archives, which are about as
-        large as the archives, and one archive.
-
-    Raises:
-        InputError: The disk has less.
+    These are the unpacked archives, which are about as large as the archives, and one archive, as an archive is removed
+    once it is unpacked. With `whole` false, parts of the archives are unpacked at once. Unknown sizes are None.
     """
     known = [size for size in sizes if size is not None]
     needed = sum(known) + (max(known, default=0) if whole else 0)
@@ -178,12 +144,7 @@ def download_archives(
     """Download archives, verify their SHA-256 and unpack them into a data folder.
 
     An interrupted download is continued by the next call. The annotations of a category are unpacked last, so that the
-    category is read only if it is complete.
-
-    Args:
-        root: The data folder.
-        archives: The archives.
-        progress: Wraps the list of an archive's files to show a progress bar, such as `tqdm`.
+    category is read only if it is complete. `progress` wraps the list of an archive's files, such as `tqdm`.
 
     Raises:
         InputError: A download fails or has another digest, an archive is damaged or holds a path that leads out of the
@@ -210,15 +171,7 @@ def download_sequences(
     """Read sequences and the annotations out of an archive on the server, without downloading the rest of it.
 
     Each file is verified by the CRC-32 in the archive. The SHA-256 is that of the whole archive and cannot be verified.
-
-    Args:
-        root: The data folder.
-        archive: The archive.
-        sequences: Names of the sequences.
-        progress: Wraps the list of files to show a progress bar, such as `tqdm`.
-
-    Raises:
-        InputError: As for `sequence_size` and `download_archives`.
+    Raises as `download_archives`, and if the server does not send parts of files or the archive lacks a sequence.
     """
     root = Path(root)
     with writing(root / _WORK):
@@ -236,22 +189,10 @@ def unpack(
     sequences: Collection[str] | None = None,
     progress: Callable[..., Iterable] | None = None,
 ) -> None:
-    """Unpack the folder of a category from a zip archive.
+    """Unpack the folder of a category, or the given sequences of it with its annotations, from the zip archive `where`.
 
     All members are checked before the first is written. A file that exists with the same size is not written again,
     except the annotations. Members that are not in the folder of the category are left out.
-
-    Args:
-        zipped: The archive.
-        root: The data folder.
-        category: Name of the category.
-        where: Name of the archive for error messages.
-        sequences: Names of the sequences to unpack, with the files of the category; all by default.
-        progress: Wraps the list of files, such as `tqdm`.
-
-    Raises:
-        InputError: The archive holds no file of the category, or holds a link or a path that leads out of the data
-            folder; or the disk is too small.
     """
     targets = {one: path_inside(root, one.filename) for one in _members(zipped, category, where, sequences)}
     wanted = [member for member, target in targets.items() if not _is_there(member, target)]
@@ -283,8 +224,7 @@ def _fetch(root: Path, archive: Archive) -> Path:
     """Download an archive unless it is there, up to the size that the server tells."""
     if (path := _archive_path(root, archive)).exists():
         return path
-    size = remote_size(archive.url)
-    return fetch(archive.url, path, size, digest=archive.sha256, most=_LARGEST[archive.dataset])
+    return fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
 
 
 @contextmanager

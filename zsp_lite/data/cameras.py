@@ -109,11 +109,7 @@ class Camera:
         return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """Convert to a PyTorch3D camera; the inverse of `from_pytorch3d`.
-
-        Returns:
-            The arguments of `from_pytorch3d` by name, without `size`; arrays are float64.
-        """
+        """Convert to the arguments of `from_pytorch3d` by name, without `size`; arrays are float64."""
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,
@@ -172,15 +168,7 @@ class Camera:
     def unproject_camera(
         self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Compute the points in camera coordinates at given pixels and depths.
-
-        Args:
-            pixels: (..., 2) pixels (x, y).
-            depth: (...) depth along +z.
-
-        Returns:
-            (..., 3) points in camera coordinates.
-        """
+        """Compute the points (..., 3) in camera coordinates at given pixels (x, y) and depths along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
@@ -207,11 +195,8 @@ class Camera:
     def turn(self, quarters: int) -> "Camera":
         """Return the camera of the image turned by quarter turns: the camera rotates about its optical axis.
 
-        One quarter turn takes pixel (x, y) of an image of width w to (y, w - x), and the camera point (X, Y, Z) to
-        (Y, -X, Z). Points, depths and pixels keep their relation exactly.
-
-        Args:
-            quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
+        One quarter turn, counterclockwise as in `numpy.rot90`, takes pixel (x, y) of an image of width w to (y, w - x),
+        and the camera point (X, Y, Z) to (Y, -X, Z). Points, depths and pixels keep their relation exactly.
         """
         camera = self
         for _ in range(quarters % 4):
@@ -237,18 +222,16 @@ def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.
 
 
 def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert to a float64 array of the given shape; InputError naming `what` if that fails or it is not finite."""
+    """Convert to a float64 array of the given shape; InputError naming `what` if that fails or a value is too large."""
     array = np.array(real_array(what, value))
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{what} is not finite: {array.tolist()}")
     check_magnitude(what, array)
     return array
 
 
 def _image_size(size: Sequence[int]) -> tuple[int, int]:
-    sides = tuple(size) if isinstance(size, Sequence | np.ndarray) else ()
+    sides = tuple(size)
     if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
         raise InputError(f"image size is {size!r}, expected (height, width), integers from 1 to {MOST_PIXELS}")
     return int(sides[0]), int(sides[1])

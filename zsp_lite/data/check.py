@@ -174,7 +174,7 @@ def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]
 
 
 def _check_call(read: Callable[[], object]) -> list[str]:
-    """Return the message of the InputError that `read` raises, if any."""
+    """Return the message of an InputError."""
     try:
         read()
     except InputError as error:

@@ -184,11 +184,6 @@ class Co3D:
             InputError: The frame has no viewpoint, a path leads out of the data folder, or a file is missing, corrupt
                 or of another size than annotated.
         """
-        if not isinstance(annotation, FrameAnnotation):
-            raise InputError(
-                f"Co3D.load got a {type(annotation).__name__}, expected a FrameAnnotation as "
-                "Co3D.frame(category, sequence, frame_number) returns it"
-            )
         camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         rgb = self._read(read_image, annotation.image.path, size)
@@ -203,13 +198,7 @@ class Co3D:
         return Frame(rgb, depth, mask, camera, name)
 
     def load_pair(self, pair: "Pair") -> tuple[Frame, list[Frame]]:
-        """Load the frames of an evaluation pair.
-
-        Args:
-            pair: Category, sequences and frame numbers (`zsp_lite.data.pairs.Pair`).
-
-        Returns:
-            The reference frame and the target frames, in the order of `pair.target_frames`.
+        """Load the reference frame and the target frames of an evaluation pair (`zsp_lite.data.pairs.Pair`).
 
         Raises:
             InputError: A frame is not in the data set or cannot be loaded.

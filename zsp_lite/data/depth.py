@@ -14,12 +14,8 @@ from zsp_lite.errors import InputError, check_integer, check_magnitude, check_nu
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
     """Decode CO3D's depth: the bits of each 16-bit value are those of a float16.
 
-    Args:
-        bits: (H, W) values of the PNG.
-        scale_adjustment: Factor applied to the decoded depth.
-
     Returns:
-        (H, W) depth, float32; values that are not finite or not positive become 0 (unknown).
+        (H, W) depth times `scale_adjustment`, float32; values that are not finite or not positive become 0 (unknown).
 
     Raises:
         InputError: The factor is not positive, or above 1e9.

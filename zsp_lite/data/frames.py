@@ -32,7 +32,7 @@ class Frame:
         name: Name for error messages.
 
     Raises:
-        InputError: Types or shapes do not fit together, or values are out of range.
+        InputError: Shapes do not fit together, or values are out of range.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -107,20 +107,13 @@ def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -
     Raises:
         InputError: The frame has no mask, or an empty one.
     """
-    if frame.mask is None:
-        raise InputError(f"{frame._label} has no object mask, expected one to crop to")
-    try:
-        return crop_frame(frame, mask_to_bbox(frame.mask, threshold, padding))
-    except InputError as error:
-        raise InputError(f"{frame._label}: {error}") from error
+    if frame.mask is None or not frame.mask.any():
+        raise InputError(f"{frame._label} has no object mask, expected one with a pixel above 0 to crop to")
+    return crop_frame(frame, mask_to_bbox(frame.mask, threshold, padding))
 
 
 def crop_frame(frame: Frame, box: Box) -> Frame:
-    """Crop a frame and its camera.
-
-    Args:
-        frame: The frame.
-        box: (top, left, height, width), pixels.
+    """Crop a frame and its camera to a box (top, left, height, width), pixels.
 
     Raises:
         InputError: The box is empty or extends beyond the image.
@@ -140,12 +133,7 @@ def crop_frame(frame: Frame, box: Box) -> Frame:
 
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
-    """Turn a frame and its camera by quarter turns; depths and points in the world stay the same.
-
-    Args:
-        frame: The frame.
-        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`; 0 gives the frame itself.
-    """
+    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; depths and world points stay the same."""
     if quarters % 4 == 0:
         return frame
     rgb, depth, mask = (
@@ -162,12 +150,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     Depth is taken from the nearest pixel, since values interpolated at an edge or hole lie on no surface. The mask is
     interpolated.
 
-    Args:
-        frame: The frame.
-        size: New (height, width), pixels.
-
     Raises:
-        InputError: The size is not positive or too large.
+        InputError: The size (height, width) is not positive or too large.
     """
     camera = frame.camera.resize(size)
     if camera.size[0] * camera.size[1] > MAX_PIXELS:
@@ -223,11 +207,7 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
 
 
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
-    """Read the values (H, W) of a 16-bit greyscale PNG.
-
-    Raises:
-        InputError: The file is missing, truncated or corrupt, or not a 16-bit greyscale PNG.
-    """
+    """Read the values (H, W) of a 16-bit greyscale PNG; InputError if the file is no such."""
     bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")

@@ -82,11 +82,7 @@ def published_sequences(
 def _read_published(
     source: str | Path, sha256: str | None, categories: Sequence[str] | None
 ) -> tuple[dict[tuple[str, str, str], bytes], dict[str, dict[str, PoseLabel]]]:
-    """Read and check the labels and pairs of a source.
-
-    Returns:
-        The content of each file by kind, folder and name; the labels by category and sequence.
-    """
+    """Return the checked files of a source by kind, folder and name, and its labels by category and sequence."""
     files, labels = {}, {}
     for path, data in _read_files(source, sha256):
         kind, group, name = PurePosixPath(path).parts[-3:]
@@ -171,17 +167,8 @@ def transfer_labels(
 def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Sim3, float]:
     """Align a sequence's world coordinates in two data sets by the camera centres of the frames in both.
 
-    Args:
-        old: The one data set.
-        new: The other data set.
-        category: Name of the category.
-        sequence: Name of the sequence.
-
     Returns:
         The similarity from `old` to `new`, and its residual (see `transfer_labels`).
-
-    Raises:
-        InputError: Fewer than four frames have cameras in both data sets, or the centres are collinear.
     """
     centres = [
         {one.frame_number: data.camera(one).centre for one in data.frames(category, sequence) if one.viewpoint}

@@ -49,10 +49,7 @@ class PoseLabel:
     reference_seq: str
 
     def __post_init__(self):
-        try:
-            trans = np.array(self.trans, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"label of {self.seq} has trans {self.trans!r}, expected a 4x4 matrix") from error
+        trans = np.array(self.trans, dtype=np.float64)
         if trans.shape != (4, 4) or not np.isfinite(trans).all():
             raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a finite 4x4 matrix")
         rotation = trans[:3, :3]
@@ -102,15 +99,7 @@ def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
 
 
 def parse_label(data: bytes, where: str) -> PoseLabel:
-    """Parse the content of a label file.
-
-    Args:
-        data: The JSON.
-        where: Name of the file, for error messages.
-
-    Raises:
-        InputError: The JSON is invalid, lacks a field, or is not rigid.
-    """
+    """Parse the JSON of the label file `where`; InputError if it lacks a field, or is not rigid."""
     label = decode(data, _LabelFile, where)
     try:
         return PoseLabel(np.array(label.trans), label.seq, label.reference_seq)

@@ -27,15 +27,7 @@ _MOST_PAIRS = 100_000  # of a category
 
 @dataclass(frozen=True)
 class Pair:
-    """A reference frame and the target frames to be compared with it.
-
-    Attributes:
-        category: Name of the category.
-        reference_sequence: Name of the sequence of the reference frame.
-        reference_frame: Frame number of the reference frame.
-        target_sequence: Name of the sequence of the target frames.
-        target_frames: Frame numbers of the target frames.
-    """
+    """A reference frame of one sequence and the target frames, by their numbers, of another sequence of a category."""
 
     category: str
     reference_sequence: str
@@ -175,17 +167,9 @@ def read_upstream_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
 
 
 def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
-    """Load an evaluation set of the published code and check its structure, without executing code in it.
+    """Return the dicts of the torch file `where` of the published code; InputError if its structure is another one.
 
-    Args:
-        data: Content of the torch file.
-        where: Name of the file, for error messages.
-
-    Returns:
-        The dicts of the file, with `all_target_id` as a list or tuple.
-
-    Raises:
-        InputError: The file holds more than plain data, or has another structure.
+    Code in it is not executed. `all_target_id` is a list or tuple.
     """
     items = load_torch(data, where)
     if not isinstance(items, list):
@@ -206,11 +190,7 @@ def check_upstream_pairs(data: bytes, where: str) -> list[dict]:
 
 
 def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
-    """Write pairs as an evaluation set in the format of the published code.
-
-    Raises:
-        InputError: The data set lacks a frame of a pair.
-    """
+    """Write pairs as an evaluation set in the format of the published code."""
     positions = {
         category: {(key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))}
         for category in dict.fromkeys(pair.category for pair in pairs)
@@ -218,11 +198,8 @@ def write_upstream_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D)
     items = []
     for pair in pairs:
         position = positions[pair.category]
-        try:
-            reference_id = position[pair.reference_sequence, pair.reference_frame]
-            target_ids = [position[pair.target_sequence, number] for number in pair.target_frames]
-        except KeyError as error:
-            raise InputError(f"pair {pair.key}: the data set has no frame {error.args[0]}") from error
+        reference_id = position[pair.reference_sequence, pair.reference_frame]
+        target_ids = [position[pair.target_sequence, number] for number in pair.target_frames]
         values = (pair.category, pair.reference_sequence, reference_id, pair.target_sequence, target_ids)
         items.append(dict(zip(_FIELDS, values, strict=True)))
     buffer = io.BytesIO()  # torch.save to a file would store the file's name

@@ -15,6 +15,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, sha256, write_atomic
 
 CHUNK = 1 << 18  # bytes
+TIMEOUT = 30  # of a connection, s
 
 
 def cache_folder() -> Path:
@@ -28,7 +29,6 @@ def fetch(
     size: int | None = None,
     md5_prefix: str = "",
     digest: str = "",
-    timeout: float = 30.0,
     most: int | None = None,
 ) -> Path:
     """Download a file unless it exists.
@@ -42,7 +42,6 @@ def fetch(
         size: Expected size, bytes; None if unknown.
         md5_prefix: Expected first digits of the MD5 digest.
         digest: Expected SHA-256 digest; empty if unknown.
-        timeout: Timeout of the connection, seconds.
         most: Largest size, bytes, where `size` is unknown. A longer download is stopped and removed.
 
     Raises:
@@ -56,7 +55,7 @@ def fetch(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for _ in range(3):
-            if _fetch_rest(url, part, size, timeout, most if size is None else size):
+            if _fetch_rest(url, part, size, most if size is None else size):
                 break
         else:
             raise InputError(
@@ -94,10 +93,7 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
 
 @contextmanager
 def pinned(path: Path) -> Iterator[None]:
-    """Use a file without a published digest; InputError if it differs from that of the first use without an error.
-
-    The SHA-256 of the first use is stored beside it: PATH.sha256, in the format of the program sha256sum.
-    """
+    """Use a file without a published digest; InputError if it differs from the first use, whose SHA-256 is stored."""
     pin, found = path.with_name(path.name + ".sha256"), sha256(path, "weights")
     if known := pin.is_file():
         expected = read_bytes(pin, "digest")[:64].decode("ascii", "replace")
@@ -112,14 +108,14 @@ def pinned(path: Path) -> Iterator[None]:
             write_atomic(pin, f"{found}  {path.name}\n".encode())
 
 
-def _fetch_rest(url: str, part: Path, size: int | None, timeout: float, most: int | None) -> bool:
+def _fetch_rest(url: str, part: Path, size: int | None, most: int | None) -> bool:
     """Request the missing rest of `part`. Returns True if the file is complete, False if interrupted."""
     start = part.stat().st_size if part.exists() else 0
     if size is not None and start >= size:
         return True
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
     try:
-        response = urllib.request.urlopen(request, timeout=timeout)
+        response = urllib.request.urlopen(request, timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         if error.code != 416:  # 416 "range not satisfiable": complete already, or the file on the server changed
             raise

@@ -46,15 +46,7 @@ def make_folder(path: str | Path, what: str) -> Path:
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:
-    """Read a file of at most `MAX_FILE` bytes.
-
-    Args:
-        path: The file.
-        what: Its kind for error messages, such as "image".
-
-    Raises:
-        InputError: The file cannot be read.
-    """
+    """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it cannot be read."""
     if (size := file_size(path, what)) > MAX_FILE:
         raise InputError(f"{what} {path} is {size} bytes long, expected at most {MAX_FILE}")
     try:

@@ -19,16 +19,12 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud in CO3D's form: binary, float32 positions and normals, 8-bit colours.
+    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit colours.
 
-    Written here rather than by trimesh, because the shipped sample data must be reproducible byte for byte. Normals
-    are zeros if not given.
-
-    Raises:
-        InputError: A value is above 1e9 or not finite.
+    Written here rather than by trimesh, because the sample data must be reproducible byte for byte. InputError if a
+    position is above 1e9 or not finite.
     """
     check_magnitude(f"point cloud {path}", points)
-    check_magnitude(f"colours of point cloud {path}", colours, 255)
     vertices = np.zeros(len(points), dtype=_VERTEX)
     normals = np.zeros((len(points), 3)) if normals is None else normals
     for names, values in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals), (_COLOURS, colours)):
@@ -47,8 +43,7 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
         if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken as [0, 255] otherwise.
 
     Raises:
-        InputError: The file is missing, truncated, empty or not a point cloud, or has positions that are not finite
-            or above 1e9.
+        InputError: The file is missing, damaged or empty, or has positions that are not finite or above 1e9.
     """
     data = read_bytes(path, "point cloud")
     try:

@@ -6,14 +6,15 @@ import urllib.error
 import urllib.request
 
 from zsp_lite.errors import InputError
+from zsp_lite.io.download import TIMEOUT
 
 _ATTEMPTS = 3  # requests of one part before it is given up
 
 
-def remote_size(url: str, timeout: float = 30.0) -> int | None:
+def remote_size(url: str) -> int | None:
     """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=timeout) as response:
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT) as response:
             length = response.headers.get("Content-Length")
         return None if length is None else int(length)
     except (OSError, http.client.HTTPException, ValueError) as error:
@@ -26,13 +27,12 @@ class RemoteFile(io.RawIOBase):
     For zipfile and the like; `io.BufferedReader(RemoteFile(url), size)` makes few large requests of many small reads.
     """
 
-    def __init__(self, url: str, timeout: float = 30.0):
+    def __init__(self, url: str):
         """Ask for the size of the file; InputError if the server cannot be reached or does not tell it."""
         super().__init__()
-        size = remote_size(url, timeout)
-        if size is None:
+        self.url, self.size, self._position = url, remote_size(url), 0
+        if self.size is None:
             raise InputError(f"{url}: the server does not tell the size of the file, expected Content-Length")
-        self.url, self.size, self.timeout, self._position = url, size, timeout, 0
 
     def readable(self) -> bool:
         """Return True."""
@@ -49,9 +49,7 @@ class RemoteFile(io.RawIOBase):
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Set the position, as for every file."""
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
-        if start + offset < 0:
-            raise ValueError(f"position is {start + offset}, expected at least 0")
-        self._position = start + offset
+        self._position = max(0, start + offset)
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview) -> int:
@@ -75,7 +73,7 @@ class RemoteFile(io.RawIOBase):
     def _request(self, end: int) -> bytes:
         wanted = f"bytes {self._position}-{end - 1}/"
         request = urllib.request.Request(self.url, headers={"Range": f"bytes={self._position}-{end - 1}"})
-        with urllib.request.urlopen(request, timeout=self.timeout) as response:
+        with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
             if response.status != 206 or not response.headers.get("Content-Range", "").startswith(wanted):
                 raise InputError(f"{self.url}: the server does not send parts of files, expected range requests")
             try:
