@@ -1,4 +1,4 @@
-"""The catalogues of models and backgrounds are complete and consistent, and their builders check what they read."""
+"""The catalogues of models are complete and consistent, and their builder checks what it reads."""
 
 import hashlib
 import json
@@ -10,10 +10,11 @@ import pytest
 from model_files import write_quad
 from PIL import Image
 
-from tools import backgrounds, credits, same_shape
+from tools import same_shape
 from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from tools.same_shape import CATALOGUE, copy_same_shape
+from zsp_lite.backbones.pretrained import WEIGHTS
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.models import list_models
@@ -23,6 +24,7 @@ from zsp_lite.synthetic.validation_categories import VALIDATION
 TOOLS = Path(__file__).parents[1] / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
 TRAINED, CHOSEN_BY = TOOLS / "training.json", TOOLS / "validation.json"
+ATTRIBUTION = WEIGHTS / "ATTRIBUTION.md"
 
 # A world with one group, moved by 10 along x, of a square turned by a quarter about y; one polyline, one wrong count.
 AC3D = """AC3Db
@@ -197,60 +199,11 @@ def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
         build(packages, out, catalogue)
 
 
-def test_every_background_may_be_shipped_and_names_its_author():
-    catalogue = backgrounds.read_catalogue()
-    pictures = catalogue.pictures.values()
-    assert len(pictures) >= 25 and len({picture.sha256 for picture in pictures}) == len(pictures)
-    assert {picture.package for picture in pictures} == set(catalogue.packages)
-    free = {"CC0 1.0", "CC BY 2.0", "CC BY 3.0", "CC BY 4.0"}
-    assert {picture.licence for picture in pictures} <= free
-    assert all(picture.author and picture.licence_file for picture in pictures)
-
-
-def test_the_weights_name_every_work_that_they_were_trained_on():
-    """After a change of a catalogue: python tools/credits.py."""
-    page = credits.PAGE.read_text(encoding="utf-8")
-    assert page == credits.page()
+def test_the_weights_name_every_model_that_they_were_trained_on():
+    page = ATTRIBUTION.read_text(encoding="utf-8")
     text = " ".join(page.split())
     models = [(name, entry) for models in read_catalogue(TRAINED).models.values() for name, entry in models.items()]
-    pictures = list(backgrounds.read_catalogue().pictures.items())
-    assert len(models) == 320 and pictures
-    for name, work in models + pictures:
+    for name, work in models:
         assert f"**{work.author}**: " in text and " ".join((work.title or name.replace("_", " ")).split()) in text
         assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
-    assert f"]({credits.PAGE.name})" in (credits.PAGE.parent / "MODEL_CARD.md").read_text(encoding="utf-8")
-
-
-def test_backgrounds_are_cut_from_the_files_of_the_catalogue_only(tmp_path):
-    halves = np.zeros((512, 1536, 3), np.uint8)
-    halves[:, 768:] = 200
-    file, archive = tmp_path / "sky" / "halves.png", tmp_path / "sky" / "set.zip"
-    file.parent.mkdir()
-    Image.fromarray(halves).save(file)
-    with zipfile.ZipFile(archive, "w") as files:
-        files.write(file, "halves.png")
-    checksum = hashlib.sha256(file.read_bytes()).hexdigest()
-    whole = backgrounds.Picture("sky", "halves.png", checksum, "CC0 1.0", "Ann", "copyright")
-    right = backgrounds.Picture(
-        "sky", "set.zip", checksum, "CC0 1.0", "Ann", "copyright", "halves.png", box=(768, 0, 1536, 512)
-    )
-    catalogue = backgrounds.Catalogue({"sky": "1.0"}, {"whole": whole, "right": right})
-    out = tmp_path / "out.npz"
-    backgrounds.build(tmp_path, out, catalogue)
-    with np.load(out) as arrays:
-        images, source = arrays["images"], arrays["source"]
-    assert images.shape[1:] == (256, 384, 3) and source.tolist() == [0] * 6 + [1] * 5  # six of 2 + 8, and all of 1 + 4
-    assert not images[0].any() and (images[5] == 200).all() and (images[6:] == 200).all()
-    file.write_bytes(file.read_bytes() + b" ")
-    with pytest.raises(InputError, match="halves.png .*checksum"):
-        backgrounds.build(tmp_path, out, catalogue)
-
-
-def test_a_view_of_an_environment_map_looks_where_it_says():
-    columns = np.broadcast_to(np.linspace(0.1, 1, 720, dtype=np.float32)[:, None], (360, 720, 3)).copy()
-    columns[100:110] += 5  # a bright line from 35 to 40 degrees above the horizon
-    level, raised = backgrounds.views(columns, ((90, 0, 60), (90, 37, 60)))
-    assert (np.diff(level[128, :, 0].astype(int)) >= 0).all()  # azimuth grows to the right
-    assert level[:, 192, 0].max() == level[128, 192, 0] and raised[128, 192, 0] == raised.max()
-    (seam,) = backgrounds.views(np.ones((360, 720, 3), np.float32), ((0, 0, 90),))
-    assert np.ptp(seam) == 0
+    assert f"]({ATTRIBUTION.name})" in (ATTRIBUTION.parent / "MODEL_CARD.md").read_text(encoding="utf-8")

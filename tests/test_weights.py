@@ -1,4 +1,4 @@
-"""The shipped backbone: what is in the package, and how it was made."""
+"""The shipped backbone: what is in the package, its log, and what its attention finds."""
 
 import json
 import re
@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
-from zsp_lite.backbones.efficientnet import weights_file
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.backbones.pretrained import EMBEDDED, SUMS, TINY, WEIGHTS, check_shipped
+from zsp_lite.backbones.pretrained import SUMS, TINY, WEIGHTS, check_shipped
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.extractors import random_backbone
 from zsp_lite.data.co3d import Co3D
@@ -19,25 +18,20 @@ from zsp_lite.synthetic.evaluation_categories import EVALUATION
 from zsp_lite.synthetic.export import GENERATORS
 from zsp_lite.synthetic.training_categories import TRAINING
 from zsp_lite.synthetic.validation_categories import VALIDATION
-from zsp_lite.training.recipe import CONTINUATION
 from zsp_lite.views import object_crop, patch_mask
 
 
-def test_the_files_are_small_and_in_half_precision():
-    """The default backbone has at most 30 MiB of weights, with the photo network and the position head."""
-    for path in EMBEDDED.values():
-        assert path.stat().st_size <= 12e6
-        with safe_open(path, "pt") as file:
-            assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
-    parts = EMBEDDED["zsp-tiny-photo"], WEIGHTS / "zsp-tiny-photo-positions.safetensors", TINY, weights_file()
-    assert sum(path.stat().st_size for path in parts) <= 30 * 2**20
+def test_the_file_is_small_and_in_half_precision():
+    assert TINY.stat().st_size <= 12e6
+    with safe_open(TINY, "pt") as file:
+        assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
 
 
 def test_the_digests_of_all_shipped_weights_are_those_of_the_files():
-    """After a change of the weights: cd zsp_lite/weights && sha256sum *.safetensors */*.safetensors > SHA256SUMS."""
-    files = sorted(WEIGHTS.rglob("*.safetensors"))
+    """After a change of the weights: cd zsp_lite/weights && sha256sum *.safetensors > SHA256SUMS."""
+    files = sorted(WEIGHTS.glob("*.safetensors"))
     listed = [line.split()[1] for line in (WEIGHTS / SUMS).read_text().splitlines()]
-    assert sorted(listed) == sorted(path.relative_to(WEIGHTS).as_posix() for path in files)
+    assert sorted(listed) == sorted(path.name for path in files)
     for path in files:
         check_shipped(path)
 
@@ -50,20 +44,15 @@ def test_it_loads_strictly_into_a_plain_dino_transformer():
     model.load_state_dict({name: value.float() for name, value in weights.items()}, strict=True)
 
 
-def test_its_runs_are_of_one_network_and_their_logs_complete():
-    configs = sorted(WEIGHTS.rglob("config-*.json"), key=lambda path: path.name)
-    assert [path.name for path in configs] == [f"config-{run}.json" for run in (1, 2, 3, 4)]
-    for path in configs:
-        config = json.loads(path.read_text())
-        for name in ("embed_dim", "depth", "num_heads"):
-            assert config[name] == getattr(CONTINUATION, name)
-        assert config["key_block"] == CONTINUATION.layer
-        log = path.with_name(path.name.replace("config", "log")).with_suffix(".jsonl")
-        rows = [json.loads(line) for line in log.read_text().splitlines()]
-        assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
-        # The crops of the last run are in front of photographs from its first step; its saliency is what improved.
-        figure = "photo_held_out_iou" if config.get("photo_share") else "held_out_accuracy"
-        assert rows[-1][figure] > rows[9][figure] > 0
+def test_the_log_of_its_last_run_is_complete_and_of_the_same_network():
+    config = json.loads((WEIGHTS / "config-4.json").read_text())
+    model = load_backbone("zsp-tiny", device="cpu").model
+    assert {name: config[name] for name in ("embed_dim", "depth", "num_heads")} == {
+        name: getattr(model, name) for name in ("embed_dim", "depth", "num_heads")
+    }
+    rows = [json.loads(line) for line in (WEIGHTS / "log-4.jsonl").read_text().splitlines()]
+    assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
+    assert rows[-1]["held_out_iou"] > rows[9]["held_out_iou"] > 0
 
 
 def test_it_was_trained_on_none_of_the_categories_that_it_is_judged_by():

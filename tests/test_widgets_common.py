@@ -1,4 +1,4 @@
-"""What all widgets have in common: controls, interactive figures, examples, latency."""
+"""What all widgets have in common: controls and interactive figures."""
 
 import ast
 import sys
@@ -13,8 +13,6 @@ from zsp_lite.errors import InputError
 pytest.importorskip("ipywidgets", reason="widgets need ipywidgets: pip install 'zsp-lite[notebooks]'")
 matplotlib.use("agg")
 
-from tools import widget_examples as examples
-from tools.widget_latency import control_values, latency, main  # noqa: E402
 from zsp_lite.widgets import common  # noqa: E402
 
 
@@ -66,34 +64,3 @@ def test_a_picture_keeps_its_size_and_leaves_room_for_the_controls():
     layout = common.interactive_figure(figure, {}, lambda: "", "nothing").picture.layout
     assert (layout.max_width, layout.max_height) == ("100%", "420px")
     assert layout.align_self == "flex-start" and layout.object_fit == "contain"  # not stretched
-
-
-def test_values_for_the_latency_always_change_the_control():
-    for control in (
-        common.slider("x", 0, 9, 3),
-        common.slider("y", 0.0, 1.0, 0.0, 0.1),
-        common.choice("z", ["a", "b"]),
-    ):
-        values = control_values(control, 7)
-        assert len(values) >= 5
-        assert all(a != b for a, b in zip([control.value, *values], values))
-
-
-def test_the_latency_is_measured_for_each_control_and_restores_its_value():
-    widget = examples.one_outlier()
-    ticks = iter(range(100))
-    assert latency(widget, 3, clock=lambda: float(next(ticks))) == {"distance": 1000.0}
-    assert widget.controls["distance"].value == 0.0
-
-
-def test_the_command_prints_a_line_for_each_control(monkeypatch, capsys):
-    monkeypatch.setattr("tools.widget_latency.latency", lambda widget, clock=None: {"pairs": 200.0, "gain": 3.0})
-    with pytest.raises(SystemExit) as stop:
-        main(["measured_accuracy"])
-    first, second = capsys.readouterr().out.splitlines()
-    assert (
-        stop.value.code == 1 and first.endswith("200 ms ( 200 ms) above 150 ms") and second.endswith("3 ms (   3 ms)")
-    )
-    with pytest.raises(SystemExit) as stop:
-        main(["unknown"])
-    assert stop.value.code == 2 and "measured_accuracy" in capsys.readouterr().err

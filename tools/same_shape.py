@@ -5,7 +5,7 @@
 
 The catalogues `training.json` and `validation.json` group models by what they are. A ceiling fan and a table fan, or a
 desk and a lectern, have no pose in common that a picture could show. The models of this list were chosen from pictures
-of all models (`zsp-lite models sheet`).
+of all models.
 """
 
 import json

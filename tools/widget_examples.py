@@ -1,4 +1,4 @@
-"""Every widget on sample data, for the tests and for `tools/widget_latency.py`."""
+"""Every widget on sample data, for the tests."""
 
 import shutil
 from collections.abc import Callable

@@ -7,8 +7,7 @@ How to write a widget:
 - Its `update` callback is called when a control moves. It only changes existing artists (`set_data`, `set_offsets`,
   `set_text`, `set_visible`). Expensive results are computed before, not in `update`.
 - `update` returns a caption with the numbers that the figure shows, also for readers who cannot see it or its colours.
-- The latency of a control should be at most 150 ms (`python -m tools.widget_latency` measures it). Keep figures below
-  about 9 by 4 inches.
+- The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
 - The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen by sliders, which
   work by keyboard.
 - The notebook shows a static figure as well (`show`), because widgets need a running kernel.
