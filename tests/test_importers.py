@@ -16,7 +16,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.importers import READERS, import_capture
 from zsp_lite.importers.fusion import fuse
 from zsp_lite.importers.masks import grab_cut, masks_from_box
-from zsp_lite.synthetic.export import make_object, sequence_name
+from zsp_lite.synthetic.export import make_object
 from zsp_lite.synthetic.sequences import render_sequence
 
 METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
@@ -25,7 +25,7 @@ METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 @pytest.fixture(scope="module")
 def views():
     """Eight views around a teapot, in metres."""
-    shape = make_object("teapot", sequence_name(4, "teapot", 0), 4)
+    shape = make_object("teapot", 0, 4)
     rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
     frames = []
     for view in rendered.views:

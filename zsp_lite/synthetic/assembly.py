@@ -28,11 +28,8 @@ class Shape:
 class Assembly:
     """Collects the parts of one object, and draws the random numbers that its generator asks for.
 
-    Args:
-        rng: Source of all draws.
-        variation: If given, every proportion (`u`) is perturbed by normal noise from this source, while the choices
-            between parts (`chance`, `choice`) stay: the same object with other proportions.
-        amount: Standard deviation of that noise, as a fraction of the range of the proportion.
+    With `variation`, every proportion (`u`) is perturbed by normal noise from that source, with a standard deviation of
+    `amount` of its range, while the choices between parts (`chance`, `choice`) stay.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None, amount: float = 0.3):
@@ -96,16 +93,9 @@ def make_shape(generator: Callable[[Assembly], None], seed: int | list[int]) -> 
 def make_variant(
     generator: Callable[[Assembly], None], seed: int | list[int], variation: np.random.Generator, amount: float = 0.3
 ) -> Shape:
-    """Return the object of `make_shape(generator, seed)` with other proportions: the same parts in the same order.
+    """Return the object of `make_shape(generator, seed)` with other proportions, see `Assembly`.
 
-    Vertex i is the same point of the same part on all variants, so the correspondence between them is known. This
-    requires that the parts depend on the generator's choices only, not on its proportions.
-
-    Args:
-        generator: Builds an object from the draws of an `Assembly`.
-        seed: Seed of the object.
-        variation: Source of the changes.
-        amount: Standard deviation of the changes, as a fraction of the range of each proportion.
+    Vertex i is the same point of the same part on all variants, if the parts depend on the generator's choices only.
     """
     assembly = Assembly(np.random.default_rng(seed), variation, amount)
     generator(assembly)
@@ -113,18 +103,9 @@ def make_variant(
 
 
 def deform(shape: Shape, seed: int | np.random.Generator, amount: float = 1.0) -> Float[np.ndarray, "v 3"]:
-    """Deform an object: scale its parts, warp and scale the whole.
+    """Return the vertices of a deformed copy of an object: its parts scaled, the whole warped and scaled.
 
-    A vertex keeps its index, so the correspondence with the original is known. This is the shape augmentation of the
-    training.
-
-    Args:
-        shape: Object to deform.
-        seed: Seed or source of the draws.
-        amount: Strength of the deformation; 0 changes nothing.
-
-    Returns:
-        Vertices of the deformed object.
+    A vertex keeps its index, so the correspondence with the original is known. With the amount 0, nothing changes.
     """
     rng = np.random.default_rng(seed)
     n_parts = shape.part.max() + 1

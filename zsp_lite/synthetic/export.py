@@ -74,17 +74,7 @@ PRESETS = {
 def export_preset(
     preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] | None = None
 ) -> None:
-    """Write a preset with its evaluation pairs to a folder.
-
-    Args:
-        preset: Name in `PRESETS`.
-        out: Folder to write; an incomplete export is completed.
-        seed: Seed of the objects and of the pairs.
-        progress: Wraps the loop over sequences, as tqdm does.
-
-    Raises:
-        InputError: The preset is unknown, and as for `export_categories`.
-    """
+    """Write a preset with its evaluation pairs to a folder, see `export_categories`."""
     if preset not in PRESETS:
         raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
     wanted = PRESETS[preset]
@@ -137,7 +127,7 @@ def export_categories(
         name = sequence_name(seed, category, index)
         if name not in read_poses(out, category) or name not in _complete_sequences(out, category):
             recorded = make_sequence(category, index, frames, seed, image_size)
-            write_sequence(out, category, make_object(category, name, seed), recorded)
+            write_sequence(out, category, make_object(category, index, seed), recorded)
     for category in categories:
         write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 
@@ -145,30 +135,14 @@ def export_categories(
 def make_sequence(
     category: str, index: int, frames: int, seed: int, image_size: int
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Make sequence number `index` of a category.
-
-    Returns:
-        The sequence with simulated sensor errors, and its exact rendering in the same unit.
-    """
+    """Make sequence number `index` of a category, with simulated sensor errors, and its exact rendering."""
     name = sequence_name(seed, category, index)
     key = stable_hash(seed, category, index)
-    return record_sequence(make_object(category, name, seed), name, key, frames, image_size)
+    return record_sequence(make_object(category, index, seed), name, key, frames, image_size)
 
 
-def make_object(category: str, sequence: str, seed: int) -> TexturedMesh:
-    """Return the object of an exported sequence in canonical coordinates, with its materials.
-
-    Args:
-        category: Category of the sequence.
-        sequence: Name of the sequence.
-        seed: Seed of the export.
-
-    Raises:
-        InputError: An export with this seed has no such sequence.
-    """
-    index = int(sequence[:3]) - 100 if sequence[:3].isdecimal() else -1
-    if category not in GENERATORS or index < 0 or sequence != sequence_name(seed, category, index):
-        raise InputError(f"sequence {category}/{sequence} does not exist in an export with seed {seed}")
+def make_object(category: str, index: int, seed: int) -> TexturedMesh:
+    """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = stable_hash(seed, category, index)
     return with_materials(make_shape(GENERATORS[category], [key, 0]), random_materials([key, 3]))
 

@@ -22,8 +22,6 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes
-from zsp_lite.synthetic.export import SETTINGS_FILE, make_object
-from zsp_lite.synthetic.model_export import RENDERED_FILE
 from zsp_lite.synthetic.recording import POSES_FILE
 from zsp_lite.views import object_crop, patch_mask
 
@@ -33,16 +31,11 @@ _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
 _Row = tuple[float, float, float, float]
 
 
-class _Settings(msgspec.Struct):
-    seed: int
-
-
 class _Pose(msgspec.Struct):
     trans: tuple[_Row, _Row, _Row, _Row]
     scale: float
-    # Bounding box of a model in canonical coordinates; that of a procedural object follows from its seed.
-    low: tuple[float, float, float] | None = None
-    high: tuple[float, float, float] | None = None
+    low: tuple[float, float, float]  # of the bounding box in object coordinates
+    high: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,22 +88,13 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
     Raises:
         InputError: The folder is not a synthetic export, or a file of the export is damaged.
     """
-    settings, models, poses = (
-        dataset.root / name for name in (SETTINGS_FILE, RENDERED_FILE, f"{category}/{POSES_FILE}")
-    )
-    for path in (models if models.is_file() else settings, poses):
-        if not path.is_file():
-            raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
-    seed = None if models.is_file() else decode(read_bytes(settings, "settings"), _Settings, settings).seed
+    path = dataset.root / category / POSES_FILE
+    if not path.is_file():
+        raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
     found = {}
-    for sequence, pose in decode(read_bytes(poses, "object poses"), dict[str, _Pose], poses).items():
-        trans, low, high = np.array(pose.trans), np.array(pose.low or ()), np.array(pose.high or ())
-        if seed is not None:
-            vertices = make_object(category, sequence, seed).vertices
-            low, high = vertices.min(axis=0), vertices.max(axis=0)
-        elif len(low) != 3 or len(high) != 3:
-            raise InputError(f"{poses}, {sequence}: the bounding box `low` and `high` is missing")
-        found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, low, high)
+    for sequence, pose in decode(read_bytes(path, "object poses"), dict[str, _Pose], path).items():
+        trans = np.array(pose.trans)
+        found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, np.array(pose.low), np.array(pose.high))
     return found
 
 

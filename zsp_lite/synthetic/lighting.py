@@ -18,11 +18,9 @@ _ROUGHNESS = (0.25, 0.45, 0.65)  # limits between these blurs
 
 @dataclass(frozen=True, eq=False)
 class ShadowMap:
-    """Shadow of the object on the floor, on a square grid around it.
+    """Shadow of the object on the floor: the visible shares of the key light and of the room on a square grid.
 
-    Attributes:
-        light: Visible shares of the key light and of the room at each grid point (n, n, 2).
-        half: Half the width of the grid in units.
+    The grid is centred at the object; `half` is half its width in units.
     """
 
     light: Float[np.ndarray, "n n 2"]
@@ -104,16 +102,10 @@ class RoomLight:
     def radiance(
         self, eye: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"], pixel: float, shadow: ShadowMap | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the radiance of the box's faces along rays.
+        """Return the radiance (n, 3) of the box along rays, and the ray parameter (n,) where a ray meets the floor.
 
-        Args:
-            eye: Origin of the rays; moved into the box if it is outside.
-            rays: Directions.
-            pixel: Angle between neighbouring rays in radians.
-            shadow: Shadow of the object. Without it, the room is empty, and a glossy floor does not reflect it.
-
-        Returns:
-            Radiance (n, 3), and the ray parameter (n,) where a ray meets the floor, 0 elsewhere.
+        Rays start at `eye`, which is moved into the box; `pixel` is the angle between neighbours in radians. The
+        parameter is 0 off the floor. Without a shadow, the room is empty, and a glossy floor does not reflect it.
         """
         room = self.room
         low, high = room.low.astype(np.float32), room.high.astype(np.float32)

@@ -17,13 +17,8 @@ from zsp_lite.synthetic.textures import hsv
 class WavePattern:
     """Two sRGB colours, mixed by k sine waves through the object: stripes, grain, checks, a weave or patches.
 
-    Attributes:
-        colours: The two colours.
-        waves: Wave vectors in radians per unit of object coordinates.
-        phases: Phases of the waves.
-        warp: Wave vector of the displacement that bends all waves.
-        warp_amount: Amplitude of the displacement in radians.
-        sharpness: Steepness of the transitions; 1 is a sine.
+    Wave vectors are in radians per unit of object coordinates. `warp` is the wave vector of the displacement that bends
+    all waves, `warp_amount` its amplitude in radians. A sharpness of 1 is a sine.
     """
 
     colours: Float[np.ndarray, "2 3"]

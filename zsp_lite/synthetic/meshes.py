@@ -72,12 +72,8 @@ class TexturedMesh:
 def read_mesh(path: str | Path) -> TexturedMesh:
     """Read a mesh file with its textures, in the axes and the unit of the file.
 
-    Args:
-        path: File with an extension of `EXTENSIONS`; COLLADA (.dae) needs the package `pycollada`.
-
-    Raises:
-        InputError: If the file cannot be read, is larger than `MAX_BYTES`, lacks a texture, or holds no faces,
-            more than `MAX_FACES` faces, or coordinates that are not finite.
+    Raises InputError if the file cannot be read, is larger than `MAX_BYTES`, lacks a texture or pycollada, or holds no
+    faces, more than `MAX_FACES` faces, or coordinates that are not finite.
     """
     import trimesh  # slow to import
 

@@ -28,14 +28,7 @@ _PAIRS, _TARGETS = 20, (1, 3, 5)
 
 
 class ModelRecord(msgspec.Struct, frozen=True):
-    """Origin of a rendered sequence, as `rendered_models.json` holds it.
-
-    Attributes:
-        file: Model file, relative to the folder of models.
-        sha256: Checksum of the file.
-        rotation: Rotation from the axes of the file to the canonical frame, row by row.
-        author, licence, source, changes: As in `models.json`.
-    """
+    """Origin of a rendered sequence, as `rendered_models.json` holds it; `rotation` is that to the canonical frame."""
 
     file: str
     sha256: str

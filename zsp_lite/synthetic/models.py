@@ -43,12 +43,8 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the axes of the file to the canonical frame (front +x, left +y, up +z).
 
-        Args:
-            extension: Extension of the model's file. Where `front` or `up` is not given, it is front +z, up +y (the
-                convention of glTF), and front -y, up +z for STL.
-
-        Raises:
-            InputError: If a direction is invalid, or the two are not perpendicular.
+        By default the front is +z and the top +y, as in glTF; for STL the front is -y and the top +z. Raises InputError
+        if a direction is invalid, or the two are not perpendicular.
         """
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         x, z = (_direction(given) for given in (self.front or front, self.up or up))
@@ -79,14 +75,9 @@ class Model:
 def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
     """Return the models of a folder, sorted by category and name.
 
-    Args:
-        folder: Folder of models.
-        front: Front of the models whose entry in `models.json` gives none, such as "-x". Default: see `ModelInfo.axes`.
-        up: Top of these models, likewise.
-
-    Raises:
-        InputError: If the folder does not exist or holds no model, `models.json` is damaged or names a model that
-            does not exist, or two files have the same name.
+    `front` and `up` hold for the models whose entry in `models.json` does not give them. Raises InputError if the
+    folder does not exist or holds no model, `models.json` is damaged or names a model that does not exist, or two files
+    have the same name.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -38,13 +38,7 @@ class CheapCamera:
     def develop(
         self, radiance: Float[np.ndarray, "h w 3"], gain: float, rng: np.random.Generator
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the 8-bit picture of a radiance image.
-
-        Args:
-            radiance: Linear radiance.
-            gain: Factor of the exposure, from `exposure_gain`.
-            rng: Source of the noise.
-        """
+        """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
         h, w = radiance.shape[:2]
         scale = min(h, w) / 256
         y, x = np.linspace(-1, 1, h, dtype=np.float32)[:, None], np.linspace(-1, 1, w, dtype=np.float32)

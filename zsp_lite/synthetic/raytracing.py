@@ -66,14 +66,10 @@ class _Hits(NamedTuple):
 
 
 class MeshScene:
-    """A mesh on the floor of a room, prepared for rendering from many cameras.
+    """A mesh on the floor of a room, prepared for rendering from many cameras in the coordinates of the mesh.
 
-    Args:
-        mesh: Mesh in canonical coordinates; its lowest vertex stands on the floor.
-        room: Surroundings; a `RoomLight` if these were prepared before.
-        quality: Numbers of rays.
-        seed: Seed of the random directions.
-        coordinates: Object coordinates of each vertex, for a deformed copy of an object. Default: its position.
+    The lowest vertex stands on the floor. A `RoomLight` is a room that was prepared before. `coordinates` are the
+    object coordinates of each vertex, for a deformed copy of an object; by default its positions.
     """
 
     def __init__(
@@ -113,15 +109,7 @@ class MeshScene:
         self._gain: float | None = None
 
     def render(self, camera: Camera, seed: int | np.random.Generator) -> Rendering:
-        """Render one view.
-
-        Args:
-            camera: Camera; maps from canonical coordinates.
-            seed: Seed of the sensor's noise.
-
-        Returns:
-            The picture and its exact geometry. The exposure is measured on the first view and varies little after it.
-        """
+        """Render one view; the exposure is measured on the first view and varies little after it."""
         rng = np.random.default_rng(seed)
         n, (top, left, bottom, right) = self.quality.samples, self._object_box(camera)
         box = np.s_[top:bottom, left:right]

@@ -29,17 +29,9 @@ def stable_hash(seed: int, category: str, item: int | str) -> int:
 def record_sequence(
     mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Render an object and simulate the sensor.
+    """Render an object and simulate the sensor; `key` is the seed of room, cameras and noise.
 
-    Args:
-        mesh: Object in canonical coordinates.
-        name: Name of the sequence.
-        key: Seed of room, cameras and noise.
-        frames: Number of frames.
-        image_size: Shorter image side in pixels.
-
-    Returns:
-        The recorded sequence, and the exact one in the same unit.
+    Returns the recorded sequence, and the exact one in the same unit.
     """
     exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size)
     return simulate_capture(exact, name, np.random.default_rng([key, 2]))

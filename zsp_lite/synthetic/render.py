@@ -30,17 +30,10 @@ class Rendering:
 
 
 def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of a camera on a sphere around `target` that looks at its centre.
+    """Return the pose of a camera on a sphere around `target` (3,) that looks at its centre; angles in radians.
 
-    Args:
-        azimuth: Angle about z in radians; 0 is in front of the object, at +x.
-        elevation: Angle above the horizontal plane in radians.
-        roll: Rotation about the optical axis in radians.
-        distance: Radius of the sphere.
-        target: Centre of the sphere (3,).
-
-    Returns:
-        World-to-camera rotation (3, 3) and translation (3,).
+    The azimuth is the angle about z, 0 in front of the object at +x; the elevation is the angle above the horizontal
+    plane, the roll the rotation about the optical axis. Returns world-to-camera rotation (3, 3) and translation (3,).
     """
     away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     forward = -away

@@ -55,14 +55,10 @@ def pyramid(image: np.ndarray) -> list[np.ndarray]:
 def sample_image(
     levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, texels: np.ndarray | None, border: int, fill=0
 ) -> Float[np.ndarray, "n c"]:
-    """Look up points (u, v) in [0, 1] (v from the top) by bilinear interpolation in the level of fitting resolution.
+    """Look up points (u, v) in [0, 1] (v from the top) by bilinear interpolation.
 
-    Args:
-        levels: Image pyramid.
-        u, v: Points (n,).
-        texels: Texels of the finest level that a sample covers (n,). Default: one.
-        border: OpenCV's rule outside the image; BORDER_WRAP repeats it.
-        fill: Value outside the image for BORDER_CONSTANT.
+    The level of the pyramid fits `texels`, the texels of the finest level that a sample covers; by default one. Outside
+    the image OpenCV's rule `border` holds, with the value `fill` for BORDER_CONSTANT; BORDER_WRAP repeats the image.
     """
     if border == cv2.BORDER_WRAP:
         u, v = u % 1, v % 1

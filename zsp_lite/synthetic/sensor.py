@@ -28,11 +28,7 @@ def smooth_noise(rng: np.random.Generator, size: tuple[int, int], sigma: float) 
 
 
 def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """Return a score of how well stereo would match each pixel.
-
-    The score has no unit. It is high in textured regions and low at depth edges and grazing angles, plus smooth
-    noise.
-    """
+    """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
     rng = np.random.default_rng(seed)
     scale = min(view.mask.shape) / 100
     grey = _blur(view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]), 0.6 * scale)
@@ -54,19 +50,10 @@ def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float
 def stereo_depth(
     view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.2
 ) -> Float[np.ndarray, "h w"]:
-    """Simulate the depth map of multi-view stereo.
+    """Simulate the depth map of multi-view stereo, 0 where there is no measurement.
 
-    The noise is mostly correlated between pixels. It is 0.5 % of the depth at the object and grows with the square
-    of the depth.
-
-    Args:
-        view: Exact rendering.
-        seed: Seed or source of the draws.
-        object_holes: Fraction of the object's pixels without depth.
-        floor_holes: Fraction of the floor's pixels without depth.
-
-    Returns:
-        Depth map (float32), 0 where there is no measurement.
+    The holes are fractions of the pixels of the object and of the floor. The noise is mostly correlated between
+    pixels. It is 0.5 % of the depth at the object and grows with the square of the depth.
     """
     rng = np.random.default_rng(seed)
     confidence = stereo_confidence(view, rng)
@@ -96,11 +83,7 @@ def fused_cloud(
     n_points: int,
     seed: int | np.random.Generator,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Sample at most `n_points` points of the object from the depth maps of all views.
-
-    Returns:
-        World points, unit normals and 8-bit colours.
-    """
+    """Sample points of the object from the depth maps of all views: world points, unit normals, 8-bit colours."""
     rng = np.random.default_rng(seed)
     points, normals, colours = [], [], []
     for view, depth in zip(views, depths, strict=True):
@@ -119,15 +102,8 @@ def simulate_capture(
     """Convert an exact rendering to a sequence with the errors of CO3D's data.
 
     The world is scaled so that the point cloud has unit standard deviation, averaged over its axes. The quality
-    scores are drawn from the range of the sequences that the paper labels.
-
-    Args:
-        sequence: Exact rendering.
-        name: Name of the sequence.
-        seed: Seed or source of the draws.
-
-    Returns:
-        The sequence with simulated depth, masks and point cloud, and the exact rendering in the same unit.
+    scores are drawn from the range of the sequences that the paper labels. Returns the sequence, and the exact
+    rendering in the same unit.
     """
     rng = np.random.default_rng(seed)
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)

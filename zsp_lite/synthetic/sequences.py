@@ -49,20 +49,11 @@ def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, 
 def handheld_sweep(
     vertices: Float[np.ndarray, "v 3"], seed: int | np.random.Generator, frames: int, size: tuple[int, int]
 ) -> list[Camera]:
-    """Draw the cameras of a hand-held camera that moves once around the object.
+    """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object.
 
     The start and the direction are random. Elevation, distance, viewing direction and roll change smoothly, with
     jitter. All cameras share one focal length: the object fills 55 to 75 % of the shorter image side in the median
     view and is inside the image in all views.
-
-    Args:
-        vertices: Vertices of the object.
-        seed: Seed or source of the draws.
-        frames: Number of cameras.
-        size: (height, width) of the images in pixels.
-
-    Returns:
-        Cameras that map from the coordinates of the vertices.
     """
     rng = np.random.default_rng(seed)
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
@@ -94,15 +85,9 @@ def handheld_sweep(
 def render_sequence(
     mesh: TexturedMesh, seed: int | np.random.Generator, frames: int, image_size: int
 ) -> RenderedSequence:
-    """Render views around an object in a random room.
+    """Render views around an object in a random room; `image_size` is the shorter image side.
 
     The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
-
-    Args:
-        mesh: Object in canonical coordinates.
-        seed: Seed or source of the draws.
-        frames: Number of views.
-        image_size: Shorter image side in pixels.
     """
     rng = np.random.default_rng(seed)
     cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
