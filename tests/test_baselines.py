@@ -6,9 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from safetensors.torch import save_file
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from synthetic_views import look_at, render, true_pose
@@ -16,24 +13,19 @@ from synthetic_views import look_at, render, true_pose
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import icp as icp_module
-from zsp_lite.baselines import posecontrast, swav
+from zsp_lite.baselines import swav
 from zsp_lite.baselines.essential_matrix import essential_rotation
 from zsp_lite.baselines.icp import align, icp
 from zsp_lite.baselines.posecontrast import (
-    PoseContrast,
-    TinyPoseContrast,
     ViewpointHead,
     euler_to_rotation,
     load_posecontrast,
-    load_posecontrast_tiny,
-    pad_to_square,
     predict_angles,
-    rotation_to_euler,
     square_crop,
 )
-from zsp_lite.baselines.resnet import TINY, ResNet, ResNetConfig
+from zsp_lite.baselines.resnet import ResNet50
 from zsp_lite.baselines.sift import Keypoints, Sift, mutual_matches, unproject_pixels
-from zsp_lite.baselines.swav import load_swav, load_swav_tiny
+from zsp_lite.baselines.swav import load_swav
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
@@ -79,21 +71,22 @@ def random_state(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
 
 
 def test_resnet50_has_torchvisions_keys_and_its_layers_their_strides():
-    model = ResNet()
+    model = ResNet50()
     assert {key: tuple(x.shape) for key, x in model.state_dict().items()} == torchvision_shapes()
     with torch.inference_mode():
         layers = model.eval().layers(torch.zeros(1, 3, 64, 64))
     assert [tuple(x.shape[1:]) for x in layers] == [(256, 16, 16), (512, 8, 8), (1024, 4, 4), (2048, 2, 2)]
 
 
-def test_a_block_is_two_convolutions_and_a_shortcut():
+def test_a_block_is_three_convolutions_and_a_shortcut():
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        block = ResNet(TINY).layer1[0].eval()
-    x = torch.rand(1, 32, 8, 8)
-    first = torch.relu(block.bn1(torch.conv2d(x, block.conv1.weight, padding=1)))
-    second = block.bn2(torch.conv2d(first, block.conv2.weight, padding=1))
-    assert torch.allclose(block(x), torch.relu(second + x), atol=1e-6)
+        block = ResNet50().layer1[1].eval()
+    x = torch.rand(1, 256, 8, 8)
+    first = torch.relu(block.bn1(torch.conv2d(x, block.conv1.weight)))
+    second = torch.relu(block.bn2(torch.conv2d(first, block.conv2.weight, padding=1)))
+    third = block.bn3(torch.conv2d(second, block.conv3.weight))
+    assert torch.allclose(block(x), torch.relu(third + x), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -119,49 +112,17 @@ def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_
         load_swav()
 
 
-def test_a_failed_download_of_swav_names_the_alternative(tmp_path, monkeypatch):
+def test_without_a_checkpoint_one_line_says_where_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
     monkeypatch.setattr(swav, "URL", "http://127.0.0.1:9/swav_800ep_pretrain.pth.tar")
-    with pytest.raises(InputError, match="swav-tiny"):
+    with pytest.raises(InputError, match="download http://127.0.0.1:9/swav.*set ZSP_LITE_SWAV to its path") as found:
         load_swav()
-
-
-def tiny_file(tmp_path, model: torch.nn.Module, name: str):
-    path = tmp_path / name
-    save_file({k: x.contiguous() for k, x in model.state_dict().items() if "num_batches" not in k}, path)
-    return path
-
-
-def test_swav_tiny_has_the_papers_grid(tmp_path):
-    model = load_swav_tiny(tiny_file(tmp_path, ResNet(TINY), "swav-tiny.safetensors"))
-    (found,) = model([np.zeros((224, 224, 3), np.uint8)])
-    assert found.keys.shape == (28, 28, TINY.channels[2])
-    with pytest.raises(InputError, match="train-baseline swav-tiny"):
-        load_swav_tiny(tmp_path / "nowhere.safetensors")
-
-
-angles = st.tuples(st.floats(0, 359.9), st.floats(1, 179), st.floats(0, 359.9))
-
-
-@given(angles)
-def test_angles_and_rotations_are_each_others_inverse(found):
-    rotation = euler_to_rotation(np.array(found))
-    assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
-    difference = (rotation_to_euler(rotation) - found + 180) % 360 - 180
-    assert difference == pytest.approx(np.zeros(3), abs=1e-6)
-
-
-def test_a_tiny_negative_angle_becomes_zero():
-    rotation = euler_to_rotation(np.array([307.5, 1.0, 0.0]))  # the in-plane rotation comes back as about -1e-14
-    azimuth, _, in_plane = rotation_to_euler(rotation)
-    assert 0 <= azimuth < 360 and 0 <= in_plane < 360
-
-
-@pytest.mark.parametrize("pole", [0.0, 180.0])
-@pytest.mark.parametrize("azimuth", [0.0, 77.0, 300.0])
-def test_angles_from_above_and_below_give_the_rotation_back(pole, azimuth):
-    rotation = euler_to_rotation(np.array([azimuth, pole, 40.0]))
-    assert rotation_error(euler_to_rotation(rotation_to_euler(rotation)), rotation) < 1e-4
+    assert "\n" not in str(found.value)
+    with pytest.raises(InputError, match="from https://github.com/.*PoseContrast, and set ZSP_LITE_POSECONTRAST to it"):
+        load_posecontrast()
+    monkeypatch.setenv("ZSP_LITE_SWAV", str(tmp_path / "nowhere.pth"))
+    with pytest.raises(InputError, match="nowhere.pth"):
+        load_swav()
 
 
 def test_viewpoints_follow_the_convention_of_pascal3d():
@@ -175,12 +136,13 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
 
 
 @pytest.mark.slow
-def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path):
-    network, head = ResNet(ResNetConfig(outputs=128)), ViewpointHead(2048)
+def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path, monkeypatch):
+    network, head = ResNet50(outputs=128), ViewpointHead()
     path = tmp_path / "posecontrast.pth"
     features = random_state(torchvision_shapes() | {"fc.weight": (128, 2048), "fc.bias": (128,)})
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head.state_dict()}, path)
-    model = load_posecontrast(path)
+    monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))
+    model = load_posecontrast()
     frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
     (found,) = model.describe([frame])
     assert found.feature.shape == (2048,)
@@ -198,15 +160,6 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
         torch.save(content, path)
         with pytest.raises(InputError, match="posecontrast"):
             load_posecontrast(path)
-    with pytest.raises(InputError, match="posecontrast-tiny"):
-        load_posecontrast(tmp_path / "nowhere.pth")
-
-
-def test_posecontrast_tiny_loads_what_its_trainer_writes(tmp_path):
-    model = load_posecontrast_tiny(tiny_file(tmp_path, TinyPoseContrast(), "posecontrast-tiny.safetensors"))
-    assert isinstance(model, PoseContrast) and model.image_size == posecontrast.TINY_SIZE
-    with pytest.raises(InputError, match="train-baseline"):
-        load_posecontrast_tiny(tmp_path / "nowhere.safetensors")
 
 
 def test_predicted_angles_are_bin_and_offset():
@@ -220,7 +173,6 @@ def test_a_square_crop_has_the_aspect_ratio_of_the_photograph():
     frame = replace(frame, mask=None)
     square = square_crop(object_crop(frame), 80)
     assert (square[:9] == 0).all() and (square[71:] == 0).all() and square[20:60].any()
-    assert pad_to_square(np.full((4, 4, 3), 9, np.uint8), 0.5, 8)[:, :, 0].tolist() == [[0, 0, 9, 9, 9, 9, 0, 0]] * 8
 
 
 def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():

@@ -1,9 +1,6 @@
-"""SwAV: self-supervised convolutional features (paper sec. 5.2).
+"""SwAV: a ResNet-50 trained by self-supervision (Caron et al. 2020), as a feature extractor (paper sec. 5.2)."""
 
-The paper uses a ResNet-50 pre-trained by SwAV (Caron et al. 2020). "swav-tiny" is a small network of this project,
-trained by the same method on renders of the training categories.
-"""
-
+import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,40 +10,32 @@ from torch import Tensor
 
 from zsp_lite.backbones.backbone import Image, normalize, prepare_images
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
-from zsp_lite.backbones.pretrained import check_shipped
-from zsp_lite.baselines.resnet import TINY, ResNet
+from zsp_lite.baselines.resnet import ResNet50
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.download import cache_folder, fetch, pinned
 
 URL = "https://dl.fbaipublicfiles.com/deepcluster/swav_800ep_pretrain.pth.tar"
-TINY_WEIGHTS = Path(__file__).parents[1] / "weights" / "swav-tiny.safetensors"
+VARIABLE = "ZSP_LITE_SWAV"  # environment variable with the path of the checkpoint
 _MOST_BYTES = 200_000_000  # of the file: 28 million float32 weights, and the state of the training
 _HEADS = ("projection_head.", "prototypes.")  # parts of the checkpoint that are used in training only
+_LAYER = 2  # index of the layer of the keys; the paper does not state it
 
 
 class Swav:
-    """Feature extractor (see `features.FeatureExtractor`) with the features of a convolutional network.
+    """Feature extractor (see `features.FeatureExtractor`).
 
-    The keys are the output of one layer, the global feature is the mean of the last layer's output, and the saliency is
-    1 everywhere.
+    Images are resized to 448 pixels. The keys are the output of the third layer, (28, 28, 1024); the global feature is
+    the mean of the last layer's output, and the saliency is 1 everywhere.
     """
 
+    name = "swav"
     has_saliency = False
+    image_size = 448
+    device = torch.device("cpu")
 
-    def __init__(self, model: ResNet, name: str, image_size: int, layer: int = 3):
-        """Create the extractor.
-
-        Args:
-            model: The network.
-            name: Name of the extractor.
-            image_size: Side to which images are resized, pixels. Layer 3 of a ResNet-50 has the paper's grid of 28 x 28
-                patches at 448 pixels.
-            layer: Layer of the keys, from 1. The paper does not state it.
-        """
+    def __init__(self, model: ResNet50):
         self.model = model.eval().requires_grad_(False)
-        self.name, self.image_size, self.layer = name, image_size, layer
-        self.device = torch.device("cpu")
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]; InputError for others."""
@@ -55,13 +44,13 @@ class Swav:
             batch = normalize(prepare_images([image], self.image_size, index))
             with torch.inference_mode():
                 layers = self.model.layers(batch)
-                keys, pooled = layers[self.layer - 1][0].permute(1, 2, 0), layers[-1].mean((2, 3))[0]
+                keys, pooled = layers[_LAYER][0].permute(1, 2, 0), layers[-1].mean((2, 3))[0]
             keys = keys.clone()  # an ordinary tensor, outside inference mode
             maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), pooled.clone()))
         return maps
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the weights of the network, which identify the extractor in the benchmark's cache."""
+        """Return the weights of the network, which identify the extractor in the benchmark."""
         return self.model.state_dict()
 
 
@@ -69,35 +58,23 @@ def load_swav(path: str | Path | None = None) -> Swav:
     """Load the ResNet-50 of SwAV.
 
     Args:
-        path: Checkpoint file with torchvision's keys, prefixed by `module.`. By default the released file, downloaded
-            at the first use.
+        path: Checkpoint file with torchvision's keys, prefixed by `module.`; by default $ZSP_LITE_SWAV, else the
+            released file, downloaded at the first use.
 
     Raises:
-        InputError: The file cannot be downloaded or read, has other keys or shapes, or is not the released one that
-            was used before.
+        InputError: The file cannot be downloaded or read, has other keys or shapes, or the released file is not that of
+            its first use.
     """
-    released = nullcontext()
-    if path is None:
-        target = cache_folder() / Path(URL).name
+    path, released = path or os.environ.get(VARIABLE), nullcontext()
+    if not path:
+        path = cache_folder() / Path(URL).name
         try:
-            path = fetch(URL, target, most=_MOST_BYTES)
+            fetch(URL, path, most=_MOST_BYTES)
         except InputError as error:
-            raise InputError(f"swav: {error}; put the file at {target}, or use swav-tiny") from error
-        released = pinned(target)
-    model = ResNet()
+            raise InputError(f"swav: {error}; download {URL}, and set {VARIABLE} to its path") from error
+        released = pinned(path)
+    model = ResNet50()
     with released:
         weights, _ = read_checkpoint(path)
         load_weights(model, weights, f"swav {path}", _HEADS)
-    return Swav(model, "swav", 448)
-
-
-def load_swav_tiny(path: str | Path = TINY_WEIGHTS) -> Swav:
-    """Load the small network of this project. Raises InputError if the file is missing or invalid."""
-    if not Path(path).is_file():
-        raise InputError(f"swav-tiny: {Path(path).name} does not exist; `zsp-lite train-baseline swav-tiny` creates it")
-    if path == TINY_WEIGHTS:
-        check_shipped(path)
-    weights, _ = read_checkpoint(path)
-    model = ResNet(TINY)
-    load_weights(model, weights, f"swav-tiny {path}")
-    return Swav(model, "swav-tiny", 224)
+    return Swav(model)
