@@ -11,7 +11,7 @@ from jaxtyping import Float, Real
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
-from zsp_lite.errors import InputError, check_magnitude, check_number
+from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number
 from zsp_lite.io.files import path_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
@@ -53,11 +53,7 @@ class CaptureFrame:
         check_magnitude(f"{self.image}: distortion", self.distortion, _MOST_DISTORTION)
 
     def load(self) -> Frame:
-        """Load the frame.
-
-        Raises:
-            InputError: A file is missing, corrupt or of another size than the camera's image.
-        """
+        """Load the frame; InputError if a file is missing, corrupt or of another size than the camera's image."""
         size = self.camera.size
         rgb = _check_size(read_image(self.image), size, self.image)
         depth = _enlarge(_read_depth(self.depth) * np.float32(self.depth_unit), size)
@@ -74,8 +70,7 @@ class CaptureFrame:
 
 def subsample(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
     """Select at most `count` evenly spaced frames, with the first and the last."""
-    if count < 1:
-        raise InputError(f"maximum number of frames is {count}, expected at least 1")
+    check_integer("maximum number of frames", count, 1)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     return [frames[index] for index in chosen]
 
@@ -87,14 +82,9 @@ def camera_from_pose(
     size: tuple[int, int],
     where: str,
 ) -> Camera:
-    """Create a camera from its pose.
+    """Create a camera from its camera-to-world pose in OpenCV's axes, with the nearest exact rotation.
 
-    Args:
-        pose: (4, 4) camera-to-world transform in OpenCV's axes. Its rotation is replaced by the nearest exact one.
-        focal_length: Focal lengths along x and y, pixels.
-        principal_point: Principal point (x, y), pixels.
-        size: Image (height, width), pixels.
-        where: File and line of the pose, for error messages.
+    `where` is the file and line of the pose, for error messages.
 
     Raises:
         InputError: The pose is not rigid, or the intrinsics are invalid.
@@ -117,11 +107,7 @@ def camera_from_pose(
 
 
 def listed_file(folder: Path, relative: str, where: str) -> Path:
-    """Return the path of a file named in a list.
-
-    Raises:
-        InputError: The file does not exist, or is not inside the folder.
-    """
+    """Return the path of a file named in a list; InputError if it does not exist or is not inside the folder."""
     path = path_inside(folder, relative)
     if not path.is_file():
         raise InputError(f"{where}: file {relative} is not in {folder}")
@@ -129,18 +115,9 @@ def listed_file(folder: Path, relative: str, where: str) -> Path:
 
 
 def read_rows(path: Path, columns: int, what: str) -> list[tuple[int, list[str]]]:
-    """Read the words of each line of a text file, without comments (#) and empty lines.
+    """Read the line number and the words of each line of a text file, without comments (#) and empty lines.
 
-    Args:
-        path: The file.
-        columns: Minimum number of words per line.
-        what: Kind of the file, for error messages.
-
-    Returns:
-        Line number (from 1) and words of each line.
-
-    Raises:
-        InputError: The file cannot be read, or a line has fewer words.
+    InputError if a line has fewer words than `columns`.
     """
     rows = []
     for number, line in enumerate(read_bytes(path, what).decode("utf-8", "replace").splitlines(), 1):
@@ -156,8 +133,8 @@ def parse_numbers(words: Sequence[str], where: str) -> list[float]:
     """Convert words to finite numbers; InputError if one is not."""
     try:
         values = [float(word) for word in words]
-    except ValueError as error:
-        raise InputError(f"{where}: {' '.join(words)!r}, expected numbers") from error
+    except ValueError:
+        values = [np.nan]
     if not np.isfinite(values).all():
         raise InputError(f"{where}: {' '.join(words)!r}, expected finite numbers")
     return values

@@ -35,14 +35,7 @@ MAX_FRAMES = 100  # about the length of CO3D's sequences
 
 
 def capture_format(folder: str | Path) -> str:
-    """Recognise the format of a capture by the names of its files.
-
-    Returns:
-        A name in `READERS`.
-
-    Raises:
-        InputError: The folder has the files of none, or of several.
-    """
+    """Return the name in `READERS` of a capture's format, by the names of its files; InputError without one format."""
     found = [name for name, signs in _SIGNS.items() if any((Path(folder) / sign).is_file() for sign in signs)]
     if len(found) == 1:
         return found[0]
@@ -57,19 +50,12 @@ def capture_format(folder: str | Path) -> str:
 
 @dataclass(frozen=True)
 class ImportResult:
-    """Result of an import.
-
-    Attributes:
-        frames: Number of imported frames.
-        empty: Number of frames that were left out because their masks are empty.
-        points: Number of points of the point cloud.
-        scale: Factor from the capture's lengths to those of the sequence.
-    """
+    """Numbers of frames and points of an import."""
 
     frames: int
-    empty: int
+    empty: int  # frames that were left out because their masks are empty
     points: int
-    scale: float
+    scale: float  # factor from the capture's lengths to those of the sequence
 
 
 def import_capture(
@@ -129,8 +115,6 @@ def import_capture(
     times = [capture[index].time - capture[0].time for index in seen]
     data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
     with writing(root):
-        if folder.exists() and not unfinished.is_file():  # another process was faster
-            raise InputError(f"{folder} exists already, expected another sequence name")
         folder.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
         write_co3d(root, category, [data])

@@ -22,9 +22,6 @@ def fuse(
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Fuse the depth maps inside the masks by truncated signed distances (TSDF; Curless and Levoy 1996).
 
-    Args:
-        frames: Frames with depth and masks.
-
     Returns:
         Points (n, 3) in world coordinates, RGB colours (n, 3), and normals (n, 3).
 

@@ -33,11 +33,7 @@ _MIN_PIXELS = 100
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     """Segment the object in frames of one world that look at it from any sides.
 
-    Args:
-        frames: Frames with depth. In a single frame the object is near the middle of the image.
-
-    Returns:
-        The frames with masks; a mask is empty where the frame does not show the object.
+    In a single frame the object is near the middle of the image. A mask is empty if the frame does not show it.
 
     Raises:
         InputError: No depth is known, or nothing stands out where the cameras look.
@@ -78,10 +74,9 @@ def _world_points(frame: Frame) -> Float[np.ndarray, "h w 3"]:
 def _focus(
     frames: Sequence[Frame], points: Sequence[np.ndarray], known: Sequence[np.ndarray]
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return the point that the cameras look at, and their mean distance from it.
+    """Return the point nearest to the optical axes of the cameras, and their mean distance from it.
 
-    With several cameras this is the point nearest to their optical axes. With one, or with parallel axes, it is the
-    median of the nearest quarter of the points in the central part of the image.
+    With one camera, or parallel axes, it is the median of the nearest quarter of the points in the central part.
     """
     centres = np.stack([frame.camera.centre for frame in frames])
     axes = np.stack([frame.camera.R[2] for frame in frames])

@@ -23,11 +23,7 @@ from zsp_lite.io.files import path_inside
 
 
 def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
-    """Read a capture: line n of each list describes frame n.
-
-    Args:
-        folder: Folder of the lists.
-        depth_unit: World units per stored depth value.
+    """Read a capture: line n of each list describes frame n. `depth_unit` is in world units per stored depth value.
 
     Raises:
         InputError: A list is missing or invalid, or the lists differ in length.

@@ -31,9 +31,6 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
         frames: Frames with depth, in the order of the capture.
         box: (top, left, height, width) of the object in the first frame, pixels.
 
-    Returns:
-        The frames with masks.
-
     Raises:
         InputError: The box extends beyond the image, or the object is not found in a frame.
     """
@@ -62,11 +59,7 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
 
 
 def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]:
-    """Read the masks of frames from files of the same names as the images, with any extension.
-
-    Raises:
-        InputError: A mask is missing or of another size than the image.
-    """
+    """Read the masks of frames from files of the same names as the images, with any extension."""
     files = {path.stem: path for path in sorted(Path(folder).glob("*")) if path.is_file()}
     masked = []
     for frame in frames:
@@ -78,17 +71,10 @@ def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]
 
 
 def grab_cut(rgb: np.ndarray, box: Box) -> Float[np.ndarray, "h w"]:
-    """Segment the object inside a box by its colours.
-
-    Args:
-        rgb: (H, W, 3) image, uint8.
-        box: (top, left, height, width), pixels.
+    """Segment the object inside a box (top, left, height, width) by the colours of an 8-bit image.
 
     Returns:
         (H, W) mask of 0 and 1: the largest connected foreground region, or 0 everywhere if there is none.
-
-    Raises:
-        InputError: The box covers the whole image, so there is no background.
     """
     top, left, height, width = box
     labels = np.full(rgb.shape[:2], cv2.GC_BGD, np.uint8)

@@ -55,9 +55,6 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
     Stored depth is in millimetres unless the file has `depth_unit_scale_factor`. Radial and tangential distortion are
     corrected on loading.
 
-    Args:
-        folder: Folder of transforms.json.
-
     Raises:
         InputError: The file is invalid, no frame has depth, the camera model is another one, intrinsics are missing, or
             k4 is not 0.

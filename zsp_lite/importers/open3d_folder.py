@@ -35,12 +35,8 @@ def read_open3d(folder: str | Path) -> list[CaptureFrame]:
 
     Images and depth maps are sorted by the numbers in their names. Depth is in millimetres, Open3D's default.
 
-    Args:
-        folder: The capture.
-
     Raises:
-        InputError: A part is missing or invalid, leads out of the folder, or the numbers of images, depth maps and
-            poses differ.
+        InputError: A part is missing or invalid, or the numbers of images, depth maps and poses differ.
     """
     folder = Path(folder)
     colours = _images(folder, _COLOURS)

@@ -32,8 +32,7 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
             is the benchmark's default camera.
 
     Raises:
-        InputError: A list is missing or invalid, no image has both depth and pose, or intrinsics are not given and the
-            images have another size than the default camera's.
+        InputError: A list is missing or invalid, no image has both depth and pose, or other intrinsics are needed.
     """
     from scipy.spatial.transform import Rotation  # takes 0.2 s to import
 

@@ -140,12 +140,7 @@ class Labelling:
         return np.eye(3)
 
     def pick(self, sequence: str, point: Point, name: str | None = None) -> None:
-        """Add the next keypoint of a sequence.
-
-        Args:
-            sequence: Name of the sequence.
-            point: (3,) point in its world coordinates.
-            name: Name of a new keypoint of the reference; the default is a number.
+        """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a new one of that name.
 
         Raises:
             InputError: All keypoints are picked, the point is not finite, or the reference's keypoints are in use on
@@ -176,12 +171,7 @@ class Labelling:
         self._save(sequence)
 
     def put(self, sequence: str, points: Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
-        """Replace all picks of a sequence, as needed to undo a change.
-
-        Args:
-            sequence: Name of the sequence.
-            points: (n, 3) picks.
-            names: Names of the keypoints, for the reference only.
+        """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints, to undo a change.
 
         Raises:
             InputError: The points are not finite, or their number does not fit the keypoints.
@@ -205,11 +195,8 @@ class Labelling:
     def guess(self, sequence: str, sim3: Sim3) -> None:
         """Set the picks of a sequence by transforming the keypoints of the reference.
 
-        Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken.
-
-        Args:
-            sequence: Name of the sequence.
-            sim3: Similarity from the world of the reference to that of the sequence.
+        Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken. `sim3` maps
+        the world of the reference to that of the sequence.
 
         Raises:
             InputError: The sequence is the reference, or fewer than four keypoints are defined.
@@ -276,11 +263,7 @@ class Labelling:
         )
 
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
-        """Write the labels of a sequence and of the reference (the identity).
-
-        Args:
-            sequence: Name of the sequence.
-            confirmed: Accept also a label that is in `doubt`.
+        """Write the labels of a sequence, also in `doubt` if `confirmed`, and of the reference (the identity).
 
         Returns:
             The label file of the sequence.
