@@ -14,6 +14,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import match, similarities
+from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.views import View
 
@@ -119,3 +120,12 @@ def matched_scene(views: list[View]) -> Scene:
     found = similarities(reference.features, [target.features for target in targets])
     matches = [match(reference.features, target.features, kmeans=False, sim=sim) for target, sim in zip(targets, found)]
     return build_scene(reference, targets, found, matches)
+
+
+def working_pose(scene: Scene, sim3: Sim3, view: int) -> Poses:
+    """A similarity from the reference's camera to that of a target view, in the scene's working units."""
+    first, camera = scene.target_cameras[0], scene.target_cameras[view]
+    rotation = first.R @ camera.R.T
+    to_first = Sim3(1.0, rotation, first.t - rotation @ camera.t)
+    pose = scene.target_to_working @ to_first @ sim3 @ scene.reference_to_working.inverse()
+    return Poses(*(torch.tensor(np.array(part)[None], dtype=torch.float32) for part in (pose.scale, pose.R, pose.t)))

@@ -14,6 +14,7 @@ from synthetic_views import (
     matched_scene,
     reference_and_targets,
     true_pose,
+    working_pose,
 )
 
 from zsp_lite.alignment import Sim3, umeyama
@@ -22,7 +23,6 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.verified import refinement
 from zsp_lite.verified.confidence import (
     Calibration,
     auroc,
@@ -43,15 +43,14 @@ from zsp_lite.verified.poses import (
     rotation_matrices,
 )
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, propose_poses
-from zsp_lite.verified.refinement import SearchSchedule, refine, refine_coarse_to_fine
-from zsp_lite.verified.scene import build_scene, double_centre, object_axes, surface_weights
+from zsp_lite.verified.refinement import SearchSchedule, refine
+from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import evenly_spaced_indices, soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
     ScoreTerms,
     ScoreWeights,
     forward_terms,
-    orientation_term,
     reverse_terms,
     score_terms,
     viewpoint_term,
@@ -90,7 +89,7 @@ def scene(views):
 def truth(frames, scene):
     """The true pose in working units."""
     first = true_pose(frames[0].camera, Sim3.identity(), frames[1].camera, ELSEWHERE)
-    return scene.from_sim3([first], 0)
+    return working_pose(scene, first, 0)
 
 
 # Poses
@@ -212,7 +211,7 @@ def test_conversion_to_a_camera_pose_and_back_is_the_identity(scene):
     rng = np.random.default_rng(2)
     pose = Sim3(0.8, some_rotation(rng), rng.normal(size=3))
     for view in range(3):
-        back = scene.to_sim3(scene.from_sim3([pose], view), 0, view)
+        back = scene.to_sim3(working_pose(scene, pose, view), 0, view)
         np.testing.assert_allclose(back.matrix, pose.matrix, atol=1e-5)
 
 
@@ -301,14 +300,6 @@ def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
 
 
-def test_soft_icp_with_features_succeeds_where_shape_alone_fails(scene, truth):
-    turn = rotation_matrices(torch.deg2rad(torch.tensor([[0.0, 60, 0]])))
-    start = Poses(truth.scale, turn @ truth.rotation, truth.translation)
-    with_features, without = (soft_icp(scene, start, feature_weight=weight) for weight in (8.0, 0.0))
-    error = [float(rotation_angles(found.rotation, truth.rotation)) for found in (with_features, without)]
-    assert error[0] < 20 and error[0] < error[1]
-
-
 def test_a_pose_is_aligned_by_itself(scene, truth):
     start = concatenate([truth, poses_from_views(scene)])
     together = soft_icp(scene, start)
@@ -329,7 +320,9 @@ def test_soft_icp_reaches_scales_from_a_half_to_two(scene, scale, reached):
         target_weight=torch.full((n,), 1 / n), similarity=torch.eye(n),
     )  # fmt: skip
     start = as_poses(Sim3(min(max(0.9 * scale, 0.5), 2.0), np.eye(3), np.zeros(3)))
-    assert float(soft_icp(larger, start, iterations=30).scale) == pytest.approx(reached, rel=0.05)
+    for _ in range(5):
+        start = soft_icp(larger, start)
+    assert float(start.scale) == pytest.approx(reached, rel=0.05)
 
 
 # Verification
@@ -462,7 +455,7 @@ def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
 def test_the_score_is_the_weighted_sum_of_the_terms():
     rng = np.random.default_rng(4)
     terms = ScoreTerms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERM_NAMES))
-    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0, 1.5)
+    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
     by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERM_NAMES)
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
 
@@ -479,32 +472,6 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
     np.testing.assert_allclose(score_terms(scene, sides).viewpoint, viewpoint_term(scene, sides))
 
 
-def test_the_axes_of_an_object_are_those_of_its_exact_positions(views):
-    reference, *_ = views
-    assert object_axes(reference) is None
-    points = reference.patch_points[0]
-    turn = some_rotation(np.random.default_rng(4))
-    positions = torch.from_numpy(0.7 * points @ turn.T).float()
-    found = object_axes(replace(reference, features=replace(reference.features, positions=positions)))
-    np.testing.assert_allclose(found, turn, atol=1e-5)
-
-
-def test_the_orientation_term_compares_the_axes_of_both_objects_under_the_pose(views):
-    """Of two target views, one predicts the axes of the reference's object under the first pose, one a quarter turn."""
-    scene = build_scene(views[0], views[1:3], [torch.zeros(784, 784)] * 2)
-    assert (orientation_term(scene, poses_from_views(scene)) == 0).all()  # no positions
-    rng = np.random.default_rng(5)
-    axes, turn = some_rotation(rng), rotation_matrices(torch.tensor([[0.0, 0, np.pi / 2]]))[0]
-    rotation = torch.from_numpy(some_rotation(rng)).float()
-    axes = torch.from_numpy(axes).float()
-    exact = axes @ rotation.T  # from the targets' frame to the axes, if the rotation is right
-    scene = replace(scene, reference_axes=axes, target_axes=torch.stack([exact, turn @ exact]))
-    poses = Poses(torch.ones(2), torch.stack([rotation, rotation @ axes.T @ turn.T @ axes]), torch.zeros(2, 3))
-    expected = [(1 + np.exp(-((90 / 50) ** 2))) / 2, (np.exp(-((90 / 50) ** 2)) + 1) / 2]
-    np.testing.assert_allclose(orientation_term(scene, poses), expected, atol=1e-4)
-    np.testing.assert_allclose(score_terms(scene, poses).orientation, expected, atol=1e-4)
-
-
 def test_with_one_view_the_viewpoint_term_is_zero(views):
     scene = build_scene(views[0], views[1:2], [torch.rand(784, 784)])
     np.testing.assert_array_equal(viewpoint_term(scene, poses_from_views(scene)), np.zeros(12))
@@ -514,7 +481,7 @@ def test_reverse_terms_equal_forward_terms_with_exchanged_views(views, truth):
     """With one target view, the reverse terms are the forward terms of the inverse pose with exchanged views."""
     zeros = [torch.zeros(784, 784)]
     one, other = build_scene(views[0], [views[1]], zeros), build_scene(views[1], [views[0]], zeros)
-    pose = one.from_sim3([Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3]))], 0)
+    pose = working_pose(one, Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3])), 0)
     there, back = reverse_terms(one, pose), forward_terms(other, pose.inverse())
     np.testing.assert_allclose(there.silhouette, back.silhouette, atol=1e-4)
     np.testing.assert_allclose(there.free_space, back.free_space, atol=1e-4)
@@ -558,21 +525,6 @@ def test_refinement_stays_within_the_scale_range():
     for sign, end in zip((-1, 1), SCALE_RANGE):
         found, _ = refine(as_poses(Sim3.identity()), lambda poses: sign * poses.scale, search)
         assert float(found.scale) == pytest.approx(end)
-
-
-def test_the_agreement_counts_in_the_choice_between_poses_that_are_near(scene, truth, monkeypatch):
-    tilted = rotation_matrices(torch.tensor([[np.deg2rad(10), 0, 0]], dtype=torch.float32)) @ truth.rotation
-    poses = concatenate([truth, replace(truth, rotation=tilted)])
-    monkeypatch.setattr(refinement, "refine", lambda poses, score, schedule, rng: (poses, score(poses)))
-    assert torch.equal(refine_coarse_to_fine(scene, poses, ScoreWeights()).rotation, truth.rotation)
-
-    def prefers_the_second(scene, poses):
-        return 1000.0 * (poses.rotation == tilted).all(dim=2).all(dim=1)
-
-    monkeypatch.setattr(refinement, "agreement_term", prefers_the_second)
-    assert torch.equal(refine_coarse_to_fine(scene, poses, ScoreWeights()).rotation, tilted)
-    without = ScoreWeights().without("agreement")
-    assert torch.equal(refine_coarse_to_fine(scene, poses, without).rotation, truth.rotation)
 
 
 @given(seeds)
