@@ -13,7 +13,6 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite import errors
 from zsp_lite.backbones.load import BackboneConfig
-from zsp_lite.backbones.pretrained import EMBEDDED
 from zsp_lite.cli import doctor
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
@@ -45,8 +44,7 @@ def test_an_unknown_option_is_one_line_and_exit_code_2(command, capsys):
 def test_help_lists_every_command(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    names = "demo estimate benchmark tables compare synth weights train train-baseline label data models profile doctor"
-    names = names.split()
+    names = "demo estimate benchmark tables compare synth weights data doctor".split()
     assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
 
 
@@ -71,13 +69,12 @@ def test_help_imports_no_large_library():
         (["demo", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
         (["demo", "--facet", "keys"], "'keys' is not one of 'key', 'query', 'value', 'token'"),
         (["benchmark", "--methods", ","], "expected names separated by commas"),
-        (["train", "--shorten", "nan"], "got 'nan', expected a positive number"),
-        (["train", "--shorten", "0"], "got '0', expected a positive number"),
-        (["train", "--seed", "-1"], "'--seed': -1 is not in the range x>=0"),
-        (["train-baseline", "resnet"], "'resnet' is not one of 'swav-tiny', 'posecontrast-tiny'"),
         (["synth", "--preset", "samples"], "Missing option '--out'"),
         (["synth", "--out", "x"], "expected either --preset or --category"),
         (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
+        (["data", "transfer", "a", "b", "c", "--max-residual", "nan"], "got 'nan', expected a positive number"),
+        (["data", "transfer", "a", "b", "c", "--max-residual", "0"], "got '0', expected a positive number"),
+        (["synth", "--preset", "a", "--seed", "-1", "--out", "x"], "'--seed': -1 is not in the range x>=0"),
         (["weights", "burn"], "No such command 'burn'"),
         (["weights", "fetch"], "Missing argument 'NAME'"),
         (["weights", "list", "dino_vits8"], "unexpected extra argument (dino_vits8)"),
@@ -101,10 +98,6 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--preset", "samples", "--frames", "3", "--out", "x"], "--category"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["train", "--start-from", "lost.pt", "--out", "x"], "or the name of embedded weights"),
-        (["train", "--start-from", ".", "--out", "x"], ".: is a folder, expected a checkpoint of `train`"),
-        (["train", "--shorten", "1e308", "--out", "x"], "1e+308"),
-        (["train", "--self-distillation", "--start-from", "a", "--out", "x"], "--start-from"),
         (["weights", "fetch", "resnet"], "resnet"),
         (["data", "check", "a\0b"], "without null bytes"),
         (["demo", "--out", "a\0b"], "without null bytes"),
@@ -154,7 +147,7 @@ def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys)
 def test_the_doctor_lists_every_check_and_what_is_missing(capsys, ellipsoids):
     code = cli.main(["doctor", "--data", str(ellipsoids.root)])
     text = capsys.readouterr().out
-    for name in ("Python", "torch", "open3d loads", "backbone zsp-tiny", "data: --data", "Jupyter"):
+    for name in ("Python", "torch", "weights zsp-tiny", "cache", "data: --data"):
         assert name in text
     assert (code == 0) == ("Everything required is installed." in text)
 
@@ -248,7 +241,7 @@ def test_layer_facet_and_size_reach_the_backbone_of_the_demo(ellipsoids, tmp_pat
     demo = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
     assert cli.main([*demo, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
     assert cli.main([*demo, "--backbone", "dino_vits8"]) == 0
-    assert loaded == [BackboneConfig("zsp-tiny-photo", "block3", "value", 96), "dino_vits8"]
+    assert loaded == [BackboneConfig("zsp-tiny", "block3", "value", 96), "dino_vits8"]
 
 
 def test_synth_writes_a_co3d_folder(tmp_path):
@@ -263,19 +256,6 @@ def test_weights_list_has_every_backbone(capsys):
     assert cli.main(["weights", "list"]) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
-
-
-def test_weights_that_are_not_in_the_wheel_are_said_to_be_in_the_repository(capsys, monkeypatch, tmp_path):
-    monkeypatch.setitem(EMBEDDED, "zsp-tiny-primitives", tmp_path / "earlier" / "zsp-tiny-primitives.safetensors")
-    monkeypatch.setitem(EMBEDDED, "zsp-tiny", tmp_path / "zsp-tiny.safetensors")
-    assert cli.main(["weights", "list"]) == 0
-    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
-    assert lines["zsp-tiny-primitives"] == "only in the repository"
-    assert lines["zsp-tiny"] == "missing: reinstall zsp-lite"
-    assert cli.main(["weights", "fetch", "zsp-tiny-primitives"]) == 2
-    assert "zsp-tiny-primitives.safetensors is missing; these weights are only in the repository" in assert_one_line(
-        capsys
-    )
 
 
 def assert_one_line(capsys) -> str:
@@ -294,12 +274,10 @@ def test_benchmark_list_has_every_method_and_group(capsys):
 
 
 @pytest.mark.slow
-def test_a_run_is_planned_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
+def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("zsp_lite.benchmark.run.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setenv("COLUMNS", "200")
     rows = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "2", "--targets", "3", "--methods", "table3"]
-    assert cli.main([*rows, "--out", str(tmp_path / "a"), "--plan"]) == 0
-    assert "2 (8 estimates in all rows)" in capsys.readouterr().out and not (tmp_path / "a").exists()
     for name in "ab":
         assert cli.main([*rows, "--out", str(tmp_path / name), "--quiet"]) == 0
         assert capsys.readouterr().out == ""
@@ -325,15 +303,11 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         raise Reached
 
     monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
-    monkeypatch.setattr("zsp_lite.benchmark.run.plan_run", record)
     words = "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair --pairs 7 --targets 3"
     words = ["benchmark", "--data", str(tmp_path), *words.split(), "--methods", "ours,sift", "--seed", "4"]
     words += ["--out", "there", "--allow-other-version"]
     config = BackboneConfig("small", "3", "value", 64)
     common = (tmp_path, config, ["ours", "sift"], 7, 3, 4, Path("there"), ["lump", "chair"])
-    with pytest.raises(Reached):
-        cli.main([*words, "--plan"])
-    assert given.pop("arguments") == (*common, True) and not given
     words += "--workers 5 --executor dask://host:1 --threads 6 --cache kept --keep-hypotheses".split()
     with pytest.raises(Reached):
         cli.main(words)

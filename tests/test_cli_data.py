@@ -1,6 +1,5 @@
 """The commands for data: their output, the files they write, and one line for bad input."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,6 @@ import pytest
 from co3d_folders import sequence_data
 from test_importers import METRES, write_lists, write_tum
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, write_co3d
@@ -66,39 +64,6 @@ def test_a_capture_is_imported(root, tmp_path, capsys):
     assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 4
 
 
-def test_label_lists_the_progress_and_draws_a_contact_sheet(root, tmp_path, capsys):
-    assert main(["label", str(root), "chair", "--list"]) == 0
-    assert capsys.readouterr().out.split()[:2] == ["a", "reference"]
-    sheet = tmp_path / "sheets/chair.png"
-    assert main(["label", str(root), "chair", "--contact-sheet", str(sheet)]) == 0
-    assert sheet.read_bytes().startswith(b"\x89PNG")
-    assert main(["label", str(root), "chair", "--contact-sheet", str(tmp_path / "sheet.doc")]) == 2
-    assert "expected the name of a .png file" in capsys.readouterr().err
-
-
-def test_label_proposes_alignments_by_the_given_backbone(root, monkeypatch, capsys):
-    given, pose = [], Sim3.identity()
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: f"loaded {name}")
-
-    def estimate(dataset, backbone, *names):
-        given.append((backbone, *names))
-        return pose, 0.7
-
-    monkeypatch.setattr("zsp_lite.labelling.guess.guess_alignment", estimate)
-    monkeypatch.setattr("zsp_lite.labelling.Labelling.guess", lambda self, *arguments: given.append(arguments))
-    proposals = []
-
-    def label_category(labelling, ask, show, propose):
-        proposals.append(propose is not None and propose("b"))
-
-    monkeypatch.setattr("zsp_lite.labelling.desktop.label_category", label_category)
-    assert main(["label", str(root), "chair"]) == 0
-    assert proposals == [False] and not given
-    assert main(["label", str(root), "chair", "--guess", "--backbone", "small"]) == 0
-    assert given == [("loaded small", "chair", "a", "b"), ("b", pose)]
-    assert "b: proposed with 70 % confidence" in capsys.readouterr().out
-
-
 def test_options_of_transfer_and_import_reach_the_library(tmp_path, monkeypatch):
     given = []
 
@@ -148,14 +113,6 @@ def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
     assert not (tmp_path / "mine").exists()
 
 
-def test_label_without_a_desktop_gives_one_line(root, monkeypatch, capsys):
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert main(["label", str(root), "chair"]) == 2
-    assert "DISPLAY is not set" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -171,18 +128,8 @@ def test_label_without_a_desktop_gives_one_line(root, monkeypatch, capsys):
          "expected four numbers"),
         (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--box", "inf,1,2,3"],
          "expected four numbers"),
-        (["label", "/nowhere", "chair"], "does not exist"),
     ],
 )  # fmt: skip
 def test_bad_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
     code, error = main(arguments), capsys.readouterr().err
     assert code == 2 and message in error and len(error.strip().splitlines()) == 1
-
-
-def test_keypoints_on_disk_are_json(root):
-    from zsp_lite.labelling import Labelling
-
-    labelling = Labelling(root, "chair")
-    labelling.pick("a", (0.5, 1.0, 2.0), "seat")
-    content = json.loads(labelling.path.read_text())
-    assert content["names"] == ["seat"] and content["picks"] == {"a": [[0.5, 1.0, 2.0]]}

@@ -15,7 +15,6 @@ from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks, rigid_label
 from zsp_lite.labelling.candidates import contact_sheet
-from zsp_lite.labelling.desktop import label_category
 from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.labelling.session import MAX_RESIDUAL
 from zsp_lite.metrics import rotation_error
@@ -246,32 +245,6 @@ def test_broken_picks_are_named(root):
         Labelling(root, "chair")
 
 
-def test_the_desktop_loop_labels_redoes_and_stops_where_it_is_told(root):
-    labelling = Labelling(root, "chair")
-    target = {"a": labelling.cloud("a")[0], "b": labelling.cloud("b")[0], "best": labelling.cloud("best")[0]}
-    picked, shown, said = [], [], []
-
-    def pick(cloud, title):
-        picked.append(title.split(":")[0])
-        # In the axes of the first camera, for a window that looks along -z with +y up.
-        turn = np.diag([1, -1, -1]) @ labelling.dataset.camera(labelling.dataset.frames("chair", picked[-1])[0]).R
-        np.testing.assert_allclose(cloud[0], target[picked[-1]] @ turn.T)
-        return [] if picked.count("a") == 1 and picked[-1] == "a" else [0, 1, 2, 3]
-
-    answers = iter(["Seat", "", "back", "arm", "a", "what", "R", "", "a", "y", "q"])
-    label_category(labelling, lambda _: next(answers), said.append, pick=pick, show=lambda *x: shown.append(x))
-    assert labelling.names == ("Seat", "keypoint 2", "back", "arm")
-    np.testing.assert_array_equal(labelling.picks("a"), target["a"][:4])  # in world coordinates
-    for reference, sequence, title in shown:
-        turn = np.diag([1, -1, -1]) @ labelling.first_view(title.split(":")[0])
-        np.testing.assert_allclose(sequence, target[title.split(":")[0]] @ turn.T)
-        assert reference.shape == target["best"].shape
-    assert picked == ["best", "a", "a", "a", "b"] and len(shown) == 3
-    assert list(read_labels(root, "chair")) == ["a", "best"]
-    assert "0 picked, 4 expected." in said
-    assert [row.state for row in labelling.progress()] == ["reference", "accepted", "open"]
-
-
 def confused(points):
     """The points with the first two exchanged."""
     return np.array([points[1], points[0], *points[2:]])
@@ -302,41 +275,9 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     assert "a" in read_labels(root, "chair")
 
 
-def test_the_desktop_asks_before_it_accepts_a_large_residual(root):
-    labelling, asked = Labelling(root, "chair"), []
-    pick_all(labelling, "best", 4 * corners())
-    labelling.put("a", confused(4 * corners("a")))
-    answers = iter(["a", "n", "a", "y", "q"])
-
-    def ask(question):
-        asked.append(question)
-        return next(answers)
-
-    picks = iter([[0, 1, 2, 3, 4]])  # of a random cloud
-    label_category(labelling, ask, lambda _: None, pick=lambda *_: next(picks, []), show=lambda *_: None)
-    assert [("nevertheless" in question) for question in asked[:4]] == [False, True, False, True]
-    assert "a: residual" in asked[1] and "a" in read_labels(root, "chair")
-
-
 def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
     edit_json(root / "chair" / FRAMES_FILE, lambda frames: [frame.pop("viewpoint") for frame in frames] and None)
     np.testing.assert_array_equal(Labelling(root, "chair").first_view("a"), np.eye(3))
-
-
-def test_the_desktop_reports_bad_picks_and_asks_again(root):
-    labelling, said = Labelling(root, "chair"), []
-    pick_all(labelling, "best", corners())
-    labelling.put("a", np.outer(np.arange(5), (1, 2, 3)))  # collinear, from an earlier session
-    picks = iter([[0, 1, 2, 3, 3], [0, 1, 2, 3, 4]])
-
-    def guess(sequence):
-        raise InputError("no frame has depth")
-
-    answers = iter(["a", "y", "s"])
-    label_category(labelling, lambda _: next(answers), said.append, guess, lambda *_: next(picks, []), lambda *_: None)
-    assert any("collinear" in line for line in said) and any("are the same point" in line for line in said)
-    assert "b: no guess: no frame has depth" in said
-    assert [row.state for row in labelling.progress()] == ["reference", "accepted", "skipped"]
 
 
 def test_the_reference_of_given_sequences_is_the_best_of_them(root):
@@ -354,15 +295,6 @@ def test_the_contact_sheet_has_a_row_for_every_candidate(root):
     assert figure.axes[0].get_ylabel() == "best\ncloud 3.00\nviews 2.00"
     with pytest.raises(InputError, match="no candidate sequences"):
         contact_sheet(dataset, "chair", [])
-
-
-def test_a_window_without_a_display_is_an_input_error(root, monkeypatch):
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    labelling = Labelling(root, "chair")
-    with pytest.raises(InputError, match="DISPLAY is not set"):
-        label_category(labelling, lambda _: "q", lambda _: None)
 
 
 @pytest.mark.slow

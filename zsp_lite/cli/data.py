@@ -1,4 +1,4 @@
-"""The commands for data: `label` and `data check`, `data labels`, `data transfer`, `data import`.
+"""The commands for data: `data check`, `data labels`, `data transfer`, `data import`.
 
 `data download` is in `zsp_lite.cli.download`.
 """
@@ -15,7 +15,6 @@ from zsp_lite.cli.common import (
     examples,
     four_integers,
     four_numbers,
-    names,
     positive,
     replace_option,
 )
@@ -23,94 +22,6 @@ from zsp_lite.errors import InputError
 
 if TYPE_CHECKING:
     from zsp_lite.data.check import CategoryCheck
-
-
-@click.command(
-    epilog=examples(
-        "label path/to/co3d chair",
-        "label path/to/co3d chair --guess",
-        "label path/to/co3d chair --list",
-        "label path/to/co3d chair --contact-sheet outputs/chairs.png",
-    )
-)
-@click.argument("root", type=PATH)
-@click.argument("category")
-@click.option(
-    "--reference", metavar="SEQ", show_default="the sequence with the best point cloud",
-    help="Sequence that defines the poses.",
-)  # fmt: skip
-@click.option(
-    "--sequences", type=names, metavar="A,B,...", show_default="the ten with the best point clouds",
-    help="Sequences to label.",
-)  # fmt: skip
-@click.option("--guess", is_flag=True, help="Propose each alignment by pose estimation first.")
-@click.option("--backbone", metavar="NAME", default="zsp-tiny-photo", help="Backbone of --guess, as for `benchmark`.")
-@click.option("--list", "list_only", is_flag=True, help="Print the progress of every sequence, and exit.")
-@click.option("--contact-sheet", type=PATH, metavar="PNG", help="Draw the candidate sequences into a file, and exit.")
-def label(
-    root: Path, category: str, reference: str | None, sequences: list[str] | None, guess: bool, backbone: str,
-    list_only: bool, contact_sheet: Path | None,
-) -> None:  # fmt: skip
-    """Label poses with keypoints in Open3D's picking window.
-
-    ROOT is a folder in CO3D's layout. Each sequence of CATEGORY is aligned to the reference sequence by keypoints
-    that are picked on both point clouds; an overlay shows the result, to accept or to redo.
-    """
-    from zsp_lite.labelling import Labelling
-
-    labelling = Labelling(root, category, sequences, reference)
-    if contact_sheet:
-        _draw_contact_sheet(labelling, contact_sheet)
-    if list_only or not contact_sheet:
-        _print_progress(labelling)
-    if list_only or contact_sheet:
-        return
-    from zsp_lite.labelling.desktop import label_category
-
-    propose = None
-    if guess:
-        from zsp_lite.backbones.load import load_backbone
-        from zsp_lite.labelling.guess import guess_alignment
-
-        model = load_backbone(backbone)
-
-        def propose(sequence: str) -> None:
-            found = guess_alignment(labelling.dataset, model, labelling.category, labelling.reference, sequence)
-            print(f"{sequence}: proposed with {100 * found[1]:.0f} % confidence")
-            labelling.guess(sequence, found[0])
-
-    label_category(labelling, ask, print, propose)
-
-
-def _draw_contact_sheet(labelling, path: Path) -> None:
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--contact-sheet is {path}, expected the name of a .png file")
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from zsp_lite.labelling.candidates import contact_sheet
-
-    sequences = {one.sequence_name: one for one in labelling.dataset.sequences(labelling.category)}
-    figure = contact_sheet(labelling.dataset, labelling.category, [sequences[name] for name in labelling.sequences])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    print(f"Written: {path}")
-
-
-def _print_progress(labelling) -> None:
-    for row in labelling.progress():
-        residual = "" if row.rms is None else f", residual {100 * row.rms:.1f} % of their spread"
-        imported = row.state == "accepted" and not row.picks
-        picks = "imported label, no keypoints" if imported else f"{row.picks} keypoints"
-        print(f"{row.sequence:24} {row.state:10} {picks}{residual}")
-
-
-def ask(question: str) -> str:
-    """Ask on the terminal. InputError if standard input is closed."""
-    try:
-        return input(question)
-    except EOFError as error:
-        raise InputError("standard input is closed, expected a terminal") from error
 
 
 @click.group(

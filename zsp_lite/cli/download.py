@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from zsp_lite.cli.common import COUNT, PATH, examples
-from zsp_lite.cli.data import ask, print_checks
+from zsp_lite.cli.data import print_checks
 from zsp_lite.errors import InputError
 
 LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
@@ -125,4 +125,7 @@ def _print_sizes(names: Sequence[str], sizes: Sequence[int | None]) -> None:
 def _confirmed(question: str) -> bool:
     if not sys.stdin.isatty():
         raise InputError("nobody can confirm the download: standard input is not a terminal, expected --yes")
-    return ask(question).strip().lower() in ("y", "yes")
+    try:
+        return input(question).strip().lower() in ("y", "yes")
+    except EOFError as error:
+        raise InputError("standard input is closed, expected --yes") from error

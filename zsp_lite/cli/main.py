@@ -158,8 +158,6 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 @cli.command(
     epilog=examples(
         "synth --preset demo --out outputs/demo-data",
-        "synth --preset samples --out outputs/procedural",
-        "synth --preset eval --out outputs/eval",
         "synth --preset paper --out outputs/paper",
         "synth --category chair --category car --sequences 2 --seed 7 --out outputs/mine",
         "synth --category validation --sequences 8 --frames 16 --seed 5 --out outputs/validation",
@@ -169,8 +167,8 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 )
 @click.option(
     "--preset", metavar="NAME",
-    help="Procedural objects: demo (3 categories, 15 s), samples (4; not data_samples/), eval (10), or paper: 20 "
-    "categories of 10 sequences of 100 frames, about an hour and a half and 1.4 GB. An existing folder is completed.",
+    help="Procedural objects: demo (3 categories, 15 s), paper-small (20 of 5 sequences of 24 frames), or paper (20 of "
+    "10 sequences of 100 frames, about an hour and a half and 1.4 GB). An existing folder is completed.",
 )  # fmt: skip
 @click.option(
     "--category", "categories", multiple=True, metavar="NAME",
@@ -274,15 +272,15 @@ def verify(name: str) -> None:
 @cli.command(epilog=examples("doctor", "doctor --data path/to/co3d"))
 @click.option("--data", type=PATH, metavar="DIR", help="Also check this CO3D folder.")
 def doctor(data: Path | None) -> int:
-    """Check the installation, the weights and the data, and print a fix for every problem."""
-    from zsp_lite.cli.doctor import BAD, ok, run_checks
+    """Check Python, PyTorch, the weights, the cache and the data, and print a fix for every problem."""
+    from zsp_lite.cli.doctor import BAD, run_checks
 
-    checks = run_checks(data)
-    width = max(len(check.name) for check in checks)
-    for check in checks:
-        print(f"{check.state:4}  {check.name:{width}}  {check.found}")
+    failed = []
+    for check in run_checks(data):
+        print(f"{check.state:4}  {check.name:22}  {check.found}")
         if check.fix:
-            print(f"{'':4}  {'':{width}}  -> {check.fix}")
-    failed = [check.name for check in checks if check.state == BAD]
+            print(f"{'':4}  {'':22}  -> {check.fix}")
+        if check.state == BAD:
+            failed.append(check.name)
     print(f"Missing or broken: {', '.join(failed)}." if failed else "Everything required is installed.")
-    return 0 if ok(checks) else 1
+    return 1 if failed else 0
