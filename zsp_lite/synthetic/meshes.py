@@ -25,48 +25,31 @@ _INVISIBLE = 0.02  # opacity below which a face is removed
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Surface of a part of a mesh.
+    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`, all sRGB.
 
-    Attributes:
-        colour: sRGB colour and opacity in [0, 1], a factor of the texture. An opacity below 1 means glass.
-        texture: sRGB colour and opacity, rows from top to bottom. Opacity below 0.5 means a hole (cut-out).
-        pattern: Another factor: the sRGB colours (n, 3) in [0, 1] of points (n, 3) in object coordinates.
-        specular: Reflectance at normal incidence, in [0, 1].
-        roughness: Width of the highlight as in glTF: 0 for a mirror, 1 for a matte surface.
-        metallic: 1 for metals, whose reflection has the colour of the surface.
+    A pattern maps points (n, 3) in object coordinates to colours (n, 3) in [0, 1].
     """
 
-    colour: Float[np.ndarray, "4"]
-    texture: UInt8[np.ndarray, "h w 4"] | None = None
+    colour: Float[np.ndarray, "4"]  # with opacity, in [0, 1]; an opacity below 1 means glass
+    texture: UInt8[np.ndarray, "h w 4"] | None = None  # rows from top to bottom; opacity below 128 means a hole
     pattern: Callable[[np.ndarray], np.ndarray] | None = None
-    specular: float = 0.04
-    roughness: float = 0.7
-    metallic: float = 0.0
+    specular: float = 0.04  # reflectance at normal incidence
+    roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
+    metallic: float = 0.0  # 1 for metals, whose reflection has the colour of the surface
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """A triangle mesh with materials.
-
-    Attributes:
-        vertices: Vertices.
-        faces: Triangles as indices of vertices.
-        normals: Unit shading normal of each corner of each face.
-        uv: Texture coordinates of each corner; (0, 0) is the lower left corner of the texture, which repeats.
-        colours: sRGB colour of each corner in [0, 1], a factor of the material's colour.
-        material: Index of each face's material.
-        materials: Materials.
-        name: Name for messages.
-    """
+    """A triangle mesh with materials."""
 
     vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    normals: Float[np.ndarray, "f 3 3"]
-    uv: Float[np.ndarray, "f 3 2"]
-    colours: Float[np.ndarray, "f 3 3"]
-    material: Int[np.ndarray, " f"]
+    faces: Int[np.ndarray, "f 3"]  # indices of vertices
+    normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
+    uv: Float[np.ndarray, "f 3 2"]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
+    colours: Float[np.ndarray, "f 3 3"]  # sRGB in [0, 1] of each corner, a factor of the material's colour
+    material: Int[np.ndarray, " f"]  # index of each face
     materials: tuple[Material, ...]
-    name: str = "mesh"
+    name: str = "mesh"  # for messages
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:

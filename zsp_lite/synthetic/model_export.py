@@ -56,26 +56,12 @@ def export_models(
 ) -> dict[str, str]:
     """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
 
-    A sequence has the name of its model, and depends only on the seed, the model and its orientation. Complete
-    sequences are not rendered again, unless the model or its orientation changed. The first model of a category is
-    the reference of its labels.
+    A sequence has the name of its model, and depends only on the seed, the model and its orientation. An incomplete
+    export is completed; complete sequences are not rendered again, unless the model or its orientation changed. The
+    first model of a category is the reference of its labels. `front` and `up` are those of `list_models`.
 
-    Args:
-        folder: Folder of models, see `zsp_lite.synthetic.models`.
-        out: Data folder to write; an incomplete export is completed.
-        frames: Frames per sequence.
-        seed: Seed of rooms, cameras, noise and pairs.
-        image_size: Shorter image side in pixels.
-        front: Front of the models for which `models.json` gives none, see `list_models`.
-        up: Top of these models.
-        progress: Wraps the loop over models, as tqdm does.
-
-    Returns:
-        Models that were left out ("CATEGORY/NAME"), with the reason.
-
-    Raises:
-        InputError: If the folder holds no usable model, a setting is out of its range, or `out` was written with
-            other settings.
+    Returns the models that were left out ("CATEGORY/NAME"), with the reason. Raises InputError if the folder holds no
+    usable model, a setting is out of its range, or `out` was written with other settings.
     """
     check_integer("frames", frames, 1, MOST_FRAMES)
     check_integer("image_size", image_size, 32, MOST_PIXELS)

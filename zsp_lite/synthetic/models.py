@@ -24,13 +24,7 @@ _Direction = str | tuple[float, float, float]
 class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     """Entry of `models.json` for one model; every field is optional.
 
-    Attributes:
-        front: Direction of the object's front in the axes of the file: "+x", "-x", ... "-z", or three numbers.
-        up: Direction of the object's top in the axes of the file.
-        author: Author of the model.
-        licence: Licence of the model.
-        source: Where the model comes from.
-        changes: What was changed with respect to the source.
+    `front` and `up` are directions in the axes of the file: "+x", "-x", ... "-z", or three numbers.
     """
 
     front: _Direction | None = None
@@ -38,7 +32,7 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     author: str = ""
     licence: str = ""
     source: str = ""
-    changes: str = ""
+    changes: str = ""  # with respect to the source
 
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the axes of the file to the canonical frame (front +x, left +y, up +z).

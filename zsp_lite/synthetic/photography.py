@@ -11,23 +11,18 @@ from zsp_lite.synthetic.textures import linear_to_srgb
 
 @dataclass(frozen=True, eq=False)
 class CheapCamera:
-    """Response of a camera: from linear radiance to 8-bit sRGB.
+    """Response of a camera: from linear radiance to 8-bit sRGB. Blurs are in pixels of an image of 256 pixels."""
 
-    Attributes:
-        exposure: Mean luminance after automatic exposure, with 1 for white.
-        white_balance: Remaining factor of each channel after automatic white balance.
-        noise: Standard deviation of the noise at mid-grey, relative to white; shot noise and read noise.
-        blur: Standard deviation of the lens' point spread in pixels of an image of 256 pixels.
-        vignetting: Loss of light in the corners, as a fraction.
-        defocus: Blur of the background in pixels of an image of 256 pixels.
-    """
-
-    exposure: float = 0.2
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    noise: float = 0.01
-    blur: float = 0.4
-    vignetting: float = 0.1
-    defocus: float = 1.0
+    exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
+    white_balance: tuple[float, float, float] = (
+        1.0,
+        1.0,
+        1.0,
+    )  # remaining factor of each channel after automatic balance
+    noise: float = 0.01  # standard deviation at mid-grey, relative to white; shot noise and read noise
+    blur: float = 0.4  # standard deviation of the lens' point spread
+    vignetting: float = 0.1  # loss of light in the corners, as a fraction
+    defocus: float = 1.0  # blur of the background
 
     def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
         """Return the factor of automatic exposure, from mean and median, which limits the effect of bright windows."""

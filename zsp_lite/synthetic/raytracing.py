@@ -38,19 +38,12 @@ _BLOCKED = 0.25  # light of a direction that another part of the object blocks, 
 
 @dataclass(frozen=True)
 class Quality:
-    """Numbers of rays.
+    """Numbers of rays."""
 
-    Attributes:
-        samples: Samples per pixel along each axis.
-        shadow_rays: Rays per sample towards the key light; with 1, shadows are hard.
-        ambient_rays: Rays per sample towards the room; with 0, no part of the object blocks the light of the room.
-        shadow_map: Points along each side of the grid on which the shadow on the floor is known.
-    """
-
-    samples: int = 2
-    shadow_rays: int = 3
-    ambient_rays: int = 8
-    shadow_map: int = 320
+    samples: int = 2  # per pixel along each axis
+    shadow_rays: int = 3  # per sample towards the key light; with 1, shadows are hard
+    ambient_rays: int = 8  # per sample towards the room; with 0, no part of the object blocks its light
+    shadow_map: int = 320  # points along each side of the grid on which the shadow on the floor is known
 
 
 FASTEST = Quality(samples=1, shadow_rays=1, ambient_rays=0, shadow_map=96)

@@ -10,22 +10,13 @@ from zsp_lite.data.cameras import Camera
 
 @dataclass(frozen=True)
 class Rendering:
-    """One rendered view with its exact geometry.
-
-    Attributes:
-        rgb: Picture.
-        depth: z coordinate in the camera frame, 0 where the ray hits neither the object nor the floor.
-        mask: Pixels of the object.
-        canonical: Object coordinates of each object pixel, NaN elsewhere.
-        normals: Unit normals of the object pixels in the camera frame, 0 elsewhere.
-        camera: Camera of the view.
-    """
+    """One rendered view with its exact geometry."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float[np.ndarray, "h w"]
-    mask: Bool[np.ndarray, "h w"]
-    canonical: Float[np.ndarray, "h w 3"]
-    normals: Float[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]  # z in the camera frame, 0 where the ray hits neither the object nor the floor
+    mask: Bool[np.ndarray, "h w"]  # pixels of the object
+    canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
+    normals: Float[np.ndarray, "h w 3"]  # unit normals of the object pixels in the camera frame, 0 elsewhere
     camera: Camera
 
 

@@ -36,26 +36,16 @@ class Room:
     The origin is on the floor below the object. `images` are those of the faces -x, +x, -y, +y, floor, ceiling. The
     floor's is an albedo, the others are radiances. The rows of a wall run from the ceiling to the floor, those of the
     floor and of the ceiling along y; the columns run along y on the first two walls, along x elsewhere.
-
-    Attributes:
-        low, high: Corners of the box; low[2] is 0.
-        images: One linear image per face.
-        light: Unit vector towards the key light.
-        light_radius: Angular radius of the key light in radians.
-        light_colour: Irradiance of the key light on a surface that faces it.
-        ambient: Irradiance of everything else on an unoccluded floor.
-        gloss: Reflectance of the floor at normal incidence.
-        camera: Camera that takes the pictures.
     """
 
-    low: Float[np.ndarray, "3"]
+    low: Float[np.ndarray, "3"]  # corners of the box; low[2] is 0
     high: Float[np.ndarray, "3"]
-    images: tuple[np.ndarray, ...]
-    light: Float[np.ndarray, "3"]
-    light_radius: float
-    light_colour: Float[np.ndarray, "3"]
-    ambient: Float[np.ndarray, "3"]
-    gloss: float
+    images: tuple[np.ndarray, ...]  # linear, one per face
+    light: Float[np.ndarray, "3"]  # unit vector towards the key light
+    light_radius: float  # angular radius of the key light in radians
+    light_colour: Float[np.ndarray, "3"]  # irradiance of the key light on a surface that faces it
+    ambient: Float[np.ndarray, "3"]  # irradiance of everything else on an unoccluded floor
+    gloss: float  # reflectance of the floor at normal incidence
     camera: CheapCamera
 
 

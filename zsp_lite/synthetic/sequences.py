@@ -19,18 +19,11 @@ _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that si
 
 @dataclass(frozen=True, eq=False)
 class RenderedSequence:
-    """Exact views of one object, and the pose of the object in the world of the sequence.
+    """Exact views of one object, and the pose of the object in the world of the sequence."""
 
-    Attributes:
-        views: Renderings; their cameras map from the world.
-        timestamps: Time of each view in seconds.
-        object_pose: Rigid transform [R t] of the object: `world = R @ (scale * canonical) + t`.
-        scale: Scale of the object.
-    """
-
-    views: tuple[Rendering, ...]
-    timestamps: tuple[float, ...]
-    object_pose: Float[np.ndarray, "4 4"]
+    views: tuple[Rendering, ...]  # their cameras map from the world
+    timestamps: tuple[float, ...]  # seconds
+    object_pose: Float[np.ndarray, "4 4"]  # rigid transform [R t]: `world = R @ (scale * canonical) + t`
     scale: float
 
     def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
