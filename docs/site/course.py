@@ -30,6 +30,15 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
+# A line "- `zsp_lite.NAME`" of a page of the reference becomes a section with the docstrings of this module.
+MODULE = r"""
+## \1
+
+```{eval-rst}
+.. automodule:: zsp_lite.\1
+```
+"""
+
 INSTALL_IN_COLAB = """\
 # Colab only: fetches the repository with its sample data, installs zsp-lite (minutes).
 import sys
@@ -71,6 +80,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
             lambda link: link[1] if (path.parent / link[2]).is_dir() else link[0],
             source[0],
         )
+    if docname.startswith("docs/api/"):
+        source[0] = re.sub(r"^- `zsp_lite\.(\S+)`$", MODULE, source[0], flags=re.MULTILINE)
 
 
 def remove_solutions(notebook: NotebookNode, root: Path) -> None:
