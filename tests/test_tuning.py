@@ -21,7 +21,8 @@ from tools.tuning import (
 )
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.verified.confidence import Calibration, reliability
+from zsp_lite.metrics import reliability
+from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 
 TRUE_WEIGHTS = ScoreWeights(6, 0, -4, -2, 0, 3, 0, -1, 2)

@@ -22,15 +22,13 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import auroc, reliability, rotation_error
 from zsp_lite.verified.confidence import (
     Calibration,
-    auroc,
     hypothesis_probabilities,
     is_one_of_two,
     modes,
     nearly_as_probable,
-    reliability,
 )
 from zsp_lite.verified.maps import build_maps, project_points
 from zsp_lite.verified.poses import (
@@ -316,7 +314,7 @@ def test_soft_icp_reaches_scales_from_a_half_to_two(scene, scale, reached):
     points, n = scene.reference_points, len(scene.reference_points)
     columns = torch.arange(n)
     larger = replace(
-        scene, target_points=scale * points, target_view=0 * columns, target_column=columns,
+        scene, target_points=scale * points, target_column=columns,
         target_weight=torch.full((n,), 1 / n), similarity=torch.eye(n),
     )  # fmt: skip
     start = as_poses(Sim3(min(max(0.9 * scale, 0.5), 2.0), np.eye(3), np.zeros(3)))

@@ -35,10 +35,10 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import reliability, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import Calibration, different_poses, modes, reliability
+from zsp_lite.verified.confidence import Calibration, different_poses, modes
 from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
 from zsp_lite.views import View, usable_targets
 

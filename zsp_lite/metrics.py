@@ -6,9 +6,10 @@ object are not independent: `object_weights` resamples objects, and its weights 
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError, check_magnitude, real_array
@@ -36,10 +37,10 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """
     first, second = _rotations("first", first), _rotations("second", second)
     _check_broadcast("rotation_error", first.shape[:-2], second.shape[:-2])
-    return rotation_angle(first, second)[()]
+    return rotation_angle(first, second)
 
 
-def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*c"]:
+def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]) -> np.ndarray | float:
     """Compute the angles of `rotation_error` without checks."""
     relative = np.swapaxes(first, -1, -2) @ second
     twice_sine = np.sqrt(
@@ -48,7 +49,7 @@ def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray,
         + np.square(relative[..., 1, 0] - relative[..., 0, 1])
     )
     twice_cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
-    return np.degrees(np.arctan2(twice_sine, twice_cosine))
+    return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
 def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
@@ -368,3 +369,73 @@ def _errors(errors: ArrayLike, low: float = 0.0, high: float = 180.0) -> np.ndar
     if not ((errors >= low) & (errors <= high)).all():  # False for NaN too
         raise InputError(f"errors hold {errors.min()} to {errors.max()}, expected {low:g} to {high:g} degrees")
     return errors
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table.
+
+    Bins hold equal numbers of estimates, in order of confidence.
+
+    Attributes:
+        auroc: Area under the ROC curve (see `auroc`).
+        calibration_error: Expected calibration error, in [0, 1].
+        top_half_accuracy: Fraction of correct estimates among the more confident half.
+        count: (bins,) number of estimates.
+        confidence: (bins,) mean confidence.
+        accuracy: (bins,) fraction of correct estimates.
+    """
+
+    auroc: float
+    calibration_error: float
+    top_half_accuracy: float
+    count: np.ndarray
+    confidence: Float[np.ndarray, " bins"]
+    accuracy: Float[np.ndarray, " bins"]
+
+    def __str__(self) -> str:
+        lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]
+        lines += [
+            f"{n:5d} {100 * c:10.1f}% {100 * a:7.1f}%" for n, c, a in zip(self.count, self.confidence, self.accuracy)
+        ]
+        lines.append(
+            f"AUROC {self.auroc:.3f}, expected calibration error {100 * self.calibration_error:.1f} points, "
+            f"accuracy of the more confident half {100 * self.top_half_accuracy:.1f} %"
+        )
+        return "\n".join(lines)
+
+
+def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
+    """Measure the reliability of confidences.
+
+    Args:
+        confidence: Confidences of n estimates, in [0, 1].
+        correct: Which of the estimates were correct.
+        bins: Number of bins of equal count.
+
+    Raises:
+        InputError: If the lengths differ or there are fewer estimates than bins.
+    """
+    confidence, correct = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
+    if confidence.shape != correct.shape or confidence.ndim != 1 or len(correct) < bins:
+        raise InputError(
+            f"{len(correct)} outcomes and {len(confidence)} confidences, expected equal numbers of at least {bins}"
+        )
+    order = np.argsort(confidence, kind="stable")
+    parts = np.array_split(order, bins)
+    mean = np.array([confidence[part].mean() for part in parts])
+    accuracy = np.array([correct[part].mean() for part in parts])
+    count = np.array([len(part) for part in parts])
+    upper_half = order[len(order) // 2 :]
+    error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
+    return Reliability(auroc(confidence, correct), error, float(correct[upper_half].mean()), count, mean, accuracy)
+
+
+def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
+    """Estimate the probability that a correct estimate has a higher confidence than a wrong one, ties counting half."""
+    correct = np.asarray(correct, dtype=bool)
+    positive, negative = np.asarray(confidence)[correct], np.asarray(confidence)[~correct]
+    if not len(positive) or not len(negative):
+        return float("nan")
+    difference = positive[:, None] - negative
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())

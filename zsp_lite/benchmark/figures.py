@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from zsp_lite.benchmark import published
 from zsp_lite.benchmark.results import Results
 from zsp_lite.errors import InputError
-from zsp_lite.verified.confidence import reliability
+from zsp_lite.metrics import reliability
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
 
 _VIEWS = (1, 3, 5, 10, 20)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
+from zsp_lite.verified.poses import float_tensor
 from zsp_lite.views import View
 
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the processor's cache.
@@ -29,29 +30,20 @@ _DEPTH, _WEIGHT, _SILHOUETTE, _PATCH = range(4)
 
 @dataclass(frozen=True, eq=False)
 class ViewMaps:
-    """Cameras of v views in working units, and one table row for each of their pixels.
+    """Cameras of v views in working units, and one table row for each of their pixels."""
 
-    Attributes:
-        rotation: (v, 3, 3) world-to-camera, `x_cam = rotation @ x + translation` with x in the working frame.
-        translation: (v, 3), working units.
-        focal_length: (v,) in map pixels; the maps are resampled so that it is equal along both axes.
-        principal_point: (v, 2), (x, y) in map pixels.
-        size: (v, 2), (width, height) in map pixels, whole numbers.
-        first_row: (v,) table row of each view's first pixel.
-        table: (pixels, 4), row-major, view after view: depth in working units; weight of that depth (the soft mask, 0
-            where the depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the
-            patch (-1 for none). Columns are contiguous in memory.
-        pixel_scale: (v, 2), (x, y) pixels of the view's frame per map pixel.
-    """
-
+    # world-to-camera, `x_cam = rotation @ x + translation` with x in the working frame
     rotation: Float[Tensor, "v 3 3"]
-    translation: Float[Tensor, "v 3"]
-    focal_length: Float[Tensor, " v"]
-    principal_point: Float[Tensor, "v 2"]
-    size: Float[Tensor, "v 2"]
-    first_row: Int[Tensor, " v"]
+    translation: Float[Tensor, "v 3"]  # working units
+    focal_length: Float[Tensor, " v"]  # in map pixels; the maps are resampled so that it is equal along both axes
+    principal_point: Float[Tensor, "v 2"]  # (x, y) in map pixels
+    size: Float[Tensor, "v 2"]  # (width, height) in map pixels, whole numbers
+    first_row: Int[Tensor, " v"]  # table row of each view's first pixel
+    # row-major, view after view: depth in working units; weight of that depth (the soft mask, 0 where
+    # the depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the patch (-1
+    # for none). Columns are contiguous in memory
     table: Float[Tensor, "pixels 4"]
-    pixel_scale: Float[Tensor, "v 2"]
+    pixel_scale: Float[Tensor, "v 2"]  # (x, y) pixels of the view's frame per map pixel
 
     def __len__(self) -> int:
         return len(self.focal_length)
@@ -59,23 +51,16 @@ class ViewMaps:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """n points under m poses, projected into v views, with the map values at their pixels.
+    """n points under m poses, projected into v views, with the map values at their pixels."""
 
-    Attributes:
-        depth: (m, v, n) depth of the point, working units.
-        surface_depth: (m, v, n) measured depth at its pixel, working units.
-        weight: (m, v, n) weight of the measured depth in [0, 1], 0 where it is unknown or background.
-        silhouette_distance: (m, v, n) distance to the silhouette at the point's depth, working units, 0 inside.
-        patch: (m, v, n) similarity column of the patch at its pixel, -1 for none.
-        pixels: (m, v, n, 2), (x, y) in map pixels.
-    """
-
-    depth: Float[Tensor, "m v n"]
-    surface_depth: Float[Tensor, "m v n"]
+    depth: Float[Tensor, "m v n"]  # depth of the point, working units
+    surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
+    # weight of the measured depth in [0, 1], 0 where it is unknown or background
     weight: Float[Tensor, "m v n"]
+    # distance to the silhouette at the point's depth, working units, 0 inside
     silhouette_distance: Float[Tensor, "m v n"]
-    patch: Int[Tensor, "m v n"]
-    pixels: Float[Tensor, "m v n 2"]
+    patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
+    pixels: Float[Tensor, "m v n 2"]  # (x, y) in map pixels
 
 
 def build_maps(
@@ -84,53 +69,34 @@ def build_maps(
     world_to_working: Sim3,
     columns: Sequence[Int[np.ndarray, " patches"]],
 ) -> ViewMaps:
-    """Build the maps of views that share a world frame.
-
-    Args:
-        views: The v views.
-        world_to_camera: Rotation and translation of each view, from their common world frame.
-        world_to_working: From that frame to working units; its rotation must be the identity.
-        columns: Per view, the similarity column of each patch (row-major), -1 for none.
-    """
+    """Build the maps of views that share a world frame."""
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
     origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
     lengths = [table.shape[1] for table in tables]
 
-    def tensor(values) -> Tensor:
-        return torch.from_numpy(np.asarray(values, dtype=np.float32))
-
     sizes = np.array([camera.size[::-1] for camera in cameras])
     translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(
-        tensor([R for R, _ in world_to_camera]),
-        tensor(translations),
-        tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
-        tensor([camera.principal_point for camera in cameras]),
-        tensor(sizes),
+        float_tensor([R for R, _ in world_to_camera]),
+        float_tensor(translations),
+        float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
+        float_tensor([camera.principal_point for camera in cameras]),
+        float_tensor(sizes),
         torch.from_numpy(np.cumsum([0, *lengths[:-1]])),
         torch.from_numpy(np.concatenate(tables, axis=1)).T,
-        tensor([view.frame.camera.size[::-1] for view in views] / sizes),
+        float_tensor([view.frame.camera.size[::-1] for view in views] / sizes),
     )
 
 
 def project_points(
-    maps: ViewMaps,
-    linear: Float[Tensor, "m 3 3"],
-    translation: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
+    maps: ViewMaps, linear: Float[Tensor, "m 3 3"], translation: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"]
 ) -> Projection:
     """Transform points by `linear @ x + translation`, project them into every view and read the maps.
 
     A point beyond the image border reads the nearest border pixel. Its silhouette distance is that of the border
     pixel plus the distance to it. It is 0 if the border pixel lies inside the silhouette: the object is cut off
     there, and its extent beyond the border is unknown.
-
-    Args:
-        maps: Maps of the v views.
-        linear: Linear parts of m poses in the working frame.
-        translation: Translations of m poses, working units.
-        points: The n points in working units.
     """
     m, v = len(linear), len(maps)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)

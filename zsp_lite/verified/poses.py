@@ -18,15 +18,9 @@ SCALE_RANGE = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """m similarity transforms `y = scale * rotation @ x + translation` in working units (see `scene.Scene`), float32.
+    """m similarity transforms `y = scale * rotation @ x + translation` in working units, float32."""
 
-    Attributes:
-        scale: (m,), positive.
-        rotation: (m, 3, 3).
-        translation: (m, 3).
-    """
-
-    scale: Float[Tensor, " m"]
+    scale: Float[Tensor, " m"]  # positive
     rotation: Float[Tensor, "m 3 3"]
     translation: Float[Tensor, "m 3"]
 
@@ -60,16 +54,17 @@ def concatenate(batches: Sequence[Poses]) -> Poses:
 
 def nearest_rotation(covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
     """Solve the orthogonal Procrustes problem (`alignment.nearest_rotation`) for a batch of covariances."""
-    return _tensor(alignment.nearest_rotation(covariance.double().numpy())[0])
+    return float_tensor(alignment.nearest_rotation(covariance.double().numpy())[0])
 
 
 def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) -> Poses:
     """Fit a similarity to each of m sets of n corresponding points (`alignment.umeyama_batch`)."""
-    return Poses(*map(_tensor, alignment.umeyama_batch(source.double().numpy(), target.double().numpy())[:3]))
+    return Poses(*map(float_tensor, alignment.umeyama_batch(source.double().numpy(), target.double().numpy())[:3]))
 
 
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(values).float()
+def float_tensor(values) -> Tensor:
+    """Convert an array, or nested lists, to a float32 tensor."""
+    return torch.from_numpy(np.asarray(values, dtype=np.float32))
 
 
 def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -95,17 +90,7 @@ def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 def non_maximum_suppression(
     rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], min_angle: float, max_count: int
 ) -> Int[Tensor, " kept"]:
-    """Select the best-scored poses whose rotations differ.
-
-    Args:
-        rotation: Rotations of the poses.
-        score: Scores of the poses, higher is better.
-        min_angle: Smallest angle in degrees between any two selected rotations.
-        max_count: Largest number of poses to select.
-
-    Returns:
-        Indices of the selected poses, best score first.
-    """
+    """Select the best-scored poses whose rotations differ."""
     order = torch.argsort(score, descending=True, stable=True)
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
     kept: list[int] = []

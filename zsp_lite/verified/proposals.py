@@ -21,8 +21,8 @@ from zsp_lite.verified.poses import (
 )
 from zsp_lite.verified.scene import Scene
 
-TRIALS = 300  # samples of three matches, per view
-PER_VIEW = 6  # proposals kept per view
+_TRIALS = 300  # samples of three matches, per view
+_PER_VIEW = 6  # proposals kept per view
 _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 _POOL = 200  # best samples of a view that go into non-maximum suppression
@@ -32,59 +32,32 @@ _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about 
 _VIEW_SCALE = 0.9
 
 
-def propose_poses(
-    scene: Scene, seed: int | np.random.Generator = 0, trials: int = TRIALS, per_view: int = PER_VIEW
-) -> Poses:
-    """Propose poses from the matches of each target view, followed by those of `poses_from_views`.
-
-    Args:
-        scene: Scene with N target views.
-        seed: Seed or generator of the samples.
-        trials: Samples of three matches, per view.
-        per_view: Largest number of proposals from the matches of a view.
-
-    Returns:
-        N + 11 to N * (per_view + 1) + 11 poses.
-    """
+def propose_poses(scene: Scene, seed: int | np.random.Generator = 0) -> Poses:
+    """Propose poses from the matches of each target view, followed by those of `poses_from_views`."""
     rng = np.random.default_rng(seed)
-    proposals = [poses_from_matches(source, target, rng, trials, per_view) for source, target in scene.matches]
+    proposals = [poses_from_matches(source, target, rng) for source, target in scene.matches]
     return concatenate([*proposals, poses_from_views(scene)])
 
 
 def poses_from_matches(
-    source: Float[Tensor, "k 3"],
-    target: Float[Tensor, "k 3"],
-    seed: int | np.random.Generator = 0,
-    trials: int = TRIALS,
-    max_count: int = PER_VIEW,
+    source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], seed: int | np.random.Generator = 0
 ) -> Poses:
     """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees.
 
     Samples are scored as in MSAC (Torr and Zisserman 2000), by the truncated quadratic
     sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2) over all matches.
-
-    Args:
-        source: Matched points of the reference, in working units.
-        target: Matched points of the target view, in working units.
-        seed: Seed or generator of the samples.
-        trials: Number of samples.
-        max_count: Largest number of poses to return.
-
-    Returns:
-        At most `max_count` poses, best score first. None for fewer than three matches, or if no fit has a scale
-        within `SCALE_RANGE`.
     """
     rng = np.random.default_rng(seed)
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
-    sample = torch.from_numpy(np.argpartition(rng.random((trials, len(source))), (0, 1, 2), axis=1)[:, :3].copy())
+    sample = torch.from_numpy(np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3].copy())
     poses = fit_poses(source[sample], target[sample])
     smallest, largest = SCALE_RANGE
     poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    return poses[best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, max_count)]]
+    return poses[best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)]]
 
 
 def poses_from_views(scene: Scene) -> Poses:

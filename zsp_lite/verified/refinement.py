@@ -5,7 +5,7 @@ evolution strategy: per round it perturbs every pose with Gaussian steps of shri
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,25 +26,15 @@ _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
 _PARENTS = 6
 
 
-@dataclass(frozen=True)
-class SearchSchedule:
-    """Number and widths of the steps of a search.
-
-    Attributes:
-        rounds: Number of rounds.
-        samples: Steps per round and pose.
-        rotation: Standard deviation of each component of the rotation vector, in degrees, in the first round.
-        translation: Standard deviation of each component, in working units, in the first round.
-        scale: Standard deviation of the logarithm of the scale, in the first round.
-        decay: Factor on all three after each round.
-    """
+class SearchSchedule(NamedTuple):
+    """Number of rounds and of steps per round and pose, and standard deviations of the steps in the first round."""
 
     rounds: int
     samples: int
-    rotation: float
-    translation: float
-    scale: float
-    decay: float
+    rotation: float  # of each component of the rotation vector, degrees
+    translation: float  # of each component, working units
+    scale: float  # of the logarithm
+    decay: float  # factor on all three after each round
 
 
 COARSE = SearchSchedule(rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65)
@@ -58,15 +48,6 @@ def refine_coarse_to_fine(
     """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
 
     Scores are computed from a subset of the points.
-
-    Args:
-        scene: Scene to score against.
-        poses: Poses to start from.
-        weights: Weights of the score.
-        seed: Seed or generator of the steps.
-
-    Returns:
-        At most six poses. The best three have been polished with nearly all points.
     """
     rng = np.random.default_rng(seed)
     score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
@@ -88,15 +69,6 @@ def refine(
     Each round keeps the best step if it raises the score. The weighted mean of the six best steps is a candidate of
     the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
     Rotations are about the centroid of the reference's points, which is the origin in working units.
-
-    Args:
-        poses: Poses to start from.
-        score: Function to maximise.
-        schedule: Number and widths of the steps.
-        seed: Seed or generator of the steps.
-
-    Returns:
-        The refined poses and their scores, which are at least those of the given poses.
     """
     rng = np.random.default_rng(seed)
     best_score, m = score(poses), len(poses)

@@ -20,7 +20,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.maps import ViewMaps, build_maps
-from zsp_lite.verified.poses import Poses, exp_
+from zsp_lite.verified.poses import Poses, exp_, float_tensor
 from zsp_lite.views import View
 
 # Points farther from the median point than this many median distances are outliers: patches at a silhouette may have
@@ -34,38 +34,23 @@ MIN_POINTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A reference view and v target views of another object, prepared for scoring poses.
+    """A reference view and v target views of another object, prepared for scoring poses."""
 
-    Attributes:
-        reference_points: (n, 3) foreground patches of known depth in the reference, working units.
-        target_points: (m, 3) the same of all target views.
-        target_view: (m,) index of the view of each target point.
-        target_column: (m,) column of each target point in `similarity`.
-        target_weight: (m,) share of the surface that each target point represents; they sum to 1.
-        similarity: (n, columns) double-centred feature similarity of each reference point to each foreground patch of
-            all targets (see `double_centre`).
-        reference_maps: Per-pixel maps of the reference.
-        target_maps: Per-pixel maps of the targets.
-        reference_to_working: Reference camera to working units.
-        target_to_working: First target camera to working units.
-        target_cameras: Cameras of the targets.
-        matches: Per target, the matched points of reference and target, working units.
-        view_similarity: (v,) feature similarity of each target view to the reference less their mean (see
-            `view_similarity`).
-    """
-
-    reference_points: Float[Tensor, "n 3"]
-    target_points: Float[Tensor, "m 3"]
-    target_view: Int[Tensor, " m"]
-    target_column: Int[Tensor, " m"]
-    target_weight: Float[Tensor, " m"]
+    reference_points: Float[Tensor, "n 3"]  # foreground patches of known depth in the reference, working units
+    target_points: Float[Tensor, "m 3"]  # the same of all target views
+    target_column: Int[Tensor, " m"]  # column of each target point in `similarity`
+    target_weight: Float[Tensor, " m"]  # share of the surface that each target point represents; they sum to 1
+    # double-centred feature similarity of each reference point to each foreground patch of all targets
+    # (see `double_centre`)
     similarity: Float[Tensor, "n columns"]
-    reference_maps: ViewMaps
-    target_maps: ViewMaps
-    reference_to_working: Sim3
-    target_to_working: Sim3
-    target_cameras: tuple[Camera, ...]
+    reference_maps: ViewMaps  # per-pixel maps of the reference
+    target_maps: ViewMaps  # per-pixel maps of the targets
+    reference_to_working: Sim3  # Reference camera to working units
+    target_to_working: Sim3  # first target camera to working units
+    target_cameras: tuple[Camera, ...]  # cameras of the targets
+    # Per target, the matched points of reference and target, working units
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
+    # feature similarity of each target view to the reference less their mean (see `view_similarity`)
     view_similarity: Float[Tensor, " v"]
 
     @property
@@ -84,18 +69,7 @@ class Scene:
 def build_scene(
     reference: View, targets: Sequence[View], similarities: Sequence[Tensor], matches: Sequence[Matches] = ()
 ) -> Scene:
-    """Prepare the scene of a reference view and its target views.
-
-    Args:
-        reference: Reference view.
-        targets: Target views.
-        similarities: Per target, (patches of the reference, patches of the target) as from `matching.similarities`.
-        matches: Per target, on the patch grids; matches without a known depth on both sides are dropped.
-
-    Raises:
-        InputError: If the reference, or all targets together, have fewer than MIN_POINTS foreground patches of known
-            depth, or if all of their points are equal.
-    """
+    """Prepare the scene of a reference view and its target views."""
     first = targets[0].frame.camera
     to_camera = [_relative_pose(first, target.frame.camera) for target in targets]
     source, source_valid = _patch_cloud(reference)
@@ -121,14 +95,15 @@ def build_scene(
     matched = []
     for target, cloud, match in zip(targets, clouds, matches):
         u, v = _matched_patches(reference, target, match)
-        matched.append((_tensor(reference_to_working.apply(source[u])), _tensor(target_to_working.apply(cloud[v]))))
+        matched.append(
+            (float_tensor(reference_to_working.apply(source[u])), float_tensor(target_to_working.apply(cloud[v])))
+        )
     target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
     return Scene(
-        reference_points=_tensor(reference_to_working.apply(source[source_valid])),
-        target_points=_tensor(target_points),
-        target_view=torch.from_numpy(np.repeat(np.arange(len(targets)), [chosen.sum() for chosen in valid])),
+        reference_points=float_tensor(reference_to_working.apply(source[source_valid])),
+        target_points=float_tensor(target_points),
         target_column=torch.from_numpy(np.concatenate([column[chosen] for column, chosen in zip(columns, valid)])),
-        target_weight=surface_weights(_tensor(target_points)),
+        target_weight=surface_weights(float_tensor(target_points)),
         similarity=torch.cat(centred, dim=1).contiguous(),
         reference_maps=build_maps(
             [reference], [(np.eye(3), np.zeros(3))], reference_to_working, [_number(source_valid)]
@@ -155,16 +130,9 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
 
 
 def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
-    """Average each foreground patch's highest similarity in the other view, in both directions.
-
-    Args:
-        similarity: Similarity between the foreground patches of two views.
-
-    Returns:
-        A scalar in [-1, 1]; -1 if one of the views has no foreground.
-    """
+    """Average each foreground patch's highest similarity in the other view, in both directions."""
     if not similarity.numel():
-        return similarity.new_tensor(-1.0)
+        return similarity.newfloat_tensor(-1.0)
     return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
 
 
@@ -172,9 +140,6 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """Weight points by the inverse of a Gaussian kernel density, so that densely sampled surface does not count more.
 
     A part of the surface that three views show has three times as many points as a part that one view shows.
-
-    Returns:
-        (m,) positive weights that sum to 1.
     """
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
@@ -226,7 +191,3 @@ def _normalisation(
     if not spread > 0:
         raise InputError(f"{name}: all {len(points)} foreground points are equal, expected an object with extent")
     return Sim3(1 / spread, np.eye(3), -mean / spread), kept
-
-
-def _tensor(values) -> Tensor:
-    return torch.from_numpy(np.asarray(values, dtype=np.float32))

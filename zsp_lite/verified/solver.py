@@ -10,15 +10,8 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.best_view import ViewPair
-from zsp_lite.errors import check_seed
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.confidence import (
-    Calibration,
-    hypothesis_probabilities,
-    is_one_of_two,
-    modes,
-    nearly_as_probable,
-)
+from zsp_lite.verified.confidence import Calibration, hypothesis_probabilities, is_one_of_two, modes, nearly_as_probable
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
@@ -38,27 +31,17 @@ _MIN_SIMILARITY = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Hypotheses of the verified solver, and what they were scored on.
+    """Hypotheses of the verified solver, and what they were scored on."""
 
-    Attributes:
-        hypotheses: Best score first, at least one, at least 15 degrees apart.
-        view_angles: (N,) angle in degrees between the reference's camera and each target view's under the best one.
-        flags: One line per reason not to trust the best one.
-        one_of_two: Whether the answer is one of two poses (see `confidence.is_one_of_two`).
-        timings: Seconds per stage.
-        scene: The scene that poses were scored on.
-        view_order: Index of the target view behind each view of the scene.
-        poses: The hypotheses in the scene's working units.
-    """
-
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
+    # (N,) angle in degrees between the reference's camera and each target view's under the best one
     view_angles: Float[np.ndarray, " n"]
-    flags: tuple[str, ...]
-    one_of_two: bool
-    timings: dict[str, float]
-    scene: Scene
-    view_order: tuple[int, ...]
-    poses: Poses
+    flags: tuple[str, ...]  # one line per reason not to trust the best one
+    one_of_two: bool  # whether the answer is one of two poses (see `confidence.is_one_of_two`)
+    timings: dict[str, float]  # seconds per stage
+    scene: Scene  # the scene that poses were scored on
+    view_order: tuple[int, ...]  # index of the target view behind each view of the scene
+    poses: Poses  # the hypotheses in the scene's working units
 
     @property
     def target_spread(self) -> float:
@@ -68,15 +51,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class VerifiedSolver:
-    """A `estimates.Solver` that scores many poses against all target views. The defaults had the highest accuracy.
+    """A `estimates.Solver` that scores many poses against all target views."""
 
-    Attributes:
-        weights: Weights of the score's terms.
-        calibration: Coefficients of the probabilities.
-        kmeans: Whether k-means selects the matches (see `ZeroShotPose.kmeans`).
-    """
-
-    kmeans: ClassVar[bool] = False
+    kmeans: ClassVar[bool] = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
     weights: ScoreWeights = ScoreWeights()
     calibration: Calibration = Calibration()
 
@@ -100,27 +77,15 @@ class VerifiedSolver:
         )  # fmt: skip
 
     def solve(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        pairs: Sequence[ViewPair],
-        seed: int | np.random.Generator = 0,
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], seed: int | np.random.Generator = 0
     ) -> Solution:
-        """Run all stages: proposals, soft ICP, verification, refinement, ranking.
+        """Run all stages on usable target views and their matches with the reference.
 
         The result is equivariant to the order of the target views and to rotations of their world frame.
 
-        Args:
-            reference: Reference view.
-            targets: N >= 1 usable target views (see `views.usable_targets`).
-            pairs: For each target view, its similarities to the reference and their matches.
-            seed: Seed or generator of all random draws.
-
         Raises:
-            InputError: The seed is negative or no integer; or the reference, or all targets together, have too few
-                foreground patches of known depth.
+            InputError: The reference, or all targets together, have too few foreground patches of known depth.
         """
-        check_seed("seed", seed)
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
             with timed(timings, "scene"):
@@ -142,61 +107,50 @@ class VerifiedSolver:
                 terms = score_terms(scene, poses)
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
-                hypotheses, view_angles = self._hypotheses(scene, poses, terms, order)
-        angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
-        flags, one_of_two = reliability_flags(hypotheses, angle)
+                hypotheses = self._hypotheses(scene, poses, terms, order)
+        view_angles = np.empty(len(order))
+        view_angles[list(order)] = _view_angles(scene, poses)[0]
+        flags, one_of_two = reliability_flags(hypotheses, rotation_angles(poses.rotation, poses.rotation).numpy())
         return Solution(hypotheses, view_angles, flags, one_of_two, timings, scene, order, poses)
 
     def _hypotheses(
         self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
-    ) -> tuple[tuple[Hypothesis, ...], Float[np.ndarray, " n"]]:
-        """Build the hypotheses of ranked poses, and return them with the view angles of the best one."""
+    ) -> tuple[Hypothesis, ...]:
+        """Build the hypotheses of ranked poses."""
         score = self.weights.score(terms).double().numpy()
-        angle = rotation_angles(poses.rotation, poses.rotation).double().numpy()
-        mode = modes(angle)
+        mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
         confidence = hypothesis_probabilities(
-            score,
-            mode,
-            len(order),
-            scene.view_similarity_std,
-            float(self.weights.shape_fit(terms)[0]),
+            score, mode, len(order), scene.view_similarity_std, float(self.weights.shape_fit(terms)[0]),
             self.calibration,
-        )
-        view_angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).double().numpy()
-        hypotheses = []
-        for i, view in enumerate(view_angle.argmin(axis=1)):
-            sim3 = scene.to_sim3(poses, i, int(view))
-            hypotheses.append(
-                Hypothesis(sim3, order[view], float(score[i]), terms.as_dict(i), float(confidence[i]), int(mode[i]))
+        )  # fmt: skip
+        return tuple(
+            Hypothesis(
+                scene.to_sim3(poses, i, view), order[view], float(score[i]), terms.as_dict(i), float(confidence[i]),
+                int(mode[i]),
             )
-        view_angles = np.empty(len(order))
-        view_angles[list(order)] = view_angle[0]
-        return tuple(hypotheses), view_angles
+            for i, view in enumerate(_view_angles(scene, poses).argmin(axis=1))
+        )  # fmt: skip
+
+
+def _view_angles(scene: Scene, poses: Poses) -> Float[np.ndarray, "m v"]:
+    """Compute the angle in degrees between the reference's camera under each pose and each target view's."""
+    return rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
 
 
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses.
-
-    Args:
-        hypotheses: Hypotheses, best first.
-        angle: Angles between their rotations, degrees.
-    """
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
     terms, flags = hypotheses[0].terms, []
     probability = np.array([one.confidence for one in hypotheses])
     mode = np.array([one.mode for one in hypotheses])
     tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
     shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
-    if one_of_two:
+    if len(tied) > 1:
+        start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
         flags.append(
-            f"one of two: poses {angle[tied[0], tied[1]]:.0f} degrees apart explain the views about equally well "
-            f"(probabilities {shown}): the object may be symmetric"
-        )
-    elif len(tied) > 1:
-        flags.append(
-            f"{len(tied)} poses more than 30 degrees apart explain the views about equally well (probabilities "
-            f"{shown}): the object may be symmetric"
+            f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
+            "symmetric"
         )
     if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
         flags.append("no view confirms the pose: nearly no point lies on an observed surface")

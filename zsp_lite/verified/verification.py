@@ -115,21 +115,13 @@ class ScoreWeights:
 
 @dataclass(frozen=True, eq=False)
 class PointTerms:
-    """The parts of the terms for each point in each view, before averaging (see the module's docstring).
+    """The parts of the terms for each point in each view, before averaging (see the module's docstring)."""
 
-    Attributes:
-        projection: Where the n points fall in the v views under m poses.
-        surface: (m, v, n), a: weight in [0, 1] with which the point lies on the measured surface.
-        silhouette: (m, v, n), c: in [0, 1].
-        free_space: (m, v, n), b: in [0, 1].
-        similarity: (m, v, n), s: feature similarity to the patch at the pixel, 0 without one.
-    """
-
-    projection: Projection
-    surface: Float[Tensor, "m v n"]
-    silhouette: Float[Tensor, "m v n"]
-    free_space: Float[Tensor, "m v n"]
-    similarity: Float[Tensor, "m v n"]
+    projection: Projection  # where the n points fall in the v views under m poses
+    surface: Float[Tensor, "m v n"]  # a: weight in [0, 1] with which the point lies on the measured surface
+    silhouette: Float[Tensor, "m v n"]  # c: in [0, 1]
+    free_space: Float[Tensor, "m v n"]  # b: in [0, 1]
+    similarity: Float[Tensor, "m v n"]  # s: feature similarity to the patch at the pixel, 0 without one
 
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
         """Yield similarity, overlap, silhouette and free space of each pose, averaged over views and points."""
@@ -158,13 +150,7 @@ def reverse_terms(scene: Scene, poses: Poses, indices: Int[Tensor, " n"] | None 
 
 
 def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> ScoreTerms:
-    """Compute the terms of every pose.
-
-    Args:
-        scene: The scene to score against.
-        poses: The m poses.
-        stride: Step through the reference points and the target points; larger is faster and less exact.
-    """
+    """Compute the terms of every pose."""
     rows = torch.arange(0, len(scene.reference_points), stride[0])
     indices = torch.arange(0, len(scene.target_points), stride[1])
     size = max(_CHUNK // (len(rows) * len(scene.target_maps) + len(indices)), 1)
@@ -191,14 +177,7 @@ def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
-    """Compute the point terms of a projection.
-
-    Args:
-        scene: The scene to score against.
-        projection: Where the n points fall.
-        offset: Index of each point's first entry in the flattened similarity matrix.
-        patch_stride: Step from there to the next patch of the views that the points are projected into.
-    """
+    """Compute the point terms of a projection."""
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
     free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)

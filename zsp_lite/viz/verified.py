@@ -17,8 +17,9 @@ from torch import Tensor
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
+from zsp_lite.metrics import Reliability, reliability
 from zsp_lite.points import object_cloud
-from zsp_lite.verified.confidence import MODE_ANGLE, Reliability, reliability
+from zsp_lite.verified.confidence import MODE_ANGLE
 from zsp_lite.verified.maps import ViewMaps
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreWeights
