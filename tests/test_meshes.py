@@ -9,7 +9,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.synthetic import meshes
 from zsp_lite.synthetic.assembly import surface_spread
 from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
-from zsp_lite.synthetic.models import ModelInfo, list_models, read_infos, turn_model
+from zsp_lite.synthetic.models import ModelInfo, list_models
 from zsp_lite.synthetic.primitives import box, ellipsoid
 from zsp_lite.synthetic.textures import srgb_to_linear
 
@@ -170,21 +170,15 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
             info.axes(".obj")
 
 
-def test_turning_a_model_turns_its_canonical_shape_and_keeps_what_else_is_known(tmp_path):
+def test_given_axes_hold_for_the_models_that_the_models_file_does_not_orient(tmp_path):
     write_wedge(tmp_path / "chair" / "a.obj")
-    (tmp_path / "models.json").write_text('{"chair/a": {"author": "Ann", "licence": "CC0"}}')
-    before = list_models(tmp_path)[0].read().vertices
-    info = turn_model(tmp_path, "chair/a", "up", 90)
-    after = list_models(tmp_path)[0].read().vertices
-    assert after == pytest.approx(before @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T, abs=1e-9)
-    assert read_infos(tmp_path)["chair/a"] == info and (info.author, info.licence) == ("Ann", "CC0")
-    turn_model(tmp_path, "chair/a", "up", -90)
-    turn_model(tmp_path, "chair/a", "left", 30)
-    tilted = list_models(tmp_path)[0].read().vertices  # its unit is another: the mean over the axes changes
-    assert tilted[:, 1] / np.ptp(tilted[:, 1]) == pytest.approx(before[:, 1] / np.ptp(before[:, 1]), abs=1e-6)
-    for key, axis in (("chair/b", "up"), ("chair/a", "down")):
-        with pytest.raises(InputError, match="expected one of"):
-            turn_model(tmp_path, key, axis, 90)
+    write_wedge(tmp_path / "chair" / "b.obj")
+    (tmp_path / "models.json").write_text('{"chair/b": {"front": "+z", "up": "+y", "author": "Ann"}}')
+    turned, own = list_models(tmp_path, front="+x")
+    assert (turned.info.front, turned.info.up, own.info.front, own.info.author) == ("+x", None, "+z", "Ann")
+    # The side at +x of the file is on the left by default, and in front when +x is given.
+    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    assert turned.read().vertices == pytest.approx(own.read().vertices @ quarter.T, abs=1e-9)
 
 
 def test_a_folder_lists_models_in_files_and_in_folders_of_their_own(tmp_path):

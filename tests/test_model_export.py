@@ -1,11 +1,9 @@
-"""A folder of models becomes a data folder with exact labels; the user's renderer and sensor fit in."""
+"""A folder of models becomes a data folder with exact labels."""
 
 import json
 import re
 import shutil
-from functools import wraps
 
-import cv2
 import numpy as np
 import pytest
 from model_files import write_quad, write_wedge
@@ -16,21 +14,14 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.errors import InputError
+from zsp_lite.synthetic import model_export
 from zsp_lite.synthetic.ground_truth import ground_truth_pair, object_poses
 from zsp_lite.synthetic.model_export import RENDERED_FILE, export_models
-from zsp_lite.synthetic.model_sheet import label_overlay, sheet_views, write_contact_sheet, write_label_overlay
-from zsp_lite.synthetic.models import list_models, turn_model
-from zsp_lite.synthetic.raytracing import HARD_SHADOWS
-from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import render_sequence, render_views
+from zsp_lite.synthetic.models import list_models
 
-FRAMES, SIZE = 8, 64
+FRAMES, SIZE = 5, 64
+SETTINGS = {"frames": FRAMES, "seed": 3, "image_size": SIZE}
 pytestmark = pytest.mark.usefixtures("coarse_rooms")
-
-
-def quick(mesh, cameras, rng):
-    """The default renderer with hard shadows."""
-    return render_views(mesh, cameras, rng, HARD_SHADOWS)
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +29,12 @@ def folder(tmp_path_factory):
     """Two chairs, one of which lies on its back in its file, and a sign whose texture is missing."""
     root = tmp_path_factory.mktemp("models")
     write_wedge(root / "chair" / "high.obj", seat=0.9)
-    write_wedge(root / "chair" / "low.obj", seat=0.4)
-    (root / "models.json").write_text('{"chair/low": {"author": "Ann", "licence": "CC0-1.0"}}')
-    path = root / "chair" / "low.obj"
+    path = write_wedge(root / "chair" / "low.obj", seat=0.4)
     lines = path.read_text().splitlines()
     lying = [f"v {x} {-z} {y}" for x, y, z in (map(float, line.split()[1:]) for line in lines if line[0] == "v")]
     path.write_text("\n".join(lying + [line for line in lines if line[0] == "f"]) + "\n")
-    turn_model(root, "chair/low", "left", -90)
+    info = {"front": "-y", "up": "+z", "author": "Ann", "licence": "CC0-1.0"}
+    (root / "models.json").write_text(json.dumps({"chair/low": info}))
     write_quad(root / "sign" / "stop.obj", np.full((4, 4, 3), 200, np.uint8))
     (root / "sign" / "stop.png").unlink()
     return root
@@ -53,7 +43,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def data(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("data")
-    left_out = export_models(folder, out, FRAMES, seed=3, image_size=SIZE, renderer=quick)
+    left_out = export_models(folder, out, **SETTINGS)
     return Co3D(out), left_out
 
 
@@ -66,8 +56,6 @@ def test_the_data_folder_has_a_sequence_per_usable_model_and_names_the_others(da
     frame = dataset.load(frames[0])
     assert len(frames) == FRAMES and min(frame.camera.size) == SIZE
     assert 0.05 < (frame.mask > 0.5).mean() < 0.5 and 0.4 < (frame.depth[frame.mask > 0.9] > 0).mean() < 0.9
-    points, _ = dataset.point_cloud("chair", "low")
-    assert points.std(0).mean() == pytest.approx(1, abs=1e-3)
     record = json.loads((dataset.root / RENDERED_FILE).read_text())["sequences"]["chair"]["low"]
     assert (record["author"], record["licence"], record["file"]) == ("Ann", "CC0-1.0", "chair/low.obj")
 
@@ -88,31 +76,10 @@ def test_points_of_the_cloud_fill_the_bounding_box_of_the_model(data, folder):
         pose = object_poses(dataset, "chair")[model.name]
         points, _ = dataset.point_cloud("chair", model.name)
         inside = pose.to_box(points)
+        assert points.std(0).mean() == pytest.approx(1, abs=1e-3)
         assert np.quantile(inside, 0.01) > -0.1 and np.quantile(inside, 0.99) < 1.1
         vertices = model.read().vertices
         assert (pose.low == vertices.min(0)).all() and (pose.high == vertices.max(0)).all()
-
-
-def test_the_overlay_draws_the_front_of_the_reference_on_the_front_of_every_object(data, tmp_path):
-    """The tips of the overlay's axes are pixels near which the object shows its own front, left side and top."""
-    dataset, _ = data
-    drawn = label_overlay(dataset, "chair")
-    assert list(drawn) == ["high", "low"]
-    for name, (picture, pose, camera) in drawn.items():
-        own = object_poses(dataset, "chair")[name]
-        for axis in range(3):
-            (overlaid, true), _ = camera.project(np.stack([pose[:3, 3] + pose[:3, axis], own.t + own.R[:, axis]]))
-            assert overlaid == pytest.approx(true, abs=0.1)
-        towards = pose[:3, 0] @ (camera.centre - pose[:3, 3])
-        assert picture.shape == (200, 200, 3) and towards > 0  # the frame sees the front
-        # Matching colours: red, green and blue arrows are in the picture.
-        for channel in range(3):
-            others = np.delete(picture.astype(int), channel, axis=2).max(-1)
-            assert (picture[..., channel] - others > 60).sum() > 20
-    path = write_label_overlay(tmp_path / "overlay.png", dataset)
-    assert path.read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(InputError, match="extension '.doc'"):
-        write_label_overlay(tmp_path / "overlay.doc", dataset)
 
 
 def test_pairs_and_ground_truth_matches_exist(data):
@@ -122,127 +89,70 @@ def test_pairs_and_ground_truth_matches_exist(data):
     assert ground_truth_pair(dataset, pairs[0], (14, 14)).valid.sum() > 5
 
 
-def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path):
-    rendered = []
+def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path, monkeypatch):
+    rendered, record_sequence = [], model_export.record_sequence
 
-    @wraps(quick)
-    def counting(mesh, cameras, rng):
-        rendered.append(mesh.name)
-        return quick(mesh, cameras, rng)
+    def counting(mesh, name, *rest):
+        rendered.append(name)
+        return record_sequence(mesh, name, *rest)
 
-    copy, out = tmp_path / "models", tmp_path / "data"
-    shutil.copytree(folder, copy)
+    monkeypatch.setattr(model_export, "record_sequence", counting)
+    out = tmp_path / "data"
     shutil.copytree(data[0].root, out)
-    settings = {"frames": FRAMES, "seed": 3, "image_size": SIZE, "renderer": counting}
     before = read_labels(out, "chair")["low"].trans
-    export_models(copy, out, **settings)
+    export_models(folder, out, **SETTINGS)
     assert not rendered
-    turn_model(copy, "chair/low", "up", 90)
-    export_models(copy, out, **settings)
-    assert len(rendered) == 1 and rendered[0].endswith("low.obj")
+    export_models(folder, out, **SETTINGS, front="+x")  # of `high` alone: models.json orients the other one
+    assert rendered == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
     with pytest.raises(InputError, match="was written with"):
-        export_models(copy, out, **{**settings, "seed": 4})
-
-
-def test_a_renderer_and_a_sensor_of_the_user_take_the_place_of_the_own_ones(folder, tmp_path):
-    def black(mesh, cameras, rng):
-        for view in quick(mesh, cameras, rng):
-            view.rgb[:] = 0
-            yield view
-
-    def exact_masks(sequence, name, seed):
-        data, exact = simulate_capture(sequence, name, seed)
-        for frame, view in zip(data.frames, exact.views, strict=True):
-            frame.mask[:] = view.mask
-        return data, exact
-
-    export_models(folder, tmp_path, 2, image_size=48, renderer=black, sensor=exact_masks)
-    dataset = Co3D(tmp_path)
-    frame = dataset.load(dataset.frames("chair", "high")[1])
-    assert frame.rgb.max() < 5 and set(np.unique(frame.mask)) == {0, 1}
-    with pytest.raises(InputError, match="was written with .*'sensor': '.*exact_masks'"):
-        export_models(folder, tmp_path, 2, image_size=48, renderer=black)
-
-
-def test_landscape_pictures_and_coarse_depth_are_settings_of_an_export(folder, tmp_path):
-    for out, settings in (("fine", {}), ("coarse", {"landscape": True, "depth_bits": 6})):
-        export_models(folder, tmp_path / out, frames=1, image_size=SIZE, renderer=quick, **settings)
-    stored = {out: sorted((tmp_path / out).rglob("depths/*.png")) for out in ("fine", "coarse")}
-    dataset = Co3D(tmp_path / "coarse")
-    for annotation in (frame for s in dataset.sequences("chair") for frame in dataset.frames("chair", s.sequence_name)):
-        assert dataset.load(annotation).rgb.shape == (SIZE, 85, 3)
-    assert all(not (cv2.imread(str(path), -1) & 0b1111).any() for path in stored["coarse"])
-    assert any((cv2.imread(str(path), -1) & 0b1111).any() for path in stored["fine"])
-    with pytest.raises(InputError, match="was written with .*depth_bits"):
-        export_models(folder, tmp_path / "coarse", frames=1, image_size=SIZE, renderer=quick)
-    with pytest.raises(InputError, match="was written with .*'renderer': 'quick'"):
-        export_models(folder, tmp_path / "fine", frames=1, image_size=SIZE)
-    with pytest.raises(InputError, match="depth_bits is 11, expected an integer from 1 to 10"):
-        export_models(folder, tmp_path / "other", depth_bits=11)
-
-
-def test_cameras_do_not_depend_on_the_renderer(folder):
-    mesh = list_models(folder)[0].read()
-    one = render_sequence(mesh, 5, 3, 48, quick)
-    two = render_sequence(mesh, 5, 3, 48, lambda mesh, cameras, rng: quick(mesh, cameras, np.random.default_rng(0)))
-    for first, second in zip(one.views, two.views, strict=True):
-        assert (first.camera.matrix == second.camera.matrix).all()
-        assert (first.mask == second.mask).all() and (first.depth == second.depth)[first.mask].all()
-    assert (one.views[0].camera.matrix == np.eye(4)).all()
-
-
-def test_the_contact_sheet_shows_every_usable_model_three_times(folder, tmp_path):
-    unusable = write_contact_sheet(folder, tmp_path / "sheet.html", size=48)
-    page = (tmp_path / "sheet.html").read_text()
-    assert list(unusable) == ["sign/stop"] and "stop.png" in page
-    assert page.count("data:image/jpeg") == 6 and "Ann, CC0-1.0" in page
-    pictures = sheet_views(list_models(folder)[0].read(), 64)
-    assert [picture.shape for picture in pictures] == [(64, 64, 3)] * 3
+        export_models(folder, out, **{**SETTINGS, "seed": 4})
 
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
     write_quad(tmp_path / "models" / "sign" / "stop.obj", opacity=0)
     with pytest.raises(InputError, match="holds no usable model; sign/stop: .* no visible face"):
         export_models(tmp_path / "models", tmp_path / "out")
-    (data[0].root / RENDERED_FILE).rename(tmp_path / RENDERED_FILE)
+    shutil.copytree(data[0].root, tmp_path / "other")
+    (tmp_path / "other" / RENDERED_FILE).unlink()
     with pytest.raises(InputError, match="holds other data"):
-        export_models(folder, data[0].root)
-    (tmp_path / RENDERED_FILE).rename(data[0].root / RENDERED_FILE)
+        export_models(folder, tmp_path / "other")
 
 
-@pytest.mark.slow
-def test_the_command_line_renders_checks_and_turns_models(folder, tmp_path, capsys):
+def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_path, capsys):
     out, mine = tmp_path / "data", tmp_path / "mine"
     write_wedge(mine / "chair" / "a.obj")
     shutil.copytree(folder / "sign", mine / "sign")
-    arguments = ["synth", "--models", str(mine), "--frames", "2", "--image-size", "48", "--out", str(out)]
-    assert cli.main(arguments) == 0
+    arguments = ["--frames", "1", "--image-size", "48", "--front", "-x", "--up", "+z", "--out", str(out)]
+    assert cli.main(["synth", "--models", str(mine), *arguments]) == 0
     assert "Left out sign/stop" in capsys.readouterr().out
-    assert Co3D(out).categories() == ["chair"]
-    assert (out / "models.html").is_file() and (out / "label_overlay.jpg").is_file()
-    assert cli.main(["models", "sheet", str(mine), "--out", str(tmp_path / "sheet.html")]) == 0
-    assert (tmp_path / "sheet.html").read_bytes() == (out / "models.html").read_bytes()
-    capsys.readouterr()
-    assert cli.main(["models", "turn", str(mine), "chair/a", "--degrees", "90"]) == 0
-    assert capsys.readouterr().out == "chair/a: front -x, up +y in the axes of its file\n"
-    for wrong, message in (
-        (["synth", "--models", str(folder), "--preset", "eval", "--out", "x"], "or --models"),
-        (["synth", "--models", str(folder), "--sequences", "2", "--out", "x"], "one sequence per model"),
-        (["synth", "--category", "mouse", "--image-size", "64", "--out", "x"], "--image-size goes with --models"),
-        (["synth", "--models", str(tmp_path / "nowhere"), "--out", "x"], "does not exist"),
-        (["models", "turn", str(folder), "chair/none", "--degrees", "9"], "expected one of chair/high"),
-    ):
-        assert cli.main(wrong) == 2 and message in capsys.readouterr().err
+    rotation = json.loads((out / RENDERED_FILE).read_text())["sequences"]["chair"]["a"]["rotation"]
+    assert rotation == [-1, 0, 0, 0, -1, 0, 0, 0, 1]
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--models", "MODELS", "--preset", "paper"], "or --models"),
+        (["--models", "MODELS", "--sequences", "2"], "one sequence per model"),
+        (["--models", "MODELS", "--front", "+y"], "front is +y and up is +y, expected perpendicular axes"),
+        (["--models", "nowhere"], "does not exist"),
+        (["--category", "mouse", "--image-size", "64"], "--image-size goes with --models"),
+        (["--category", "mouse", "--up", "+z"], "--front and --up go with --models"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(tmp_path, capsys, wrong, message):
+    write_wedge(tmp_path / "chair" / "a.obj")
+    given = [str(tmp_path) if one == "MODELS" else one for one in wrong]
+    assert cli.main(["synth", *given, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_the_code_of_the_page_on_own_models_runs(tmp_path, monkeypatch, capsys):
     page = (REPOSITORY / "docs" / "own_models.md").read_text()
-    (dataset,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(dataset.strip().splitlines()) < 50
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(dataset, names := {})
+    exec(code, names := {})
     assert names["dataset"].categories() == ["disc"] and "disc" in capsys.readouterr().out
     first, second = (names["dataset"].point_cloud("disc", name)[0] for name in ("first", "second"))
     label = read_labels(tmp_path / "outputs" / "discs", "disc")["second"].trans
