@@ -14,22 +14,19 @@ class Server:
         break_after: The connection is closed after so many bytes of a response.
         stall_after: Nothing is sent after so many bytes of a response, but the connection stays open.
         knows_ranges: Whether Range headers are honoured.
-        knows_head: Whether HEAD requests are answered.
         chunked: Whether the length is not sent.
         surplus: Sent after the content.
     """
 
     def __init__(self, files: dict[str, bytes]):
         self.files, self.ranges, self.break_after, self.stall_after = files, [], None, None
-        self.knows_ranges = self.knows_head = True
+        self.knows_ranges = True
         self.chunked, self.surplus = False, b""
         self.closed = threading.Event()
         outer = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
             def do_HEAD(self):
-                if not outer.knows_head:
-                    return self.send_error(405)
                 content = outer.files.get(self.path)
                 if content is None:
                     return self.send_error(404)

@@ -56,12 +56,6 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
         Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,)))
 
 
-def test_a_frame_key_cannot_be_loaded_and_the_error_names_the_alternative(root):
-    dataset = Co3D(root)
-    with pytest.raises(InputError, match=r"got a FrameKey, expected a FrameAnnotation as Co3D\.frame"):
-        dataset.load(dataset.frame_list("chair")[0])
-
-
 @pytest.mark.parametrize("intrinsics_format", [V1, V2])
 def test_written_data_is_read_back(tmp_path, intrinsics_format):
     written = sequence_data("b_2", depth_scale_adjustment=1.7)
@@ -213,17 +207,6 @@ def test_a_viewpoint_that_is_no_rotation_is_refused_with_its_frame(root):
     edit_json(frames_file(root), lambda frames: frames[0]["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]))
     with pytest.raises(InputError, match="frame b_2/0: camera R"):
         Co3D(root).load(first(root))
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"no gzip", gzip.compress(b"[{]"), gzip.compress(b"[1, 2]"), "cut"],
-    ids=["empty", "no gzip", "no JSON", "no annotations", "cut"],
-)  # fmt: skip
-def test_broken_annotation_files_are_refused_by_name(root, data):
-    path = frames_file(root)
-    path.write_bytes(path.read_bytes()[:-40] if data == "cut" else data)
-    with pytest.raises(InputError, match=r"annotations .*frame_annotations\.jgz"):
-        Co3D(root).frame_list("chair")
 
 
 def test_unknown_folders_categories_sequences_and_frames_are_named(root):

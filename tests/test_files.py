@@ -1,38 +1,157 @@
-"""Limits on files: what is no file, grows too much, is too large or damaged is refused before it is read."""
+"""Limits on files, and one table of bad files: each is refused by one line that names it."""
 
 import gzip
 import io
+import json
 import os
 import struct
-import threading
-import zipfile
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from co3d_folders import edit_json, random_camera, sequence_data
+from co3d_folders import random_camera, sequence_data
+from safetensors.torch import save
 
 from zsp_lite.backbones.checkpoints import build_vit, read_checkpoint
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.data.annotations import read_frame_index
-from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.frames import Frame, read_image, resize_frame
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.data.pairs import read_upstream_pairs
+from zsp_lite.data.frames import Frame, read_depth, read_image, read_mask, resize_frame
+from zsp_lite.data.label_import import import_labels
+from zsp_lite.data.labels import parse_label
+from zsp_lite.data.pairs import check_upstream_pairs, read_upstream_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import decompress, growth_limit, read_arrays, read_bytes
-from zsp_lite.io.ply import read_ply, write_ply
-from zsp_lite.io.tensors import load_torch
+from zsp_lite.importers import READERS
+from zsp_lite.io import images
+from zsp_lite.io.files import decompress, growth_limit, path_inside, plain_name, read_bytes
+from zsp_lite.io.ply import read_ply
 
 PICTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
+JPEG, PNG = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png"))
+LABEL = {"trans": np.eye(4).tolist(), "seq": "b", "reference_seq": "a"}
+FRAME = b'{"sequence_name": "a", "frame_number": %d}'
+PLY = "ply\nformat %s 1.0\nelement vertex %d\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
 
 
-def test_a_pipe_is_refused_without_waiting_for_a_writer(tmp_path):
+class Code:
+    """Pickled as a call that makes the file `executed`."""
+
+    def __reduce__(self):
+        return open, ("executed", "w")
+
+
+def _torch(content) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+def _huge_png() -> bytes:
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(99))), (b"IEND", b""))
+    packed = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def _ply(count, body: bytes, kind="binary_little_endian") -> bytes:
+    return (PLY % (kind, count)).encode() + body
+
+
+def _label(**changes) -> bytes:
+    return json.dumps(LABEL | changes).encode()
+
+
+def _pairs(path):
+    return check_upstream_pairs(path.read_bytes(), f"pairs {path}")
+
+
+def _archive(path):
+    (path.parent / "data").mkdir(exist_ok=True)
+    return import_labels(path, path.parent / "data")
+
+
+def _read_label(path):
+    return parse_label(path.read_bytes(), f"label {path}")
+
+
+def _capture(path):
+    return READERS["nerfstudio"](path.parent)
+
+
+# Name of the file, its reader, what is wrong with it, its content, part of the message.
+BAD_FILES = [
+    *((name, read, damage, data, "cannot be decoded .*expected a complete JPEG or PNG")
+      for name, read in (("x.jpg", read_image), ("mask.png", read_mask), ("depth.png", read_depth))
+      for damage, data in {
+          "empty": b"", "text": b"text", "GIF": b"GIF89a" + bytes(20), "JPEG cut": JPEG[: len(JPEG) // 2],
+          "JPEG without a frame": b"\xff\xd8\xff\xd9", "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
+          "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
+      }.items()),
+    ("x.png", read_image, "huge", _huge_png(), "30000 x 30000 pixels, expected at most 67108864"),
+    ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
+    ("frame_annotations.jgz", read_frame_index, "empty", b"", "annotations .* are not"),
+    ("frame_annotations.jgz", read_frame_index, "no gzip", b"text", "are not complete gzip data"),
+    ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "are not complete gzip data"),
+    ("frame_annotations.jgz", read_frame_index, "bytes behind", gzip.compress(b"[]") + b"x", "not complete gzip data"),
+    ("frame_annotations.jgz", read_frame_index, "bomb", gzip.compress(bytes(growth_limit(0) + 1), 1), "grow from"),
+    ("frame_annotations.jgz", read_frame_index, "no JSON", gzip.compress(b"[{]"), "are not valid JSON"),
+    ("frame_annotations.jgz", read_frame_index, "nested", gzip.compress(b"[" * 100_000), "annotations"),
+    ("frame_annotations.jgz", read_frame_index, "not UTF-8", gzip.compress(b'["\xff"]'), "annotations"),
+    ("frame_annotations.jgz", read_frame_index, "another structure", gzip.compress(b"[1, 2]"), "Expected `object`"),
+    ("frame_annotations.jgz", read_frame_index, "a frame twice",
+     gzip.compress(b"[" + FRAME % 1 + b"," + FRAME % 1 + b"]"), "entries 0 and 1 are both frame 1 of a"),
+    ("b.json", _read_label, "scaled", _label(trans=np.diag([2.0, 2, 2, 1]).tolist()), "expected a rigid transform"),
+    ("b.json", _read_label, "of 1e300", _label(trans=(1e300 * np.eye(4)).tolist()), "expected a rigid transform"),
+    ("b.json", _read_label, "of null", _label(trans=None), "Expected `array`, got `null` - at `\\$.trans`"),
+    ("b.json", _read_label, "a list", b"[]", "Expected `object`, got `array`"),
+    ("x.ply", read_ply, "empty", b"", "is not a complete PLY file"),
+    ("x.ply", read_ply, "text", b"text", "is not a complete PLY file"),
+    ("x.ply", read_ply, "part of the header", _ply(1, bytes(12))[:60], "is not a complete PLY file"),
+    ("x.ply", read_ply, "cut", _ply(3, bytes(35)), "is not a complete PLY file"),
+    ("x.ply", read_ply, "too long", _ply(3, bytes(37)), "is not a complete PLY file"),
+    ("x.ply", read_ply, "10^12 points", _ply(10**12, bytes(36)), "is not a complete PLY file"),
+    ("x.ply", read_ply, "a word", _ply(1, b"0 0 red\n", "ascii"), "is not a complete PLY file"),
+    ("x.ply", read_ply, "no points", _ply(0, b""), "is not a complete PLY file"),
+    ("x.ply", read_ply, "not finite", _ply(1, np.float32([0, np.nan, 0]).tobytes()), "expected finite numbers"),
+    ("x.pth", read_checkpoint, "empty", b"", "damaged, or contains more than tensors"),
+    ("x.pth", read_checkpoint, "cut", _torch({"a": torch.zeros(99)})[:-200], "damaged, or contains more than tensors"),
+    ("x.pth", read_checkpoint, "code", _torch({"a": Code()}), "damaged, or contains more than tensors"),
+    ("x.pth", read_checkpoint, "a number", _torch(5), "expected a state dict of tensors, got int"),
+    ("x.safetensors", read_checkpoint, "empty", b"", "damaged, or contains more than tensors"),
+    ("x.safetensors", read_checkpoint, "cut", save({"a": torch.zeros(9)})[:-1], "damaged, or contains"),
+    ("x.safetensors", read_checkpoint, "giant header", struct.pack("<Q", 2**63) + b"{}", "damaged, or contains"),
+    ("cup.pt", _pairs, "code", _torch([Code()]), "damaged, or contains more than tensors"),
+    ("cup.pt", _pairs, "a dictionary", _torch({}), "hold a dict, expected a list of dicts"),
+    ("cup.pt", _pairs, "another structure", _torch([{}]), "pair 0: missing class"),
+    ("x.zip", _archive, "text", b"text", "is damaged, encrypted or of another format"),
+    ("x.tar.gz", _archive, "cut", gzip.compress(bytes(9999))[:-9], "are not complete gzip data|is damaged"),
+    ("transforms.json", _capture, "no frames", b"{}", "missing required field `frames`"),
+    ("transforms.json", _capture, "nested", b"[" * 100_000, "transforms.json"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name, read, data, message",
+    [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES],
+)
+def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, name, read, data, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path / name)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("read", [read_image, read_depth, read_ply, read_checkpoint, read_frame_index])
+def test_what_is_no_file_is_refused_without_being_opened(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="image .*pipe cannot be read: a pipe or a device"):
-        read_bytes(tmp_path / "pipe", "image")
+    (tmp_path / "cycle").symlink_to(tmp_path / "cycle")
+    for name, reason in (("pipe", "a pipe or a device"), (".", "is a directory"), ("gone", "no such"), ("cycle", "")):
+        with pytest.raises(InputError, match=f"cannot be read: {reason}"):
+            read(tmp_path / name)
 
 
 def test_a_path_with_a_null_byte_is_refused_in_one_printable_line():
@@ -40,127 +159,61 @@ def test_a_path_with_a_null_byte_is_refused_in_one_printable_line():
         read_bytes("a\0b", "image")
 
 
-def test_a_file_above_a_gigabyte_is_refused(tmp_path):
-    with open(tmp_path / "sparse", "wb") as file:
-        file.truncate(2 << 30)
-    with pytest.raises(InputError, match=f"sparse is {2 << 30} bytes long, expected at most {1 << 30}"):
-        read_bytes(tmp_path / "sparse", "image")
+@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a\0b", "x" * 5000, "link/x"])
+def test_paths_out_of_a_folder_are_refused(tmp_path, path):
+    (tmp_path / "link").symlink_to("/etc")
+    with pytest.raises(InputError, match="path .* (leads out of the data folder|is invalid)"):
+        path_inside(tmp_path, path)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", ".x", "a/b", "a\\b", "C:", "a\0", "x" * 256])
+def test_names_that_are_no_plain_names_are_refused(name):
+    with pytest.raises(InputError, match="category name"):
+        plain_name(name, "category")
+
+
+@pytest.mark.parametrize(
+    "name, read", [("x", read_image), ("x.pth", read_checkpoint), ("x.safetensors", read_checkpoint)]
+)
+def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, read):
+    with open(tmp_path / name, "wb") as file:
+        file.truncate(5 << 30)
+    with pytest.raises(InputError, match=f"{name} is {5 << 30} bytes long, expected at most"):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("members", [1, 3])
-def test_gzip_data_of_any_number_of_members_is_read_up_to_the_limit(members):
+def test_gzip_data_of_any_number_of_members_is_read(members):
     content = os.urandom(1000)
     assert decompress(members * gzip.compress(content), "data") == members * content
-    bomb = members * gzip.compress(bytes(growth_limit(0) // members + 1), 1)
-    assert len(bomb) < growth_limit(0) / 32
-    with pytest.raises(InputError, match="data grow from .* bytes, expected less"):
-        decompress(bomb, "data")
-
-
-def test_an_array_is_refused_before_it_is_allocated_if_its_shape_does_not_fit_its_file(tmp_path):
-    header = str({"descr": "<f8", "fortran_order": False, "shape": (10**15,)}).ljust(117).encode() + b"\n"
-    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("a.npy", b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(8))
-    with pytest.raises(InputError, match=r"x.npz cannot be read: .*float64 of shape \(1000000000000000,\) in 8 bytes"):
-        read_arrays(tmp_path / "x.npz", ("a",), "arrays")
-
-
-def test_a_jpeg_that_the_decoder_patches_up_is_refused_and_nothing_is_printed(tmp_path, capfd):
-    data = cv2.imencode(".jpg", PICTURE)[1].tobytes()
-    (tmp_path / "whole.jpg").write_bytes(data)
-    assert read_image(tmp_path / "whole.jpg").shape == PICTURE.shape
-    (tmp_path / "x.jpg").write_bytes(data[: len(data) // 2] + b"\xff\xd9")
-    with pytest.raises(InputError, match=r"x.jpg cannot be decoded .*Corrupt JPEG data: premature end"):
-        read_image(tmp_path / "x.jpg")
-    assert capfd.readouterr().err == ""
-    os.write(2, b"still there")
-    assert capfd.readouterr().err == "still there"
-
-
-def test_pictures_are_decoded_by_several_threads_at_once(tmp_path):
-    (tmp_path / "x.jpg").write_bytes(cv2.imencode(".jpg", PICTURE)[1].tobytes())
-    found = []
-    threads = [threading.Thread(target=lambda: found.append(read_image(tmp_path / "x.jpg"))) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 8 and all((image == found[0]).all() for image in found)
 
 
 @pytest.mark.parametrize("extension", [".jpg", ".png"])
 def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, extension):
     path = tmp_path / f"x{extension}"
-    path.write_bytes(cv2.imencode(extension, PICTURE)[1].tobytes())
-    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", "14399")
-    with pytest.raises(InputError, match="90 x 160 pixels, expected 1 to 14399 pixels"):
+    path.write_bytes(JPEG if extension == ".jpg" else PNG)
+    monkeypatch.setattr(images, "MAX_PIXELS", 14_399)
+    with pytest.raises(InputError, match="90 x 160 pixels, expected at most 14399"):
         read_image(path)
-    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", "14400")
+    monkeypatch.setattr(images, "MAX_PIXELS", 14_400)
     assert read_image(path).shape == (90, 160, 3)
 
 
-def test_the_limit_on_pixels_holds_for_resizing(monkeypatch):
-    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", "99")
+def test_the_limit_on_pixels_holds_for_resizing():
     whole = Frame(np.zeros((8, 8, 3), np.uint8), None, None, random_camera(0, (8, 8)))
     assert resize_frame(whole, (9, 11)).camera.size == (9, 11)
-    with pytest.raises(InputError, match=r"\(10, 10\), expected at most 99 pixels"):
-        resize_frame(whole, (10, 10))
+    with pytest.raises(InputError, match=r"\(10000, 10000\), expected at most 67108864 pixels"):
+        resize_frame(whole, (10_000, 10_000))
 
 
-@pytest.mark.parametrize("text", ["abc", "0", "-1", "1.5", " ", "\u0663", "9" * 5000])
-def test_a_limit_on_pixels_that_is_no_positive_whole_number_is_refused(tmp_path, monkeypatch, text):
-    (tmp_path / "x.png").write_bytes(cv2.imencode(".png", PICTURE)[1].tobytes())
-    monkeypatch.setenv("ZSP_LITE_MAX_PIXELS", text)
-    with pytest.raises(InputError, match="ZSP_LITE_MAX_PIXELS is .*, expected a positive whole number"):
-        read_image(tmp_path / "x.png")
-
-
-def test_a_frame_listed_twice_is_refused(tmp_path):
-    write_co3d(tmp_path, "cup", [sequence_data("a", 3)])
-    path = tmp_path / "cup" / "frame_annotations.jgz"
-    edit_json(path, lambda content: [*content, content[1]])
-    with pytest.raises(InputError, match="entries 1 and 3 are both frame 1 of a"):
-        read_frame_index(path)
-
-
-@pytest.mark.parametrize("count", [b"-1", b"99999999999", b"1.5"])
-def test_a_point_cloud_with_another_number_of_points_in_its_header_is_refused(tmp_path, count):
-    write_ply(tmp_path / "x.ply", np.ones((3, 3)), np.zeros((3, 3), np.uint8))
-    data = (tmp_path / "x.ply").read_bytes()
-    (tmp_path / "x.ply").write_bytes(data.replace(b"vertex 3", b"vertex " + count))
-    with pytest.raises(InputError, match="not a complete PLY file"):
-        read_ply(tmp_path / "x.ply")
-
-
-def test_coordinates_that_overflow_when_squared_are_refused(tmp_path):
-    text = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property double {x}\n" for x in "xyz")
-    (tmp_path / "x.ply").write_text(text + "end_header\n1e155 0 0\n")
-    with pytest.raises(InputError, match=r"holds 1e\+155, expected finite numbers of at most 1e\+09"):
-        read_ply(tmp_path / "x.ply")
-
-
-def _saved(content) -> bytes:
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getvalue()
-
-
-def test_a_tensor_with_more_values_than_its_file_stores_is_refused():
-    stored = torch.arange(6.0).reshape(2, 3)
-    assert torch.equal(load_torch(_saved({"a": [stored.T]}), "file")["a"][0], stored.T)
-    with pytest.raises(InputError, match=r"file: tensor of shape \(10000000000,\) is not dense"):
-        load_torch(_saved([{"a": (torch.zeros(1).expand(10**10),)}]), "file")
-
-
-def test_a_compressed_torch_file_is_refused(tmp_path):
-    with (
-        zipfile.ZipFile(io.BytesIO(_saved({"a": torch.zeros(9)}))) as old,
-        zipfile.ZipFile(tmp_path / "x.pth", "w", zipfile.ZIP_DEFLATED) as new,
-    ):
-        for name in old.namelist():
-            new.writestr(name, old.read(name))
-    with pytest.raises(InputError, match="checkpoint .*x.pth: damaged, .*compressed entries"):
-        read_checkpoint(tmp_path / "x.pth")
+def test_a_jpeg_with_a_preview_in_its_header_is_read_and_refused_if_it_is_cut(tmp_path):
+    preview = b"Exif\0\0" + cv2.imencode(".jpg", PICTURE[:8, :8])[1].tobytes()
+    header = b"\xff\xe1" + (len(preview) + 2).to_bytes(2, "big") + preview
+    (tmp_path / "x.jpg").write_bytes(JPEG[:2] + header + JPEG[2:])
+    assert read_image(tmp_path / "x.jpg").shape == PICTURE.shape
+    (tmp_path / "x.jpg").write_bytes(JPEG[:2] + header + JPEG[2 : len(JPEG) // 2])
+    with pytest.raises(InputError, match="expected a complete JPEG"):
+        read_image(tmp_path / "x.jpg")
 
 
 def test_blocks_that_are_not_numbered_from_zero_are_refused_before_a_network_is_built():
@@ -172,13 +225,6 @@ def test_blocks_that_are_not_numbered_from_zero_are_refused_before_a_network_is_
 def test_a_long_message_keeps_its_beginning_and_end():
     message = str(InputError("begin" + "x" * 100_000 + "end"))
     assert len(message) < 1000 and message.startswith("begin") and message.endswith("end")
-
-
-@pytest.mark.parametrize("name, value", [("T", 1e155), ("focal_length", 1e-300), ("principal_point", 1e300)])
-def test_a_camera_of_absurd_magnitude_is_refused(name, value):
-    values = {"R": np.eye(3), "T": np.zeros(3), "focal_length": np.ones(2), "principal_point": np.zeros(2)}
-    with pytest.raises(InputError, match=f"{name} .*expected"):
-        Camera.from_pytorch3d(**values | {name: np.full(values[name].shape, value)}, size=(20, 20))
 
 
 @pytest.mark.parametrize(
@@ -195,30 +241,8 @@ def test_a_pair_that_cannot_be_evaluated_as_its_set_says_is_refused(tmp_path, ch
             "all_target_id": [3]}  # fmt: skip
     path = tmp_path / "determ_eval/1samples_1tgt/cup.pt"
     path.parent.mkdir(parents=True)
-    path.write_bytes(_saved([pair]))
+    path.write_bytes(_torch([pair]))
     assert read_upstream_pairs(path, Co3D(tmp_path))[0].target_frames == (0,)
-    path.write_bytes(_saved([pair | change]))
+    path.write_bytes(_torch([pair | change]))
     with pytest.raises(InputError, match=message):
         read_upstream_pairs(path, Co3D(tmp_path))
-
-
-def test_a_link_to_itself_is_refused(tmp_path):
-    write_co3d(tmp_path, "cup", [sequence_data("a", 1)])
-    (tmp_path / "x.pt").symlink_to(tmp_path / "x.pt")
-    with pytest.raises(InputError, match="evaluation pairs .*x.pt cannot be read"):
-        read_upstream_pairs(tmp_path / "x.pt", Co3D(tmp_path))
-
-
-@pytest.mark.parametrize("name", ["x.pth", "x.safetensors"])
-def test_a_file_of_weights_above_four_gigabytes_is_refused_before_it_is_read(tmp_path, name):
-    with open(tmp_path / name, "wb") as file:
-        file.truncate(5 << 30)
-    with pytest.raises(InputError, match=f"checkpoint .*{name} is {5 << 30} bytes long, expected at most {4 << 30}"):
-        read_checkpoint(tmp_path / name)
-
-
-def test_labels_with_two_references_are_refused(tmp_path):
-    for name in "ab":
-        write_label(tmp_path, "cup", PoseLabel(np.eye(4), name, name))
-    with pytest.raises(InputError, match="have references a, b, expected one"):
-        read_labels(tmp_path, "cup")

@@ -291,7 +291,7 @@ def edited(change):
         ("lists", break_file("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "expected a finite rigid"),
         ("lists", break_file("poses.txt", 8 * "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1\n"), "line 1: pose is"),
         ("lists", break_file("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
-        ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt, line 1: '1 2 x', expected numbers"),
+        ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt, line 1: '1 2 x', expected finite numbers"),
     ],
 )
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):

@@ -47,14 +47,10 @@ def test_type_checkers_see_the_same_names_as_the_interpreter():
 
 
 def test_every_data_file_of_the_package_is_installed():
-    """Weights, templates, scripts of widgets, and `py.typed`, by which type checkers read the annotations.
-
-    The weights of the folder `earlier` are in the repository only, on purpose: they would double the wheel.
-    """
+    """Weights, templates, scripts of widgets, and `py.typed`, by which type checkers read the annotations."""
     package = Path(zsp_lite.__file__).parent
     settings = tomllib.loads((package.parent / "pyproject.toml").read_text(encoding="utf-8"))
     patterns = settings["tool"]["setuptools"]["package-data"]["zsp_lite"]
     installed = {path for pattern in patterns for path in package.glob(pattern) if path.is_file()}
     files = {path for path in package.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
-    earlier = {path for path in files if path.parent == package / "weights" / "earlier"}
-    assert package / "py.typed" in files and files - earlier == installed
+    assert package / "py.typed" in files and files == installed

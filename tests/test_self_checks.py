@@ -113,9 +113,3 @@ def test_without_jupyterquiz_the_error_has_the_command_that_installs_it(shell, m
     monkeypatch.setitem(sys.modules, "jupyterquiz", None)
     with pytest.raises(InputError, match=r"needs jupyterquiz, which is not installed; pip install jupyterquiz"):
         self_check("00", 1)
-
-
-def test_outside_a_notebook_the_error_says_so(monkeypatch):
-    monkeypatch.setattr("IPython.get_ipython", lambda: None)
-    with pytest.raises(InputError, match="outside IPython, expected a notebook"):
-        self_check("00", 1)
