@@ -48,7 +48,7 @@ def test_patch_coordinates_lie_on_the_mesh_of_the_object(tmp_path):
     (frame,) = exported.frames("toytruck", sequence)
     coordinates, known = patch_coordinates(object_crop(exported.load(frame)), pose, GRID)
     points = coordinates[known] * (pose.high - pose.low) + pose.low
-    mesh = surface(make_object("toytruck", sequence, seed=0))
+    mesh = surface(make_object("toytruck", 0, seed=0))
     distance = NearestNeighbors(n_neighbors=1).fit(mesh).kneighbors(points)[0]
     assert known.sum() > 100
     # The truck is several units long and several units away; the depth has an error of half a percent.
@@ -109,17 +109,9 @@ def test_a_folder_without_object_poses_is_an_input_error(tmp_path, dataset):
         object_poses(Co3D(tmp_path), "chair")
 
 
-@pytest.mark.parametrize(
-    "file, content, message",
-    [
-        ("synthetic.json", '{"preset": "eval"}', "synthetic.json: .*`seed`"),
-        ("synthetic.json", '{"seed": "one"}', "synthetic.json: Expected `int`"),
-        ("chair/object_poses.json", '{"a": {"trans": []}}', "object_poses.json: .*trans"),
-    ],
-)
-def test_a_damaged_export_is_an_input_error_with_the_name_of_the_file(tmp_path, file, content, message):
+@pytest.mark.parametrize("content", ['{"a": {"trans": []}}', '{"a": ', '{"a": {"scale": 1.0}}'])
+def test_damaged_object_poses_are_an_input_error_with_the_name_of_the_file(tmp_path, content):
     (tmp_path / "chair").mkdir()
-    for path, text in {"synthetic.json": '{"seed": 0}', "chair/object_poses.json": "{}", file: content}.items():
-        (tmp_path / path).write_text(text)
-    with pytest.raises(InputError, match=message):
+    (tmp_path / "chair/object_poses.json").write_text(content)
+    with pytest.raises(InputError, match="object_poses.json"):
         object_poses(Co3D(tmp_path), "chair")
