@@ -1,12 +1,18 @@
-"""Plots: artists are drawn at the right positions, and 3D scenes stay small."""
+"""Figures draw what they are given where it belongs: pixels, projections, orientations, signs, counts and intervals."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import torch
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, render
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError
-from zsp_lite.viz import plots, scene3d
+from zsp_lite.metrics import reliability
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.points import object_cloud
+from zsp_lite.verified.maps import Projection, ViewMaps
+from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreWeights
+from zsp_lite.viz import alignment_plots, feature_plots, plots, result_plots, scene3d, verified
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
@@ -18,117 +24,142 @@ def close_figures():
     plt.close("all")
 
 
-def test_images_are_shown_in_a_grid_with_titles_and_without_ticks():
-    figure, axes = plots.show_images([IMAGE] * 3, ["a", "b", "c"], columns=2)
-    assert [axis.get_title() for axis in axes] == ["a", "b", "c"]
-    assert len(figure.axes) == 4  # two rows of two, the last one empty
-    assert not any(axis.axison for axis in figure.axes)
-
-
-def test_axis_limits_are_the_edges_of_the_image():
-    _, (axis,) = plots.show_images([IMAGE])
-    assert axis.get_xlim() == (0, 80) and axis.get_ylim() == (60, 0)
-
-
-@pytest.mark.parametrize(("images", "titles"), [([], None), ([IMAGE], ["a", "b"])])
-def test_no_image_and_too_many_titles_raise(images, titles):
-    with pytest.raises(InputError, match="expected"):
-        plots.show_images(images, titles)
-
-
 def test_a_map_covers_its_image_and_is_transparent_where_not_finite():
     _, (axis,) = plots.show_images([IMAGE])
     plots.overlay_map(axis, np.array([[0.0, -np.inf], [-3.0, np.nan]]))
-    drawn = axis.images[-1]
-    assert drawn.get_extent() == [0, 80, 60, 0]
-    assert drawn.get_array().mask.tolist() == [[False, True], [False, True]]
+    assert axis.images[-1].get_extent() == [0, 80, 60, 0]
+    assert axis.images[-1].get_array().mask.tolist() == [[False, True], [False, True]]
 
 
-def test_patch_centres_are_pixels_x_y():
-    # A grid of 3 x 4 over 60 x 80 pixels has patches of 20 x 20.
+def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), (3, 4), (60, 80))
     np.testing.assert_allclose(centres, [[10, 10], [70, 50]])
+    similar = np.zeros((3, 4))
+    similar[2, 1] = 0.9
+    figure = feature_plots.similarities_of_patch(IMAGE, (0, 0), [IMAGE], {"key": similar}, np.array([1, 3]))
+    first, second = (axis for axis in figure.axes if axis.get_title())
+    marks = [(line.get_marker(), *line.get_xydata()[0]) for axis in (first, second) for line in axis.lines]
+    assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]  # the patch, the most similar one, the true one
 
 
 def test_outliers_are_dashed_and_inliers_solid():
     pixels = np.array([[10.0, 10], [20, 20], [30, 30]])
-    figure = plots.draw_matches(IMAGE, IMAGE, pixels, pixels, np.array([True, False, True]))
-    styles = [artist.get_linestyle() for artist in figure.artists]
-    assert len(styles) == 3 and sum(style in ("-", "solid") for style in styles) == 2
+    figure = plots.draw_matches(IMAGE, IMAGE, pixels, pixels + 5, np.array([True, False, True]))
+    ends = {tuple(artist.xy1): artist for artist in figure.artists}
+    assert [ends[tuple(pixel)].get_linestyle() in ("-", "solid") for pixel in pixels] == [True, False, True]
+    assert all(tuple(artist.xy2) == (first[0] + 5, first[1] + 5) for first, artist in ends.items())
 
 
-def test_matches_of_different_lengths_raise():
-    with pytest.raises(InputError, match="3 reference pixels, 2 target pixels"):
-        plots.draw_matches(IMAGE, IMAGE, np.zeros((3, 2)), np.zeros((2, 2)))
-
-
-def test_equal_features_have_equal_colours_across_maps():
+def test_equal_features_have_equal_colours_across_maps_and_the_background_is_white():
     features = np.random.default_rng(0).normal(size=(4, 5, 8))
-    first, second = plots.pca_colours([features, features[::-1]])
+    foreground = np.arange(4)[:, None].repeat(5, axis=1) > 0
+    first, second = plots.pca_colours([features, features[::-1]], [foreground, foreground[::-1]])
     np.testing.assert_allclose(first, second[::-1])
-    assert first.shape == (4, 5, 3) and first.min() >= 0 and first.max() <= 1
+    assert (first[0] == 1).all() and not (first[1:] == 1).all()
 
 
-def test_background_patches_are_white():
-    features = np.random.default_rng(0).normal(size=(4, 5, 8))
-    foreground = np.ones((4, 5), bool)
-    foreground[0] = False
-    (colours,) = plots.pca_colours([features], [foreground])
-    assert (colours[0] == 1).all() and not (colours[1:] == 1).all()
-
-
-def test_pca_of_two_patches_raises():
-    with pytest.raises(InputError, match="at least 3"):
-        plots.pca_colours([np.zeros((1, 2, 8))])
-
-
-def test_points_are_drawn_at_their_pixels_and_points_behind_the_camera_are_not():
+def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():
     _, (axis,) = plots.show_images([IMAGE])
     # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of the latter.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
     np.testing.assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
-    assert axis.get_xlim() == (0, 80)
-
-
-def test_axes_are_drawn_at_their_projections():
-    _, (axis,) = plots.show_images([IMAGE])
     plots.draw_axes(axis, CAMERA, lambda points: points + [0, 0, 2], np.zeros(3), 0.2)
     at = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
     assert at["x"] == pytest.approx((50, 30)) and at["y"] == pytest.approx((40, 40))
 
 
-def test_coordinate_colours_run_along_the_longest_axis():
-    points = np.random.default_rng(0).normal(size=(200, 3)) * [1, 5, 1]
-    colours = plots.coordinate_colours(points)
-    assert abs(np.corrcoef(colours[:, 1], points[:, 1])[0, 1]) > 0.95  # the green channel of viridis is increasing
+def test_the_reference_is_drawn_where_the_pose_puts_it():
+    """The object is the same, so the true place of every point is known."""
+    reference = render(look_at((0.9, 0.3, 0.3)), AT_HOME, "a/0")
+    targets = [render(look_at(ELSEWHERE.R @ at), ELSEWHERE, "b") for at in ((1, 0.2, 0.3), (0.8, -0.5, 0.2))]
+    estimate = ZeroShotPose(CoordinateBackbone()).estimate(reference, targets)
+    at_home = reference.camera.to_world(object_cloud(estimate.reference_view, most=1400))
+    for axis, frame in zip(result_plots.pose_over_sequence(estimate, targets, "ab").axes, targets):
+        expected, _ = frame.camera.project(ELSEWHERE.apply(at_home))
+        shown = np.asarray(axis.collections[0].get_offsets())
+        assert np.linalg.norm(np.sort(shown, axis=0) - np.sort(expected, axis=0), axis=1).mean() < 8
 
 
-def test_a_scene_has_at_most_four_thousand_points_and_a_marker_per_cloud():
-    cloud = np.random.default_rng(0).normal(size=(30_000, 3))
+def test_the_ring_frames_the_view_of_highest_score_and_has_the_reference_below():
+    turns = np.radians([0, 60, 120, 180, 240, 300])
+    places = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    scores, angles = np.array([-30.0, -20, -50, -40, -45, -41]), np.array([60.0, 0, 60, 120, 180, 120])
+    figure = alignment_plots.view_ring(IMAGE, [IMAGE] * 6, (places, places[1:2]), scores, angles)
+    widths = {axis.get_title(): axis.spines["left"].get_linewidth() for axis in figure.axes[0].child_axes}
+    assert max(widths, key=widths.get) == "2: -20.0, 0° chosen" and len(widths) == 7
+    ends = [line.get_xydata()[-1] for line in figure.axes[0].lines]
+    np.testing.assert_allclose([ends[1], ends[4]], [[0, -1], [0, 1]], atol=1e-9)
+
+
+def test_clouds_from_above_have_depth_upwards_and_from_the_front_y_downwards():
+    cloud = np.random.default_rng(0).normal(size=(50, 3)) + (0, 0, 9)
+    front, above = result_plots.aligned_from_two_sides(cloud, cloud + 0.1).axes
+    np.testing.assert_allclose(front.collections[1].get_offsets(), cloud[:, [0, 1]])
+    np.testing.assert_allclose(above.collections[1].get_offsets(), cloud[:, [0, 2]])
+    assert front.yaxis_inverted() and not above.yaxis_inverted()
+
+
+def test_what_lies_outside_a_picture_is_counted_and_not_drawn():
+    pixels = np.array([[10.0, 10], [20, 20]])
+    cases = {"right": pixels, "wrong": np.array([[10.0, 10], [200, 20]]), "far": pixels + 100}
+    figure, inside = result_plots.landing_points(IMAGE, IMAGE, pixels, cases)
+    assert inside == {"right": 1.0, "wrong": 0.5, "far": 0.0}
+    assert [len(axis.collections[0].get_offsets()) for axis in figure.axes[:4]] == [2, 2, 1, 0]
+
+
+def test_mean_scores_are_relative_to_the_pair_and_by_angle():
+    angles, scores = np.array([[10.0, 100.0], [20.0, 110.0]]), np.array([[4.0, 2.0], [10.0, 6.0]])
+    figure = alignment_plots.choices_and_scores_over_angle(["car", "car"], angles[:, 0], angles, scores)
+    values = figure.axes[1].lines[0].get_ydata()
+    assert values[[0, 3]].tolist() == [1.5, -1.5] and np.isnan(values[[1, 2, 4, 5]]).all()
+
+
+def test_a_scene_has_equal_axes_robust_to_outliers_and_y_down():
+    cloud = np.random.default_rng(0).uniform(-1, 1, (30_000, 3)) * [1, 2, 3]
     figure = scene3d.aligned_clouds(cloud, cloud[:100])
-    assert [len(trace.x) for trace in figure.data] == [2000, 100]
-    assert len({trace.marker.symbol for trace in figure.data}) == 2
-    assert [trace.name for trace in figure.data] == ["reference, aligned", "target"]
-    assert figure.layout.scene.camera.up.y == -1
-    assert len(figure.to_html(full_html=False, include_plotlyjs=False)) < 300_000
-
-
-def test_a_scene_is_deterministic_for_a_seed():
-    cloud = np.random.default_rng(0).normal(size=(5000, 3))
-    first, second = (scene3d.aligned_clouds(cloud, cloud, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(first.data[0].x, second.data[0].x)
-
-
-@pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
-def test_an_empty_cloud_and_values_that_are_not_finite_raise(cloud):
-    with pytest.raises(InputError, match="empty or not finite"):
-        scene3d.aligned_clouds(cloud, np.zeros((4, 3)))
-
-
-def test_axis_ranges_are_equal_in_length_and_robust_to_outliers():
-    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [1, 2, 3]
-    points[:10] = 100
-    ranges = scene3d.axis_ranges(points)
-    lengths = [high - low for low, high in ranges.values()]
+    assert [len(trace.x) for trace in figure.data] == [2000, 100] and figure.layout.scene.camera.up.y == -1
+    cloud[:10] = 100
+    lengths = [high - low for low, high in scene3d.axis_ranges(cloud).values()]
     np.testing.assert_allclose(lengths, 1.2 * 6, rtol=0.05)
-    np.testing.assert_allclose([sum(limits) / 2 for limits in ranges.values()], 0, atol=0.2)
+
+
+def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects():
+    # Points: on the surface, far behind it, far before it, outside the silhouette, over a hole in the depth.
+    behind, weight = torch.tensor([0.0, 1, -1, 0, 0]), torch.tensor([1.0, 1, 1, 0, 0])
+    off, pixels = torch.tensor([0.0, 0, 0, 0.4, 0]), torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
+    parts = (3 + behind, torch.full((5,), 3.0), weight, off, torch.arange(5), pixels)
+    touch = weight * torch.exp(-(behind**2) / (2 * SURFACE_SIGMA**2))
+    front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
+    values = (touch, off / MAX_VIOLATION, front, torch.zeros(5))
+    terms = PointTerms(Projection(*(x[None, None] for x in parts)), *(x[None, None] for x in values))
+    # The maps have half the image's size: their pixel 10 is pixel 20 of the image.
+    maps = ViewMaps(
+        torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1), torch.zeros(1, 2), torch.tensor([[40.0, 30.0]]),
+        torch.zeros(1, dtype=torch.long), torch.zeros(1200, 4), torch.tensor([[2.0, 2.0]]),
+    )  # fmt: skip
+    assert verified.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
+    assert list(verified.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
+    _, axes = plots.show_images([IMAGE])
+    assert verified.draw_point_classes(axes, terms, maps).tolist() == [[1, 1, 1, 1, 1]]
+    drawn = np.concatenate([collection.get_offsets() for collection in axes[0].collections])
+    # The point beyond the border (110) stands at it (80).
+    np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
+
+
+def test_bars_of_the_score_add_up_to_it():
+    rng = np.random.default_rng(0)
+    terms, weights = dict(zip(TERM_NAMES, rng.random(len(TERM_NAMES)))), ScoreWeights(*rng.normal(size=len(TERM_NAMES)))
+    _, axis = plt.subplots()
+    verified.draw_score_contributions(axis, {"first": terms}, weights)
+    widths = [bar.get_width() for bar in axis.containers[0]]
+    np.testing.assert_allclose(widths, [getattr(weights, name) * terms[name] for name in TERM_NAMES])
+
+
+def test_reliability_points_lie_at_confidence_and_frequency_with_wilsons_interval():
+    _, axis = plt.subplots()
+    measured = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
+    verified.draw_reliability(axis, measured)
+    np.testing.assert_allclose(axis.containers[0][0].get_xydata(), [[0.2, 0.3], [0.9, 0.3]])
+    # For 3 of 10, from a table: 10.8 % to 60.3 %.
+    low, high = axis.containers[0][2][0].get_segments()[0][:, 1]
+    assert (low, high) == pytest.approx((0.108, 0.603), abs=1e-3)

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.depth import patch_points
-from zsp_lite.data.frames import ON_OBJECT, Frame
+from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.data.samples import (
@@ -23,10 +22,8 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pair_result import SEQUENCE_FRAMES, PairResult, label_error, solve_pair
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.points import object_points
-from zsp_lite.synthetic.ground_truth import object_poses, patch_coordinates
+from zsp_lite.synthetic.ground_truth import object_poses
 from zsp_lite.synthetic.recording import POSES_FILE
-from zsp_lite.views import object_crop, patch_mask
 
 N_TARGETS = 5
 # Settings of `ZeroShotPose` on the photograph.
@@ -53,7 +50,7 @@ def example_pair(dataset: Co3D) -> Pair:
     """Return a pair of the sample data for a first try.
 
     Of `data_samples/`, this is a pair of cars that is chosen by its result: a stored pair with five targets on which
-    both solvers are within 5 degrees, with zsp-tiny as with zsp-tiny-photo. Of other data, it is the first pair of the
+    both solvers are within 5 degrees with zsp-tiny. Of other data, it is the first pair of the
     first category.
 
     Raises:
@@ -180,57 +177,6 @@ def run_photograph(
             axes = to_photograph.R @ camera.R @ pose.R
             cloud, along = to_photograph.apply(camera.to_camera(points)), pose.to_box(points)[:, 0]
             yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along)
-
-
-@dataclass(frozen=True, eq=False)
-class PhotographPair:
-    """Object crops of the photographed motorcycle and of a synthetic one that is seen from about the same side.
-
-    Attributes:
-        photograph: Object crop of the photograph.
-        target: Object crop of the synthetic motorcycle.
-        along: Position of each patch of the photograph from the rear (0) to the front (1) of its motorcycle; NaN off
-            the object and where the depth is unknown.
-        target_along: The same of the target.
-    """
-
-    photograph: Frame
-    target: Frame
-    along: Float[np.ndarray, "rows cols"]
-    target_along: Float[np.ndarray, "rows cols"]
-
-
-def photograph_pair(dataset: Co3D, grid: tuple[int, int] = (28, 28), size: int = 448) -> PhotographPair:
-    """Pair the photograph with the view of the sequence `samples.PHOTOGRAPH_TARGET` that shows the same side best.
-
-    The position along the photographed motorcycle rests on its front as judged by eye (`samples.PHOTOGRAPH_FRONT`), so
-    it is right to a few per cent of the length only.
-
-    Args:
-        dataset: The sample data.
-        grid: Patches (rows, columns).
-        size: Side of the crops in pixels.
-
-    Raises:
-        InputError: The data has no such sequence, or no exact object poses.
-    """
-    pose = object_poses(dataset, PHOTOGRAPH_CATEGORY).get(PHOTOGRAPH_TARGET)
-    if pose is None:
-        raise InputError(f"{dataset.root}: no sequence {PHOTOGRAPH_CATEGORY}/{PHOTOGRAPH_TARGET}, expected sample data")
-    frames = dataset.frames(PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET)
-    fronts = [dataset.camera(frame).R @ pose.R[:, 0] for frame in frames]
-    nearest = min(range(len(frames)), key=lambda index: _angle(fronts[index], PHOTOGRAPH_FRONT))
-    target = object_crop(dataset.load(frames[nearest]), size)
-    coordinates, known = patch_coordinates(target, pose, grid)
-    photograph = motorcycle_photograph()
-    ends = np.percentile(object_points(photograph) @ PHOTOGRAPH_FRONT, [1, 99])  # robust to outliers of the depth
-    crop = object_crop(photograph, size)
-    points, measured = patch_points(np.where(crop.mask > ON_OBJECT, crop.depth, 0), crop.camera, grid)
-    along = (points @ PHOTOGRAPH_FRONT - ends[0]) / (ends[1] - ends[0])
-    measured &= patch_mask(crop, grid).numpy()
-    return PhotographPair(
-        crop, target, np.where(measured, along, np.nan), np.where(known, coordinates[..., 0], np.nan)
-    )  # fmt: skip
 
 
 def _angle(first: np.ndarray, second: np.ndarray | tuple[float, ...]) -> float:

@@ -1,6 +1,8 @@
 """Figures of the notebooks on the best view, the alignment of points, and metrics (03 to 05).
 
-Each function draws one complete figure from computed data; its name says what is shown.
+Each function draws one complete figure from computed data; its name says what is shown. Angles and rotation errors are
+in degrees, lengths in scene units, accuracies in per cent. Mappings go from the title of a panel, or the name in the
+legend, to what is drawn there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,18 +18,19 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.viz.plots import (
     BLUE,
     CHOSEN,
+    COLOURS,
     GREEN,
+    LINES,
+    MARKERS,
     ORANGE,
     VERMILLION,
     coordinate_colours,
+    draw_curves,
     draw_points,
     overlay_map,
     show_images,
 )
 
-_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
-_LINES = ("-", "--", "-.", ":")
-_MARKERS = ("o", "s", "^", "D")
 _RING, _PICTURE = 1.22, 0.26  # of `view_ring`: distance of the pictures' centres, and half their width
 
 
@@ -40,14 +43,8 @@ def view_ring(
 ) -> Figure:
     """Show target views around their object as seen from above, each with its score and its angle to the reference.
 
-    The ring is turned so that the side of the reference is below. The view of highest score has a thick frame.
-
-    Args:
-        reference: Image (H, W, 3) of the reference.
-        targets: Images (H, W, 3) of the target views.
-        places: Directions of the target cameras and of the reference camera, from `viewpoints_from_above`.
-        scores: Score of each view.
-        angles: Angle of each view to the reference, in degrees.
+    The ring is turned so that the side of the reference is below. The view of highest score has a thick frame. `places`
+    are the directions of the target cameras and of the reference camera, from `viewpoints_from_above`.
     """
     side = places[1][0]
     turned = places[0] @ np.stack([side[[1, 0]] * [-1, 1], -side], axis=1)
@@ -73,12 +70,7 @@ def view_ring(
 
 
 def scores_over_angle(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
-    """Show each kind of score of the views over their angle to the reference, a panel each; the best view is ringed.
-
-    Args:
-        angles: Angle of each view to the reference, in degrees.
-        scores: Name of the score to its value for each view.
-    """
+    """Show each kind of score of the views over their angle to the reference, a panel each; the best view is ringed."""
     rows = -(-len(scores) // 2)
     figure, axes = plt.subplots(rows, 2, figsize=(7.6, 3.5 * rows), layout="constrained", squeeze=False)
     for axis, (name, values) in zip(axes.flat, scores.items()):
@@ -94,13 +86,11 @@ def scores_over_angle(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[
 def accuracy_over_views(counts: Sequence[int], curves: Mapping[str, Sequence[Real[np.ndarray, " starts"]]]) -> Figure:
     """Show the accuracy over the number of target views; bars span the choices of the first view.
 
-    Args:
-        counts: Numbers of target views.
-        curves: Name of a method to its accuracies in percent: for each number of views, one for each first view.
+    `curves` maps a method to its accuracies: for each number of views, one for each first view.
     """
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
     shifts = np.geomspace(0.97, 1.03, len(curves))
-    for (name, values), colour, line, marker, shift in zip(curves.items(), _COLOURS, _LINES, _MARKERS, shifts):
+    for (name, values), colour, line, marker, shift in zip(curves.items(), COLOURS, LINES, MARKERS, shifts):
         at = shift * np.asarray(counts)
         axis.plot(at, [np.mean(v) for v in values], line, marker=marker, color=colour, label=name, markersize=8)
         axis.vlines(at, [np.min(v) for v in values], [np.max(v) for v in values], color=colour, alpha=0.5, linewidth=3)
@@ -117,20 +107,13 @@ def choices_and_scores_over_angle(
     angles: Real[np.ndarray, "pairs views"],
     scores: Real[np.ndarray, "pairs views"],
 ) -> Figure:
-    """Show for each category at which angles the chosen views lie, and the mean score of all views over the angle.
-
-    Args:
-        categories: Category of each pair.
-        chosen: Angle of the chosen view of each pair, in degrees.
-        angles: Angles of all views, in degrees.
-        scores: Scores of all views; the mean of each pair is subtracted.
-    """
+    """Show for each category at which angles the chosen views lie, and the mean score of all views over the angle."""
     categories, names = np.asarray(categories), list(dict.fromkeys(categories))
     relative = scores - scores.mean(axis=1, keepdims=True)
     part = (angles // 30).clip(max=5)
     scatter = np.random.default_rng(0).uniform(-0.25, 0.25, len(categories))
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for place, (name, colour, marker, line) in enumerate(zip(names, _COLOURS, _MARKERS, _LINES)):
+    for place, (name, colour, marker, line) in enumerate(zip(names, COLOURS, MARKERS, LINES)):
         here = categories == name
         style = {"s": 40, "marker": marker, "color": colour, "edgecolors": "black", "linewidths": 0.3}
         left.scatter(chosen[here], place + scatter[here], **style)
@@ -150,14 +133,11 @@ def choices_and_scores_over_angle(
 def scores_of_views(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
     """Show the scores of the same views, in the order of the camera's path, for several references.
 
-    Args:
-        angles: Angle of each view to the first reference, in degrees; labels of the ticks.
-        scores: Name of the reference to the scores of the views.
+    The ticks are labelled with the angle of each view to the first reference.
     """
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
     views = np.arange(1, len(angles) + 1)
-    for (name, values), colour, line, marker in zip(scores.items(), _COLOURS, _LINES, _MARKERS):
-        axis.plot(views, values, line, marker=marker, color=colour, label=name)
+    draw_curves(axis, views, scores)
     axis.set_xticks(views, [f"{view}\n{angle:.0f}°" for view, angle in zip(views, angles)])
     axis.set(xlabel=f"view, and its angle to the {next(iter(scores))}", ylabel="score")
     figure.legend(ncols=len(scores), loc="outside upper center")
@@ -165,12 +145,7 @@ def scores_of_views(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np
 
 
 def winning_scores(near: Real[np.ndarray, " n"], far: Real[np.ndarray, " m"]) -> Figure:
-    """Show histograms of the winning views' scores: of winners near the reference, and where only far views compete.
-
-    Args:
-        near: Scores of winning views that are near the reference.
-        far: Scores of winning views where all near views are withheld.
-    """
+    """Show histograms of the winning views' scores: of winners near the reference, and where only far views compete."""
     figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
     both = np.concatenate([near, far])
     bins = np.linspace(both.min() - 1, both.max() + 1, 19)
@@ -185,14 +160,7 @@ def winning_scores(near: Real[np.ndarray, " n"], far: Real[np.ndarray, " m"]) ->
 def depth_with_holes(
     image: np.ndarray, depth: Real[np.ndarray, "h w"], filled: Real[np.ndarray, "h w"], limits: tuple[float, float]
 ) -> Figure:
-    """Show an image, its depth map with the unknown pixels in white, and the depth map after filling.
-
-    Args:
-        image: Image (H, W, 3).
-        depth: Depth in scene units; 0 where unknown.
-        filled: Depth without holes.
-        limits: Depths at the ends of the colour map.
-    """
+    """Show an image, its depth map with the unknown pixels (0) in white, and the depth map after filling."""
     empty = np.ones_like(image)
     figure, axes = show_images([image, empty, empty], ["crop", "depth, unknown pixels white", "filled"], size=3.1)
     for axis, values in zip(axes[1:], (np.where(depth > 0, depth, np.nan), filled)):
@@ -202,15 +170,10 @@ def depth_with_holes(
 
 
 def filled_depth_errors(errors: Mapping[str, Real[np.ndarray, " n"]], tolerance: float) -> Figure:
-    """Show histograms of the errors of filled depths on a logarithmic axis, a panel for each part of the image.
-
-    Args:
-        errors: Name of the part to absolute errors in scene units.
-        tolerance: Error to mark by a line.
-    """
+    """Show histograms of the errors of filled depths, a panel per part of the image; a line marks the tolerance."""
     figure, axes = plt.subplots(1, len(errors), figsize=(9, 3.4), layout="constrained", sharex=True, squeeze=False)
     bins = np.geomspace(1e-3, max(1, *(np.max(values, initial=0) for values in errors.values())), 40)
-    for axis, (name, values), colour in zip(axes.flat, errors.items(), _COLOURS):
+    for axis, (name, values), colour in zip(axes.flat, errors.items(), COLOURS):
         axis.hist(np.clip(values, 1e-3, None), bins, color=colour, edgecolor="white")
         axis.axvline(tolerance, color=VERMILLION, linestyle="--", label=f"{tolerance:g} scene units")
         axis.set(xscale="log", title=name, ylabel="pixels")
@@ -225,11 +188,6 @@ def points_from_above(
     """Show camera-frame points from above, a panel for each way to compute them; points off the object are crosses.
 
     The panels share their limits, which lie around the points on the object: crosses far off are cut.
-
-    Args:
-        panels: Title to points.
-        beside: Title to the points that are off the object's surface.
-        tolerance: Largest distance of a point on the object, in scene units; for the legend.
     """
     low, high = _around(np.concatenate([points[~beside[title]] for title, points in panels.items()])[:, [0, 2]])
     figure, axes = _equal_panels(len(panels), low, high, extra=1.5)
@@ -251,14 +209,7 @@ def fits_with_one_outlier(
     moves: Real[np.ndarray, " m"],
     turned: Real[np.ndarray, " m"],
 ) -> Figure:
-    """Show least-squares fits with one displaced target point, and the rotation error over its displacement.
-
-    Args:
-        fitted: Title to the source points after the fit.
-        targets: Title to the target points, of which the last is displaced.
-        moves: Displacements in scene units.
-        turned: Rotation error for each displacement, in degrees.
-    """
+    """Show fits with the last target point displaced, and the error `turned` of the rotation over the displacement."""
     low, high = _around(np.concatenate([*fitted.values(), *targets.values()])[:, :2], margin=0.1)
     names, ratio = [f"fit {number}" for number in range(len(fitted))], (high - low)[1] / (high - low)[0]
     figure = plt.figure(figsize=(10, len(fitted) * (5.2 * ratio + 0.7)), layout="constrained")
@@ -284,14 +235,7 @@ def trials_over_good_share(
     trials: int,
     marks: Mapping[str, float],
 ) -> Figure:
-    """Show how many trials are needed over the share of good matches, on a logarithmic axis.
-
-    Args:
-        shares: Shares of good matches, in [0, 1].
-        needed: Label of a curve to the number of trials for each share.
-        trials: Number of trials to mark by a horizontal line.
-        marks: Label to a share to mark by a vertical line.
-    """
+    """Show how many trials are needed over the share of good matches; lines mark a number of trials and some shares."""
     figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
     for (label, values), colour, style in zip(needed.items(), (GREEN, BLUE, ORANGE), (":", "-", "--")):
         axis.plot(shares, values, style, color=colour, label=label, linewidth=2)
@@ -314,12 +258,6 @@ def matched_points_after_fits(
 
     A line joins each moved reference point (cross) to its target point (circle): the residual. Residuals above the
     threshold are thin and grey. The limits lie around the object: points far off are cut.
-
-    Args:
-        fitted: Title to the matched reference points after the fit.
-        target: Matched target points.
-        inliers: Title to the matches whose residual is below the threshold.
-        surface: Points of the target object, the background.
     """
     low, high = _around(surface[:, :2])
     figure, axes = _equal_panels(len(fitted), low, high, extra=1.9)
@@ -348,10 +286,8 @@ def ransac_sweeps(
 ) -> Figure:
     """Show inliers and rotation errors of several draws over a setting of RANSAC, a column for each sweep.
 
-    Args:
-        sweeps: Title to the name of the setting, and for each of its values the inliers and the rotation errors (in
-            degrees) of the draws, and the inliers for shuffled matches.
-        matches: Number of matches.
+    `sweeps` maps a title to the name of the setting, and for each of its values to the inliers and the rotation errors
+    of the draws, and the inliers for shuffled matches.
     """
     figure, axes = plt.subplots(2, len(sweeps), figsize=(10.4, 7.2), layout="constrained", sharex="col", sharey="row",
                                 squeeze=False)  # fmt: skip
@@ -378,13 +314,7 @@ def ransac_sweeps(
 def rotation_error_over_width(
     widths: Real[np.ndarray, " n"], quartiles: Real[np.ndarray, "n 3"], noise: float
 ) -> Figure:
-    """Show the rotation error of long thin point sets over their width: the median, and a band of the middle half.
-
-    Args:
-        widths: Widths of point sets of length 1, in scene units.
-        quartiles: The three quartiles of the rotation error for each width, in degrees.
-        noise: Standard deviation of the noise, marked by a line.
-    """
+    """Show quartiles of the rotation error of thin sets of length 1 over their width; a line marks the noise."""
     figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
     low, middle, high = np.transpose(quartiles)
     axis.fill_between(widths, low, high, color=BLUE, alpha=0.2, linewidth=0)
@@ -398,12 +328,9 @@ def rotation_error_over_width(
 def angle_errors_of_formulas(
     offsets: Real[np.ndarray, " n"], errors: Mapping[str, tuple[Sequence[float], Sequence[float]]]
 ) -> Figure:
-    """Show the largest error of formulas for the angle of a rotation near 0 and near 180 degrees, on logarithmic axes.
+    """Show the largest error of formulas for a rotation angle near 0 and near 180 degrees, on logarithmic axes.
 
-    Args:
-        offsets: Distances from 0 and from 180 degrees, in degrees.
-        errors: Name of the formula and precision to its errors near 0 and near 180 degrees, for each distance; names
-            with "arccos" have one colour, and names with "single" have dashed lines.
+    Formulas with "arccos" in their name have one colour, and those with "single" have dashed lines.
     """
     figure, panels = plt.subplots(1, 2, figsize=(10, 4.8), layout="constrained", sharey=True)
     for end, (panel, middle) in enumerate(zip(panels, (0, 180))):
@@ -427,13 +354,8 @@ def pose_chain(
 ) -> Figure:
     """Show points on their way from one camera to the other: over two images, and in the worlds between them.
 
-    A point keeps its colour, its position along the first object.
-
-    Args:
-        images: Images of the first and the last camera.
-        cameras: The first and the last camera.
-        in_cameras: The points in the frames of both cameras.
-        in_worlds: Name of a world to the points in it and the cloud of the object whose world it is.
+    A point keeps its colour, its position along the first object. `in_worlds` maps the name of a world to the points in
+    it and the cloud of the object whose world it is.
     """
     figure, axes = plt.subplots(2, 3, figsize=(10.2, 6.6), layout="constrained")
     panels, colours = list(axes.flat), coordinate_colours(in_cameras[0])
@@ -454,17 +376,11 @@ def pose_chain(
 
 
 def share_of_benchmarks(gains: Real[np.ndarray, " n"], curves: Mapping[str, Real[np.ndarray, "2 n"]]) -> Figure:
-    """Show how often a benchmark shows a true gain at all, and significantly, over the gain.
-
-    Args:
-        gains: True gains in points.
-        curves: Name of the benchmark to both shares in percent, for each gain.
-    """
+    """Show the share of benchmarks that show a true gain at all (first row), and significantly, over the gain."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained", sharey=True)
     titles = "the better method comes out ahead", "... and significantly so"
     for row, (panel, title) in enumerate(zip(panels, titles)):
-        for (name, shares), colour, line, marker in zip(curves.items(), _COLOURS, _LINES, _MARKERS):
-            panel.plot(gains, shares[row], line, marker=marker, color=colour, label=name)
+        draw_curves(panel, gains, {name: shares[row] for name, shares in curves.items()})
         panel.set(title=title, xlabel="true gain (points of Acc30)", xticks=gains[::2])
     panels[0].set_ylabel("share of benchmarks (%)")
     panels[1].legend(fontsize=9, loc="lower right")
@@ -474,16 +390,14 @@ def share_of_benchmarks(gains: Real[np.ndarray, " n"], curves: Mapping[str, Real
 def measured_accuracies(
     distributions: Mapping[str, Sequence[tuple[Real[np.ndarray, " n"], Real[np.ndarray, " n"]]]], labels: Sequence[str]
 ) -> Figure:
-    """Show the probability densities of the accuracies that benchmarks would measure, a panel each.
+    """Show the probability densities of the accuracies that benchmarks would measure.
 
-    Args:
-        distributions: Title to the accuracies (percent) and densities of each method.
-        labels: Name of each method.
+    `distributions` maps the title of a panel to the accuracies and densities of each method.
     """
     figure, axes = plt.subplots(1, len(distributions), figsize=(10.2, 4), layout="constrained", sharex=True)
     likely = [values[density > 0.01 * density.max()] for one in distributions.values() for values, density in one]
     for axis, (title, methods) in zip(np.atleast_1d(axes), distributions.items()):
-        for (values, density), label, colour, line in zip(methods, labels, _COLOURS, _LINES):
+        for (values, density), label, colour, line in zip(methods, labels, COLOURS, LINES):
             axis.plot(values, density, line, color=colour, label=label)
         axis.set(xlim=(np.concatenate(likely).min(), np.concatenate(likely).max()), title=title)
         axis.set_xlabel("measured Acc30 (%)")
@@ -495,15 +409,10 @@ def measured_accuracies(
 def accuracies_with_intervals(
     accuracies: Mapping[str, float], intervals: Mapping[str, Mapping[str, tuple[float, float]]]
 ) -> Figure:
-    """Show accuracies of methods, each with several kinds of intervals beside each other.
-
-    Args:
-        accuracies: Name of the method to its accuracy in percent.
-        intervals: Kind of interval to the interval of each method, in percent.
-    """
+    """Show accuracies of methods, each with several kinds of intervals (by method) beside each other."""
     figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
     shifts = np.linspace(-0.12, 0.12, len(intervals))
-    for (kind, found), colour, marker, shift in zip(intervals.items(), _COLOURS, _MARKERS, shifts):
+    for (kind, found), colour, marker, shift in zip(intervals.items(), COLOURS, MARKERS, shifts):
         at = np.arange(len(accuracies)) + shift
         low, high = np.transpose([found[name] for name in accuracies])
         axis.vlines(at, low, high, color=colour, linewidth=3)
@@ -515,17 +424,11 @@ def accuracies_with_intervals(
 
 
 def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str], limit: float = 30.0) -> Figure:
-    """Show all rotation errors, a row of dots for each category, with the median as a bar.
-
-    Args:
-        errors: Rotation errors in degrees.
-        categories: Category of each error.
-        limit: Error to mark by a line, in degrees.
-    """
+    """Show all rotation errors, a row of dots for each category, with the median as a bar; a line marks the limit."""
     categories, names = np.asarray(categories), list(dict.fromkeys(categories))
     scatter = np.random.default_rng(0).uniform(-0.28, 0.28, len(errors))
     figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
-    for row, (name, marker) in enumerate(zip(names, _MARKERS * len(names))):
+    for row, (name, marker) in enumerate(zip(names, MARKERS * len(names))):
         here = categories == name
         style = {"s": 40, "marker": marker, "color": BLUE, "edgecolors": "white", "linewidths": 0.4}
         axis.scatter(errors[here], row + scatter[here], **style)
@@ -538,15 +441,9 @@ def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str]
 
 
 def distances_over_turn(turns: Real[np.ndarray, " n"], distances: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
-    """Show closest-point distances of objects to themselves over the angle by which they are turned.
-
-    Args:
-        turns: Angles in degrees.
-        distances: Name of the object to its distance for each angle, in scene units.
-    """
+    """Show closest-point distances of objects to themselves over the angle by which they are turned."""
     figure, axis = plt.subplots(figsize=(7.5, 3.5), layout="constrained")
-    for (name, values), colour, line, marker in zip(distances.items(), _COLOURS, _LINES, _MARKERS):
-        axis.plot(turns, values, line, marker=marker, color=colour, label=name, markersize=5)
+    draw_curves(axis, turns, distances)
     axis.set(xlabel="turned about the vertical by (degrees)", xticks=range(0, 181, 30))
     axis.set_ylabel("closest-point distance (scene units)")
     axis.legend(fontsize=9)
@@ -556,12 +453,7 @@ def distances_over_turn(turns: Real[np.ndarray, " n"], distances: Mapping[str, R
 def distances_between_instances(
     angles: Real[np.ndarray, " n"], curves: Mapping[str, Real[np.ndarray, "pairs n"]]
 ) -> Figure:
-    """Show closest-point distances between instances over the angle from the true pose; a triangle marks each minimum.
-
-    Args:
-        angles: Angles from the true pose, in degrees.
-        curves: Category to the distances of each pair, in scene units.
-    """
+    """Show closest-point distances of pairs over the angle from the true pose; a triangle marks each minimum."""
     figure, panels = plt.subplots(1, len(curves), figsize=(11, 3.8), layout="constrained", sharey=True, squeeze=False)
     for panel, (name, pairs) in zip(panels.flat, curves.items()):
         for distances in pairs:
@@ -574,12 +466,7 @@ def distances_between_instances(
 
 
 def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]], limit: float = 30.0) -> Figure:
-    """Show the rotation errors of two methods on the same pairs against each other.
-
-    Args:
-        errors: Names of the two methods to their errors in degrees.
-        limit: Error to mark by lines, in degrees.
-    """
+    """Show the rotation errors of two methods on the same pairs against each other; lines mark the limit."""
     (first, x), (second, y) = errors.items()
     figure, axis = plt.subplots(figsize=(5.6, 5.4), layout="constrained")
     axis.scatter(x, y, s=36, color=BLUE, alpha=0.6, edgecolors="black", linewidths=0.5)

@@ -1,6 +1,8 @@
 """Figures of the notebooks on the first estimate (00), features (01) and cyclical distances (02).
 
-Each function shows one thing and returns the figure. They are made of the primitives of `plots`.
+Each function shows one thing and returns the figure, made of the primitives of `plots`. A patch is given by its cell
+(row, col), `grid` is the number of (rows, columns) of patches, `size` the width of a panel in inches, and mappings go
+from the title of a panel, or the name in the legend, to what is drawn there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +19,6 @@ from matplotlib.patheffects import Normal, Stroke
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
 from zsp_lite.points import object_cloud
 from zsp_lite.synthetic.ground_truth import GroundTruthPair
@@ -27,21 +28,12 @@ from zsp_lite.viz import plots
 Image = UInt8[np.ndarray, "height width 3"]
 
 _POINTS = 1500  # drawn of a cloud
-_AXIS_LENGTH = 2.0  # scene units; the points of an object have unit standard deviation
 _WRONG = "#D40000"  # with black borders or beside orange, also distinguishable with colour-vision deficiencies
 _MAP = {"limits": (-8, 0), "cmap": "cividis", "alpha": 0.85}  # of a cyclical distance map
-_COLOURS = plots.ORANGE, plots.BLUE, plots.GREEN, plots.VERMILLION
 
 
 def views_with_choice(reference: Frame, targets: Sequence[Frame], chosen: int, size: float = 3.0) -> Figure:
-    """Show the reference and the target views, three in a row, with a frame around the chosen target view.
-
-    Args:
-        reference: Reference frame.
-        targets: Target frames.
-        chosen: Index of the chosen target view.
-        size: Width of an image in inches.
-    """
+    """Show the reference and the target views, three in a row, with a frame around the chosen target view."""
     titles = ["reference", *(f"target {number}" for number in range(1, len(targets) + 1))]
     figure, axes = plots.show_images([frame.rgb for frame in (reference, *targets)], titles, columns=3, size=size)
     plots.mark(axes[1 + chosen], "chosen")
@@ -52,10 +44,6 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Fi
     """Show the reference under its own points, and for each estimate its target view under the moved points.
 
     The colour of a point is its position along the reference object.
-
-    Args:
-        estimates: Estimates with one reference, by the title of their panel.
-        size: Width of a panel in inches.
     """
     reference = next(iter(estimates.values())).reference_view
     cloud = object_cloud(reference, most=_POINTS)
@@ -70,12 +58,7 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Fi
 
 
 def matches_of_estimate(estimate: PoseEstimate, size: float = 3.6) -> Figure:
-    """Show the matches between the reference and the chosen target view; see `plots.draw_matches` for the lines.
-
-    Args:
-        estimate: Estimate.
-        size: Width of an image in inches.
-    """
+    """Show the matches between the reference and the chosen target view; see `plots.draw_matches` for the lines."""
     views = estimate.reference_view, estimate.target_views[estimate.view]
     ends = [
         plots.patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
@@ -88,54 +71,18 @@ def matches_of_estimate(estimate: PoseEstimate, size: float = 3.6) -> Figure:
 def moved_points_in_frames(
     reference: View, frames: Sequence[Frame], poses: Sequence[Sim3], size: float = 3.0
 ) -> Figure:
-    """Show frames of the target sequence, three in a row, under the reference's points and camera axes.
-
-    Args:
-        reference: Reference view.
-        frames: Frames of the target sequence.
-        poses: For each frame, the similarity from reference-camera points to its camera points.
-        size: Width of a frame in inches.
-    """
-    cloud = object_cloud(reference, most=_POINTS)
-    colours = plots.coordinate_colours(cloud)
+    """Show frames of the target sequence, three in a row, under the reference's points and camera axes."""
     titles = [f"frame {frame.name.split('/')[-1]}" for frame in frames]
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=size)
-    for axis, frame, pose in zip(axes, frames, poses):
-        plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
-        plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), _AXIS_LENGTH, names=("", "", ""))
-    return figure
-
-
-def saliency_of_backbones(
-    images: Mapping[str, Image], maps: Mapping[str, Sequence[FeatureMap]], size: float = 3.0
-) -> Figure:
-    """Show the saliency of several backbones on several images, one image per row.
-
-    Args:
-        images: Images by title.
-        maps: For each backbone, by its name, the features of every image.
-        size: Width of a panel in inches.
-    """
-    pictures = [image for image in images.values() for _ in range(1 + len(maps))]
-    titles = [title for name in images for title in (name, *maps)]
-    figure, axes = plots.show_images(pictures, titles, columns=1 + len(maps), size=size)
-    for row in range(len(images)):
-        for axis, features in zip(axes[row * (1 + len(maps)) + 1 :], maps.values()):
-            plots.overlay_map(axis, features[row].saliency.cpu().numpy(), alpha=0.75, limits=(0, 1))
+    cloud = object_cloud(reference, most=_POINTS)
+    plots.draw_moved_cloud(axes, [frame.camera for frame in frames], cloud, poses)
     return figure
 
 
 def image_in_patches(
     image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int], count: int = 8
 ) -> Figure:
-    """Show an image under the grid of its patches, and some of them pulled apart.
-
-    Args:
-        image: Image.
-        patches: Its patches.
-        corner: (row, col) of the first patch that is pulled apart.
-        count: Number of rows and of columns that are pulled apart.
-    """
+    """Show an image under the grid of its patches, and `count` x `count` of them, from `corner` on, pulled apart."""
     rows, cols, p = patches.shape[:3]
     (top, left), last = corner, count - 1
     titles = [f"{rows} x {cols} patches", f"rows {top} to {top + last}, columns {left} to {left + last}"]
@@ -150,12 +97,7 @@ def image_in_patches(
 
 
 def maps_of_positions(maps: Mapping[tuple[int, int], Real[np.ndarray, "rows cols"]], label: str) -> Figure:
-    """Show maps over the patch grid, from 0 to 1, without an image; a circle marks the patch of each.
-
-    Args:
-        maps: Maps by their patch (row, col).
-        label: Label of the colour bars.
-    """
+    """Show maps over the patch grid, from 0 to 1, without an image; a circle marks the patch of each."""
     shape = next(iter(maps.values())).shape
     titles = [f"position ({row}, {col})" for row, col in maps]
     figure, axes = plots.show_images([np.ones((*shape, 3))] * len(maps), titles, size=3.2)
@@ -168,14 +110,7 @@ def maps_of_positions(maps: Mapping[tuple[int, int], Real[np.ndarray, "rows cols
 def attention_of_patch(
     image: Image, cell: tuple[int, int], weights: Mapping[str, Float[np.ndarray, "rows cols"]], columns: int
 ) -> Figure:
-    """Show the attention weights of one patch, each panel relative to its largest weight; a circle marks the patch.
-
-    Args:
-        image: Image.
-        cell: The patch (row, col).
-        weights: Weights by the title of their panel; the largest one is added to the title.
-        columns: Panels per row.
-    """
+    """Show the attention weights of one patch, each panel relative to its largest weight; a circle marks the patch."""
     titles = [f"{title}\nat most {values.max():.0%}" for title, values in weights.items()]
     figure, axes = plots.show_images([image] * len(weights), titles, columns=columns, size=2.6)
     for axis, values in zip(axes, weights.values()):
@@ -196,15 +131,6 @@ def similarities_of_patch(
     """Show a patch of an image, and how similar the patches of other pictures are to it.
 
     A circle marks the patch, and in each other panel the most similar patch; a star marks the true partner.
-
-    Args:
-        image: Image.
-        cell: The patch (row, col).
-        pictures: Picture of each map.
-        maps: Similarities by the title of their panel.
-        true_cell: The true partner (row, col) in all pictures; None if there is none to show.
-        limits: Values at the ends of the colours; default those of each map.
-        size: Width of a panel in inches.
     """
     columns = 2 if len(maps) == 3 else min(1 + len(maps), 3)
     figure, axes = plots.show_images([image, *pictures], ["this patch", *maps], columns=columns, size=size)
@@ -220,13 +146,7 @@ def similarities_of_patch(
 
 
 def true_partners(pair: GroundTruthPair, count: int = 14, seed: int = 0) -> Figure:
-    """Show some patches of the reference with the patches of the target that show the same place.
-
-    Args:
-        pair: Pair with its true matches.
-        count: Number of patches, drawn at random.
-        seed: Seed of the draw.
-    """
+    """Show `count` patches of the reference, drawn at random, with those of the target that show the same place."""
     known = np.argwhere(pair.valid)
     some = known[np.random.default_rng(seed).choice(len(known), min(count, len(known)), replace=False)]
     grid = pair.valid.shape
@@ -240,17 +160,9 @@ def true_partners(pair: GroundTruthPair, count: int = 14, seed: int = 0) -> Figu
 
 
 def scores_by_layer(scores: pd.DataFrame, used: int, guessing: float) -> Figure:
-    """Draw a score against the layer, one line for each facet.
-
-    Args:
-        scores: Shares from 0 to 1; one row per layer, one column per facet.
-        used: Layer that the backbone is used at, drawn as a dashed line.
-        guessing: Score of a random partner, drawn as a dotted line.
-    """
+    """Draw a score (share of 1) against the layer, a line per facet; lines mark the layer in use and guessing."""
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
-    for name, marker, colour in zip(scores.columns, "o^sD", _COLOURS):
-        width = 2.5 if name == "key" else 1.2
-        axis.plot(scores.index, 100 * scores[name], marker=marker, color=colour, label=name, linewidth=width)
+    plots.draw_curves(axis, scores.index, (100 * scores).to_dict("list"))
     axis.axhline(100 * guessing, color="0.4", linestyle=":", label="guessing")
     axis.axvline(used, color="0.6", linestyle="--", linewidth=1)
     axis.set(xlabel="layer", ylabel="nearest neighbour within one patch (%)", xticks=scores.index, ylim=(0, None))
@@ -259,12 +171,7 @@ def scores_by_layer(scores: pd.DataFrame, used: int, guessing: float) -> Figure:
 
 
 def rows_of_pictures(rows: Mapping[str, Sequence[np.ndarray]], size: float = 2.0) -> Figure:
-    """Show rows of pictures, each under the title of its row.
-
-    Args:
-        rows: As many pictures in each row, by its title.
-        size: Width of a picture in inches.
-    """
+    """Show rows of pictures, each under the title of its row."""
     columns = len(next(iter(rows.values())))
     pictures = [picture for row in rows.values() for picture in row]
     titles = [title for title in rows for _ in range(columns)]
@@ -274,13 +181,7 @@ def rows_of_pictures(rows: Mapping[str, Sequence[np.ndarray]], size: float = 2.0
 def cls_attention_and_saliency(
     image: Image, attention: Float[np.ndarray, "heads rows cols"], saliency: Float[np.ndarray, "rows cols"]
 ) -> Figure:
-    """Show what CLS attends to in each head, relative to the largest weight of the head, and the saliency.
-
-    Args:
-        image: Image.
-        attention: Weights of the patches in each head.
-        saliency: Saliency from 0 to 1.
-    """
+    """Show what CLS attends to in each head, relative to the largest weight of the head, and the saliency."""
     titles = [*(f"CLS, head {head}" for head in range(len(attention))), "saliency"]
     figure, axes = plots.show_images([image] * len(titles), titles, columns=4, size=2.4)
     for axis, values in zip(axes, [*(head / head.max() for head in attention), saliency]):
@@ -289,13 +190,7 @@ def cls_attention_and_saliency(
 
 
 def foreground_above(image: Image, saliency: Float[np.ndarray, "rows cols"], thresholds: Sequence[float]) -> Figure:
-    """Show the patches whose saliency is above each of some thresholds.
-
-    Args:
-        image: Image.
-        saliency: Saliency from 0 to 1.
-        thresholds: One panel each.
-    """
+    """Show the patches whose saliency is above each of some thresholds."""
     titles = [f"saliency above {threshold}" for threshold in thresholds]
     figure, axes = plots.show_images([image] * len(titles), titles, size=3.0)
     for axis, threshold in zip(axes, thresholds):
@@ -304,13 +199,7 @@ def foreground_above(image: Image, saliency: Float[np.ndarray, "rows cols"], thr
 
 
 def overlap_by_threshold(thresholds: Float[np.ndarray, " t"], overlap: Float[np.ndarray, "n t"], used: float) -> Figure:
-    """Draw the overlap of foreground and mask against the threshold, thin for each image and bold for the mean.
-
-    Args:
-        thresholds: Thresholds of the saliency.
-        overlap: Intersection over union of each image at each threshold.
-        used: Threshold that the method uses, drawn as a dashed line.
-    """
+    """Draw the overlap (IoU) of foreground and mask over the threshold, thin for each image, bold for the mean."""
     figure, axis = plt.subplots(figsize=(5.6, 3.6), layout="constrained")
     axis.plot(thresholds, overlap.T, color="0.75", linewidth=1)
     axis.plot(thresholds, overlap.mean(axis=0), color=plots.BLUE, linewidth=2.5, label=f"mean of {len(overlap)}")
@@ -321,13 +210,7 @@ def overlap_by_threshold(thresholds: Float[np.ndarray, " t"], overlap: Float[np.
 
 
 def bins_of_patches(image: Image, cells: Mapping[str, tuple[int, int]], grid: tuple[int, int]) -> Figure:
-    """Show the 17 bins of the log-binned descriptor of some patches: nine white cells and eight dashed blocks.
-
-    Args:
-        image: Image.
-        cells: Patches (row, col) by the title of their panel.
-        grid: Patches (rows, columns) of the image.
-    """
+    """Show the 17 bins of the log-binned descriptor of some patches: nine white cells and eight dashed blocks."""
     figure, axes = plots.show_images([image] * len(cells), list(cells), size=3.4)
     height, width = image.shape[0] / grid[0], image.shape[1] / grid[1]
     near = {"edgecolor": "white", "linewidth": 1.2}
@@ -347,32 +230,6 @@ def bins_of_patches(image: Image, cells: Mapping[str, tuple[int, int]], grid: tu
     return figure
 
 
-def similarities_within_images(
-    images: Mapping[str, Image],
-    cells: Mapping[str, tuple[int, int]],
-    similarities: Mapping[str, Mapping[str, Real[np.ndarray, "rows cols"]]],
-    size: float = 2.4,
-) -> Figure:
-    """Show, for one patch of each image, how similar the other patches of the same image are to it.
-
-    Args:
-        images: Images by title, one per row.
-        cells: The patch (row, col) of each image, marked by a circle.
-        similarities: For each backbone, by its name, the similarities in each image; one column per backbone.
-        size: Width of a panel in inches.
-    """
-    pictures = [image for image in images.values() for _ in range(1 + len(similarities))]
-    titles = [title for name in images for title in (name, *similarities)]
-    figure, axes = plots.show_images(pictures, titles, columns=1 + len(similarities), size=size)
-    panels = iter(axes)
-    for name, image in images.items():
-        first, values = next(panels), next(iter(similarities.values()))[name]
-        _circle(first, cells[name], values.shape, image.shape[:2])
-        for maps in similarities.values():
-            plots.overlay_map(next(panels), maps[name], alpha=0.75, limits=(0, 1))
-    return figure
-
-
 def toy_cycles(
     values: tuple[Real[np.ndarray, "rows cols"], Real[np.ndarray, "rows cols"]],
     cycles: Sequence[tuple[tuple[int, int], tuple[int, int], tuple[int, int]]],
@@ -380,10 +237,7 @@ def toy_cycles(
 ) -> Figure:
     """Show two grids of numbers and some cycles u, v, u' between them: solid arrows to v, dashed ones back to u'.
 
-    Args:
-        values: Number of each patch of the first and the second image.
-        cycles: Patches (row, col) u, v and u' of each cycle.
-        wrong: Indices of the cycles that are drawn in red; the others are orange.
+    Cycles whose index is in `wrong` are red.
     """
     figure, axes = plt.subplots(1, 2, figsize=(8.6, 4.3), layout="constrained")
     for axis, numbers, title in zip(axes, values, ("first image", "second image")):
@@ -405,13 +259,7 @@ def toy_cycles(
 
 
 def cyclical_map(reference: Image, distances: Real[np.ndarray, "rows cols"], target: Image) -> Figure:
-    """Show a reference, its cyclical distance map, and the target.
-
-    Args:
-        reference: Reference image.
-        distances: Map C over the reference, -infinity off the foreground.
-        target: Target image.
-    """
+    """Show a reference, its cyclical distance map, and the target."""
     titles = ["reference", "map C over the reference", "target"]
     figure, axes = plots.show_images([reference, reference, target], titles, size=3.2)
     plots.overlay_map(axes[1], distances, label="− d(u, u') in patches", **_MAP)
@@ -419,12 +267,7 @@ def cyclical_map(reference: Image, distances: Real[np.ndarray, "rows cols"], tar
 
 
 def cyclical_maps(pictures: Sequence[Image], maps: Mapping[str, Real[np.ndarray, "rows cols"]]) -> Figure:
-    """Show several cyclical distance maps, each over its picture, two per row.
-
-    Args:
-        pictures: Picture of each map.
-        maps: Maps by the title of their panel.
-    """
+    """Show several cyclical distance maps, each over its picture, two per row."""
     figure, axes = plots.show_images(list(pictures), list(maps), columns=2, size=3.2)
     for axis, values in zip(axes, maps.values()):
         plots.overlay_map(axis, values, **_MAP)
@@ -440,12 +283,7 @@ def cycles_between(
 ) -> Figure:
     """Show cycles between two images, one per row: a solid line from u to v, a dashed one from v to u'.
 
-    Args:
-        reference: Reference image.
-        target: Target image of the same size.
-        cycles: Patches (row, col) u, v and u' of each cycle, by the title of its row.
-        grid: Patches (rows, columns) of both images.
-        wrong: Titles of the cycles that are drawn in red; the others are white.
+    `cycles` has the cells u, v and u' by title; those whose title is in `wrong` are red.
     """
     (height, width), gap = reference.shape[:2], 10
     picture = np.concatenate([reference, np.full((height, gap, 3), 255, np.uint8), target], axis=1)
@@ -463,20 +301,15 @@ def cycles_between(
 
 
 def counts_of_matches(counts: Mapping[str, pd.DataFrame], wanted: int) -> Figure:
-    """Draw how many matches each rule finds in several pairs of views, one marker for each pair.
-
-    Args:
-        counts: Numbers of matches by category; one row per pair of views, one column per rule.
-        wanted: Number that the method wants, drawn as a dashed line.
-    """
+    """Draw how many matches each rule (column) finds in the pairs of views (rows) of several categories."""
     figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
     rules = list(next(iter(counts.values())).columns)
     for index, (name, table) in enumerate(counts.items()):
         for place, rule in enumerate(reversed(rules)):
             heights = np.full(len(table), place) + 0.16 * (index - (len(counts) - 1) / 2)
             axis.scatter(
-                table[rule], heights, s=45, marker="osD^"[index % 4], color=_COLOURS[index % 4], edgecolors="black",
-                label=None if place else name,
+                table[rule], heights, s=45, marker=plots.MARKERS[index % 4], color=plots.COLOURS[index % 4],
+                edgecolors="black", label=None if place else name,
             )  # fmt: skip
     axis.axvline(wanted, color="0.4", linestyle="--")
     labels = {"yticks": range(len(rules)), "yticklabels": rules[::-1]}
@@ -486,11 +319,7 @@ def counts_of_matches(counts: Mapping[str, pd.DataFrame], wanted: int) -> Figure
 
 
 def correct_by_length(table: pd.DataFrame) -> Figure:
-    """Draw the share of correct matches against the length of their cycle, with the number of matches.
-
-    Args:
-        table: One row per range of lengths, named by its index; columns "correct" (share from 0 to 1) and "matches".
-    """
+    """Draw the columns "correct" (share of 1) and "matches" (number) against the length of the cycle, the index."""
     figure, axis = plt.subplots(figsize=(6.8, 3.6), layout="constrained")
     shares = 100 * table["correct"]
     bars = axis.bar(table.index, shares, color=plots.BLUE)
@@ -502,13 +331,7 @@ def correct_by_length(table: pd.DataFrame) -> Figure:
 
 
 def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[int, int]) -> Figure:
-    """Show where the matches of several rules start, coloured by their cyclical distance.
-
-    Args:
-        image: Reference image.
-        matches: Matches by the title of their panel.
-        grid: Patches (rows, columns) of the image.
-    """
+    """Show where the matches of several rules start, coloured by their cyclical distance."""
     figure, axes = plots.show_images([image] * len(matches), list(matches), size=4.0)
     for axis, some in zip(axes, matches.values()):
         centres = plots.patch_centres(some.reference, grid, image.shape[:2]).T
@@ -519,15 +342,9 @@ def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[
 
 
 def accuracy_by_number(curves: pd.DataFrame) -> Figure:
-    """Draw the share of correct matches against the number of matches kept, one line for each matcher.
-
-    Args:
-        curves: Shares from 0 to 1; one row per number of matches, one column per matcher.
-    """
+    """Draw the share of correct matches against the number of matches kept (index), one line for each matcher."""
     figure, axis = plt.subplots(figsize=(7.4, 4), layout="constrained")
-    for name, line, marker, colour in zip(curves.columns, ("-", "--", "-.", ":"), "osD^", _COLOURS):
-        style = {"linestyle": line, "marker": marker, "color": colour, "markersize": 4}
-        axis.plot(curves.index, 100 * curves[name], label=name, **style)
+    plots.draw_curves(axis, curves.index, (100 * curves).to_dict("list"))
     axis.set(xlabel="matches kept per pair, best first", ylabel="right of those known (%)", ylim=(0, None))
     axis.legend(loc="upper right", ncols=2)
     return figure
@@ -540,15 +357,7 @@ def judged_matches(
     grid: tuple[int, int],
     titles: tuple[str, str],
 ) -> Figure:
-    """Show matches between two images; the good ones are solid, the others dashed.
-
-    Args:
-        images: Reference and target image.
-        cells: Patches (row, col) of the matches in both.
-        good: Which matches are good.
-        grid: Patches (rows, columns) of both images.
-        titles: Titles of the images.
-    """
+    """Show matches between two images; the good ones are solid, the others dashed."""
     ends = [plots.patch_centres(some, grid, image.shape[:2]) for some, image in zip(cells, images)]
     return plots.draw_matches(*images, *ends, good, titles, size=3.8)
 

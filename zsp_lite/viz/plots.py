@@ -1,10 +1,11 @@
 """Plots of every stage of the method, as primitives to combine.
 
 `show_images` shows images side by side; `overlay_map`, `mark`, `draw_points` and `draw_axes` add to its axes.
-`draw_matches` shows two images and lines between them. Colours are distinguishable with colour-vision deficiencies.
+`draw_matches` shows two images and lines between them; `draw_curves` adds curves to any axis. Colours are
+distinguishable with colour-vision deficiencies.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,13 +14,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import ArrayLike
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError
+from zsp_lite.points import axis_deviation
 
 # The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 CHOSEN = ORANGE
+# Of several curves or groups of points in one figure, in this order.
+COLOURS = BLUE, ORANGE, GREEN, VERMILLION
+LINES = "-", "--", "-.", ":"
+MARKERS = "o", "s", "^", "D"
 _AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
@@ -46,14 +53,7 @@ def show_images(
 
     Returns:
         The figure, and one axis per image.
-
-    Raises:
-        InputError: No image, or the numbers of titles and images differ.
     """
-    if len(images) == 0:
-        raise InputError("images is empty, expected at least one (H, W, 3) array")
-    if titles is not None and len(titles) != len(images):
-        raise InputError(f"titles has {len(titles)} entries, expected one for each of the {len(images)} images")
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
@@ -150,22 +150,13 @@ def draw_matches(
         inliers: Which matches are inliers; None for all.
         titles: Titles of the images.
         size: Width of an image in inches.
-
-    Raises:
-        InputError: The numbers of pixels and flags differ.
     """
-    reference_pixels, target_pixels = np.asarray(reference_pixels, float), np.asarray(target_pixels, float)
-    inliers = np.ones(len(reference_pixels), bool) if inliers is None else np.asarray(inliers, bool)
-    if not len(reference_pixels) == len(target_pixels) == len(inliers):
-        raise InputError(
-            f"{len(reference_pixels)} reference pixels, {len(target_pixels)} target pixels and {len(inliers)} inlier "
-            "flags, expected equal numbers"
-        )
+    inliers = np.ones(len(reference_pixels), bool) if inliers is None else inliers
     figure, (left, right) = show_images([reference, target], list(titles), size=size)
     # plasma without its brightest end, which is not visible on light images.
     colours = plt.get_cmap("plasma")(0.85 * reference_pixels[:, 1] / np.shape(reference)[0])
     for a, b, good, colour in sorted(
-        zip(reference_pixels, target_pixels, inliers, colours), key=lambda match: match[2]
+        zip(reference_pixels, target_pixels, inliers, colours, strict=True), key=lambda match: match[2]
     ):
         style = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
         if good:  # with a white outline, to be visible on dark images
@@ -187,6 +178,12 @@ def draw_matches(
     return figure
 
 
+def draw_curves(axis: Axes, x: ArrayLike, curves: Mapping[str, ArrayLike]) -> None:
+    """Draw up to four curves over x that differ in colour, line and marker, each with its name for the legend."""
+    for (name, values), colour, line, marker in zip(curves.items(), COLOURS, LINES, MARKERS):
+        axis.plot(x, values, line, marker=marker, color=colour, label=name, markersize=5)
+
+
 def pca_colours(
     maps: Sequence[Real[np.ndarray, "rows cols d"]],
     foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None,
@@ -202,16 +199,11 @@ def pca_colours(
 
     Returns:
         Per map, an RGB image in [0, 1] with one pixel per patch.
-
-    Raises:
-        InputError: Fewer than three foreground patches or feature dimensions.
     """
     features = [np.asarray(features, dtype=np.float64) for features in maps]
     if foreground is None:
         foreground = [np.ones(features.shape[:2], bool) for features in features]
     inside = np.concatenate([feature[np.asarray(where, bool)] for feature, where in zip(features, foreground)])
-    if len(inside) < 3 or inside.shape[1] < 3:
-        raise InputError(f"{inside.shape[0]} patches of {inside.shape[1]} features, expected at least 3 of each")
     mean = inside.mean(axis=0)
     axes = np.linalg.eigh((inside - mean).T @ (inside - mean))[1][:, :-4:-1]
     low, high = np.percentile((inside - mean) @ axes, [2, 98], axis=0)
@@ -296,6 +288,29 @@ def draw_axes(
             path_effects=[Stroke(linewidth=3, foreground="white"), Normal()],
         )
     _keep_limits(axis, camera.size)
+
+
+def draw_moved_cloud(
+    axes: Sequence[Axes],
+    cameras: Sequence[Camera],
+    cloud: Real[np.ndarray, "n 3"],
+    poses: Sequence[Sim3],
+    names: Sequence[str] | None = ("", "", ""),
+) -> None:
+    """Draw a cloud of the reference, and the axes of its camera, under a pose over the image of each camera.
+
+    Args:
+        axes: Axes of the images.
+        cameras: Cameras of the images.
+        cloud: Points in the frame of the reference camera; see `coordinate_colours` for their colours.
+        poses: For each camera, the pose from the reference camera to it.
+        names: Labels of the axes; None to draw no axes.
+    """
+    colours, length = coordinate_colours(cloud), 2 * axis_deviation(cloud)
+    for axis, camera, pose in zip(axes, cameras, poses):
+        draw_points(axis, camera, pose.apply(cloud), colours, size=3)
+        if names is not None:
+            draw_axes(axis, camera, pose.apply, cloud.mean(axis=0), length, names)
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -31,7 +31,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.pair_result import PairResult
-from zsp_lite.points import axis_deviation, coloured_cloud, object_cloud
+from zsp_lite.points import coloured_cloud, object_cloud
 from zsp_lite.views import View, frame_defect, object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
@@ -63,25 +63,15 @@ _TERMS = {
 
 @dataclass(frozen=True)
 class StageFigure:
-    """One figure of the page: an image with its alternative text, or HTML that draws it.
-
-    Attributes:
-        title: Heading.
-        caption: Text below the figure.
-        notebook: Notebook that explains the stage, without its extension.
-        image: Data URI of the image, or None.
-        alt: Alternative text of the image.
-        html: Markup of the figure if there is no image.
-        wide: Whether it spans both columns.
-    """
+    """One figure of the page: an image with its alternative text, or HTML that draws it."""
 
     title: str
     caption: str
-    notebook: str
-    image: str | None = None
+    notebook: str  # that explains the stage, without its extension
+    image: str | None = None  # a data URI
     alt: str = ""
     html: Markup = Markup()
-    wide: bool = False
+    wide: bool = False  # spans both columns
 
 
 def write_report(
@@ -106,27 +96,9 @@ def write_report(
         The path.
     """
     path = Path(path)
-    page = render_page(results, data, data_note, backbone, photograph, path.parent)
+    page = render_page(results, backbone, path.parent, data, data_note, photograph=photograph)
     write_atomic(path, page.encode(errors="replace"))
     return path
-
-
-def render_page(
-    results: Sequence[PairResult],
-    data: str,
-    data_note: str,
-    backbone: str,
-    photograph: Sequence[PhotographResult] = (),
-    folder: Path = Path(),
-) -> str:
-    """Return the page of the demo as text; the arguments are those of `write_report`.
-
-    Links to the notebooks are relative to `folder`.
-    """
-    return _render(
-        results, folder, backbone, data=data, data_note=data_note, own=False,
-        photograph=_photograph_section(photograph) if photograph else None,
-    )  # fmt: skip
 
 
 def write_pair_report(path: str | Path, result: PairResult, backbone: str, masks: tuple[str, str]) -> Path:
@@ -144,12 +116,21 @@ def write_pair_report(path: str | Path, result: PairResult, backbone: str, masks
     path = Path(path)
     names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found from the depth"}
     note = f"reference {names[masks[0]]}, target {names[masks[1]]}"
-    page = _render([result], path.parent, backbone, data="", data_note=note, own=True, photograph=None)
+    page = render_page([result], backbone, path.parent, data_note=note, own=True)
     write_atomic(path, page.encode(errors="replace"))
     return path
 
 
-def _render(results: Sequence[PairResult], folder: Path, backbone: str, **content) -> str:
+def render_page(
+    results: Sequence[PairResult],
+    backbone: str,
+    folder: Path = Path(),
+    data: str = "",
+    data_note: str = "",
+    own: bool = False,
+    photograph: Sequence[PhotographResult] = (),
+) -> str:
+    """Return the page as text: of the demo, or of a pair of the user's `own`. Links are relative to `folder`."""
     environment = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
     environment.filters |= {"explain": _explain, "notebook": lambda name: _notebook_link(name, folder)}
     pairs = [
@@ -164,10 +145,11 @@ def _render(results: Sequence[PairResult], folder: Path, backbone: str, **conten
         }
         for index, result in enumerate(results, 1)
     ]
-    labelled = any(result.errors for result in results) or not content["own"]
+    labelled = any(result.errors for result in results) or not own
     return environment.get_template("report.html").render(
-        plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, labelled=labelled, **content
-    )
+        plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, labelled=labelled, data=data,
+        data_note=data_note, own=own, photograph=_photograph_section(photograph) if photograph else None,
+    )  # fmt: skip
 
 
 def _answer(solver: str, estimate: PoseEstimate, result: PairResult) -> dict:
@@ -286,24 +268,19 @@ def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     columns = 2 + _OVERVIEW_FRAMES
     figure, axes = plots.show_images(images, titles, columns=columns, size=1.7)
     for result, row in zip(results, np.reshape(np.array(axes, dtype=object), (-1, columns))):
-        cloud = object_cloud(result.estimate.reference_view, most=_OVERVIEW_POINTS)
-        colours = plots.coordinate_colours(cloud)
-        plots.draw_points(row[0], result.estimate.reference_view.frame.camera, cloud, colours, size=3)
+        reference = result.estimate.reference_view
+        cloud = object_cloud(reference, most=_OVERVIEW_POINTS)
+        plots.draw_points(row[0], reference.frame.camera, cloud, plots.coordinate_colours(cloud), size=3)
         cameras = [frame.camera for frame in _sequence_crops(result)]
-        for axis, camera, pose in zip(row[2:], cameras, result.estimate.propagate(cameras)):
-            plots.draw_points(axis, camera, pose.apply(cloud), colours, size=3)
+        plots.draw_moved_cloud(row[2:], cameras, cloud, result.estimate.propagate(cameras), names=None)
     write_atomic(path, _jpeg(figure))
     return path
 
 
 def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
-    """Draw the figures of one result, in the order of the method's stages.
+    """Draw the figures of one result, in the order of the method's stages, those of a single view by the first solver.
 
-    The figures before the point clouds are those of the first solver; both share the features.
-
-    Args:
-        result: The result.
-        scene_id: HTML id of the 3D scene, unique on the page.
+    `scene_id` is the HTML id of the 3D scene, unique on the page.
     """
     estimate, title, chosen = result.estimate, result.title, f"target view {result.estimate.view + 1}"
     inliers = int(estimate.inliers.sum())
@@ -522,11 +499,8 @@ def _two_poses_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
 
 def _draw_pose(axes: Sequence[Axes], frames: Sequence[Frame], estimate: PoseEstimate) -> None:
     """Draw the reference cloud and the axes of its camera under the pose over frames of the target sequence."""
-    cloud = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
-    colours, length = plots.coordinate_colours(cloud), 2 * axis_deviation(cloud)
-    for axis, frame, pose in zip(axes, frames, estimate.propagate([frame.camera for frame in frames])):
-        plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
-        plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), length)
+    cloud, cameras = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS), [frame.camera for frame in frames]
+    plots.draw_moved_cloud(axes, cameras, cloud, estimate.propagate(cameras), ("x", "y", "z"))
 
 
 def _chosen_views(result: PairResult) -> list[View]:

@@ -1,4 +1,7 @@
-"""Figures of results: estimated poses and their failures, benchmark runs, pose labels, and one's own captures."""
+"""Figures of results: estimated poses and their failures, benchmark runs, pose labels, and one's own captures.
+
+Angles are in degrees, lengths in scene units, accuracies in per cent; `size` is the width of a panel in inches.
+"""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -14,10 +17,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.points import object_cloud
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
-
-_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
-_MARKERS = "osD^vP*X"
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
 
 
 def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, points: int = 1500) -> Figure:
@@ -44,13 +44,7 @@ def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, po
 
 
 def crop_steps(frame: Frame, crop: Frame, size: float = 3.0) -> Figure:
-    """Draw a frame with the box around its object, the object mask, and the crop.
-
-    Args:
-        frame: Whole frame with a mask.
-        crop: Its object crop.
-        size: Width of a panel in inches.
-    """
+    """Draw a frame with the box around its object, the object mask, and the crop."""
     top, left, height, width = mask_to_bbox(frame.mask)
     titles = ["frame and box", "object mask", "crop, resized to a square"]
     figure, axes = plots.show_images([frame.rgb, frame.mask, crop.rgb], titles, size=size)
@@ -107,11 +101,6 @@ def matched_points(views: Sequence[View], points: Sequence[Float[np.ndarray, "k 
 
     Both points of a match have the same colour, by their height on the first object. Points far off the object are
     outside the panels.
-
-    Args:
-        views: Two views.
-        points: Matched points in the camera frames of both.
-        names: Names of both.
     """
     clouds = [object_cloud(view)[:, :2] for view in views]
     middles = [(cloud.min(axis=0) + cloud.max(axis=0)) / 2 for cloud in clouds]
@@ -132,13 +121,7 @@ def matched_points(views: Sequence[View], points: Sequence[Float[np.ndarray, "k 
 
 
 def residual_histogram(residuals: Real[np.ndarray, " k"], inliers: Bool[np.ndarray, " k"], threshold: float) -> Figure:
-    """Draw the distribution of the residuals of a fit, inliers and outliers apart.
-
-    Args:
-        residuals: Distance of each moved reference point from its match, in scene units.
-        inliers: Which matches are inliers.
-        threshold: RANSAC's threshold, drawn as a line.
-    """
+    """Draw the distribution of the residuals of a fit, inliers and outliers apart; a line marks RANSAC's threshold."""
     figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
     capped = np.minimum(residuals, 1.99)  # the last bar holds everything beyond
     labels = [f"{inliers.sum()} inliers", f"{(~inliers).sum()} outliers"]
@@ -153,12 +136,7 @@ def residual_histogram(residuals: Real[np.ndarray, " k"], inliers: Bool[np.ndarr
 
 
 def aligned_from_two_sides(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, "m 3"]) -> Figure:
-    """Draw both clouds in the target camera's frame, from the front and from above.
-
-    Args:
-        reference: Points of the reference after the pose.
-        target: Points of the target.
-    """
+    """Draw both clouds in the target camera's frame, from the front and from above."""
     low, high = np.percentile(np.concatenate([reference, target]), [0.5, 99.5], axis=0)
     middle, half = (low + high) / 2, 0.55 * np.max(high - low)
     figure, axes = plt.subplots(1, 2, figsize=(9, 4.9), layout="constrained")
@@ -184,23 +162,11 @@ def pose_over_sequence(
     size: float = 2.7,
     show_axes: bool = True,
 ) -> Figure:
-    """Draw the reference's points in frames of the target sequence after the estimated pose.
-
-    Args:
-        estimate: Pose estimate.
-        frames: Whole frames of the target sequence.
-        titles: Title of each.
-        columns: Panels per row.
-        size: Width of a panel in inches.
-        show_axes: Whether to draw the axes of the reference camera as well.
-    """
-    cloud = object_cloud(estimate.reference_view, most=1400)
-    colours = plots.coordinate_colours(cloud)
+    """Draw the reference's points in frames of the target sequence after the estimated pose."""
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
-    for axis, frame, pose in zip(axes, frames, estimate.propagate([frame.camera for frame in frames])):
-        plots.draw_points(axis, frame.camera, pose.apply(cloud), colours, size=3)
-        if show_axes:
-            plots.draw_axes(axis, frame.camera, pose.apply, cloud.mean(axis=0), 2, names=("", "", ""))
+    cloud, cameras = object_cloud(estimate.reference_view, most=1400), [frame.camera for frame in frames]
+    names = ("", "", "") if show_axes else None
+    plots.draw_moved_cloud(axes, cameras, cloud, estimate.propagate(cameras), names)
     return figure
 
 
@@ -213,17 +179,7 @@ def points_on_images(
     size: float = 2.6,
     zoom: bool = False,
 ) -> Figure:
-    """Draw coloured points over images.
-
-    Args:
-        frames: One frame per panel.
-        clouds: For each frame, points in its camera's frame.
-        colours: For each frame, the colours of the points in [0, 1].
-        titles: Title of each panel.
-        columns: Panels per row; default all in one row.
-        size: Width of a panel in inches.
-        zoom: Show only a square around the object mask, a third wider than the object.
-    """
+    """Draw coloured points, in the frame of each camera, over images; `zoom` shows only a square around each object."""
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
     for axis, frame, cloud, own in zip(axes, frames, clouds, colours):
         plots.draw_points(axis, frame.camera, cloud, own, size=4)
@@ -237,14 +193,7 @@ def points_on_images(
 
 
 def foregrounds(views: Sequence[View], titles: Sequence[str], columns: int | None = None, size: float = 2.9) -> Figure:
-    """Draw the saliency of foreground patches over each crop, dark (0) to bright (1).
-
-    Args:
-        views: Views.
-        titles: Title of each.
-        columns: Panels per row; default all in one row.
-        size: Width of a panel in inches.
-    """
+    """Draw the saliency of foreground patches over each crop, dark (0) to bright (1)."""
     figure, axes = plots.show_images([view.frame.rgb for view in views], titles, columns=columns, size=size)
     for axis, view in zip(axes, views):
         plots.overlay_map(axis, np.where(view.foreground, view.features.saliency, np.nan), limits=(0, 1))
@@ -256,15 +205,10 @@ def errors_against_viewpoint(
 ) -> Figure:
     """Draw rotation errors over the angle between the reference and the chosen view, a marker for each group.
 
-    Args:
-        angles: Angle of each pair in degrees.
-        errors: Rotation error of each pair in degrees.
-        groups: Category of each pair.
-        near: Largest angle of a near view, drawn as a dotted line.
-        correct: Largest error of a correct pose, drawn as a dashed line.
+    Lines mark the largest angle of a near view, the largest error of a correct pose, and errors equal to the angle.
     """
     figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
-    styles = zip(dict.fromkeys(groups), cycle(_MARKERS), cycle(_COLOURS))
+    styles = zip(dict.fromkeys(groups), cycle("osD^vP*X"), cycle(plots.COLOURS))
     for group, marker, colour in styles:
         at = [(angle, error) for angle, error, own in zip(angles, errors, groups) if own == group]
         axis.scatter(*np.transpose(at), marker=marker, color=colour, s=60, edgecolors="black", label=group)
@@ -278,14 +222,9 @@ def errors_against_viewpoint(
 
 
 def label_error_curves(noises: Sequence[float], errors: Mapping[int, Real[np.ndarray, "noises draws"]]) -> Figure:
-    """Draw the error of pose labels over the error of single clicks: medians, and 95th percentiles dotted.
-
-    Args:
-        noises: Errors of the clicks, as shares of the object's length.
-        errors: For each number of keypoints, the errors of random labels in degrees.
-    """
+    """Draw the error of pose labels over the error of single clicks: medians, and 95th percentiles dotted."""
     figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
-    for (n, draws), marker, colour in zip(errors.items(), cycle(_MARKERS), cycle((VERMILLION, ORANGE, GREEN, BLUE))):
+    for (n, draws), marker, colour in zip(errors.items(), cycle(plots.MARKERS), cycle(plots.COLOURS)):
         middle, high = np.percentile(draws, [50, 95], axis=1)
         axis.plot(noises, middle, marker=marker, color=colour, label=f"{n} keypoints")
         axis.plot(noises, high, marker=marker, color=colour, linestyle=":", markerfacecolor="white")
@@ -306,12 +245,8 @@ def cloud_overlays(
 ) -> Figure:
     """Draw pairs of clouds over each other: the first as orange discs, the second as blue crosses.
 
-    Args:
-        overlays: For each panel, two clouds in the axes of the object (front +x, left +y, up +z).
-        titles: Title of each panel.
-        seen: For each panel, the object axes to the right and up: (0, 2) from the right side, (0, 1) from above.
-        columns: Panels per row.
-        low: Lower end of the vertical axis.
+    The clouds are in the axes of the object (front +x, left +y, up +z). `seen` are the axes to the right and up of each
+    panel: (0, 2) from the right side, (0, 1) from above; `low` is the lower end of the vertical axis.
     """
     rows = -(-len(overlays) // columns)
     size = 9, rows * (0.5 + 9 / columns * (2.3 - low) / 7.4)
@@ -325,15 +260,9 @@ def cloud_overlays(
 
 
 def accuracy_of_wrong_labels(label_errors: Sequence[float], shares: Mapping[str, Sequence[float]]) -> Figure:
-    """Draw the accuracy that a benchmark measures over the error of its labels.
-
-    Args:
-        label_errors: Errors of the labels in degrees.
-        shares: For each measure, the accuracy in percent at each error.
-    """
+    """Draw the accuracy that a benchmark measures over the error of its labels."""
     figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
-    for (name, share), marker, colour in zip(shares.items(), "so", (ORANGE, BLUE)):
-        axis.plot(label_errors, share, marker=marker, color=colour, label=name)
+    plots.draw_curves(axis, label_errors, shares)
     axis.set(xlabel="error of the labels (degrees)", ylabel="accuracy that is measured (%)", ylim=(0, None))
     axis.legend()
     return figure
@@ -379,12 +308,7 @@ def landing_points(
 def fused_clouds(
     clouds: Mapping[str, tuple[Real[np.ndarray, "_ 3"], UInt8[np.ndarray, "_ 3"]]], points: int = 3000
 ) -> Figure:
-    """Draw coloured point clouds in 3D, one panel each, with +y of the camera's frame downwards.
-
-    Args:
-        clouds: Points and their colours by the title of the panel.
-        points: Largest number of points of a panel.
-    """
+    """Draw at most `points` points of coloured clouds in 3D, with +y of the camera's frame downwards."""
     figure = plt.figure(figsize=(4.5 * len(clouds), 3.6))
     for place, (title, (cloud, colours)) in enumerate(clouds.items()):
         keep = np.random.default_rng(0).permutation(len(cloud))[:points]
@@ -399,14 +323,7 @@ def fused_clouds(
 def category_heatmap(
     cells: Real[np.ndarray, "rows categories"], rows: Sequence[str], categories: Sequence[str], label: str
 ) -> Figure:
-    """Draw percentages of rows by category as numbers on a colour map from 0 to 100.
-
-    Args:
-        cells: Percentages.
-        rows: Names of the rows.
-        categories: Names of the categories.
-        label: Label of the colour bar.
-    """
+    """Draw percentages of rows by category as numbers on a colour map from 0 to 100."""
     size = 1.6 + 0.47 * len(categories), 0.9 + 0.5 * len(rows)
     figure, axis = plt.subplots(figsize=size, layout="constrained")
     image = axis.imshow(cells, cmap="cividis", vmin=0, vmax=100, aspect="auto")
@@ -420,13 +337,7 @@ def category_heatmap(
 
 
 def interval_against_pairs(numbers: Sequence[int], values: Sequence[float], bounds: Real[np.ndarray, "n 2"]) -> Figure:
-    """Draw Acc30 with its interval over the number of pairs, and the rule of thumb for independent pairs dotted.
-
-    Args:
-        numbers: Numbers of pairs, ascending; the last one is all pairs.
-        values: Acc30 of the first n pairs in percent.
-        bounds: Interval of each.
-    """
+    """Draw Acc30 with its interval over the number of pairs, and the rule of thumb for independent pairs dotted."""
     figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
     axis.fill_between(numbers, *bounds.T, color=BLUE, alpha=0.25, label="95 % interval, objects resampled")
     axis.plot(numbers, values, "o-", color=BLUE, label="Acc30 of the first n pairs")

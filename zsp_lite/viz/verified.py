@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.errors import InputError
 from zsp_lite.metrics import Reliability, reliability
 from zsp_lite.points import object_cloud
 from zsp_lite.verified.confidence import MODE_ANGLE
@@ -84,11 +83,8 @@ def draw_point_classes(
 
     Returns:
         (v, classes) number of points of each class in each drawn view.
-
-    Raises:
-        InputError: There is not one axis per drawn view.
     """
-    views = _drawn_views(axes, maps, views)
+    views = range(len(maps)) if views is None else views
     classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
     # Violations are drawn last, so that no other point covers them.
     for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
@@ -126,13 +122,8 @@ def draw_point_term(
         pose: Index of the pose.
         size: Marker size in points squared.
         views: Indices of the views that are drawn; None for all.
-
-    Raises:
-        InputError: Another name, or there is not one axis per drawn view.
     """
-    if name not in _POINT_TERMS:
-        raise InputError(f"point term is {name!r}, expected one of {', '.join(_POINT_TERMS)}")
-    views = _drawn_views(axes, maps, views)
+    views = range(len(maps)) if views is None else views
     label, (low, high) = _POINT_TERMS[name]
     values = getattr(terms, name)[pose].numpy()[views]
     weights = terms.surface[pose].numpy()[views] if name == "similarity" else values
@@ -155,18 +146,7 @@ def score_contributions(terms: Mapping[str, float], weights: ScoreWeights) -> di
 
 
 def draw_score_contributions(axis: Axes, hypotheses: Mapping[str, Mapping[str, float]], weights: ScoreWeights) -> None:
-    """Draw what each term adds to the scores of one to four hypotheses. Terms of weight 0 are left out.
-
-    Args:
-        axis: Axis to draw on.
-        hypotheses: The terms of each hypothesis by its name in the legend.
-        weights: Weights of the score.
-
-    Raises:
-        InputError: No hypothesis, or more than four.
-    """
-    if not 1 <= len(hypotheses) <= len(_HATCHES):
-        raise InputError(f"{len(hypotheses)} hypotheses to draw, expected 1 to {len(_HATCHES)}")
+    """Draw what each term adds to the scores of one to four hypotheses. Terms of weight 0 are left out."""
     names = [name for name in TERM_NAMES if getattr(weights, name)]
     height = 0.8 / len(hypotheses)
     for place, (label, terms) in enumerate(hypotheses.items()):
@@ -258,17 +238,7 @@ def show_point_classes(
     images: Sequence[np.ndarray], terms: PointTerms, maps: ViewMaps, views: Sequence[int], names: Sequence[str],
     poses: Sequence[str], size: float = 3.0,
 ) -> Figure:  # fmt: skip
-    """Show the points of each pose by their classes: one row per pose, one column per view (a single view: one row).
-
-    Args:
-        images: Image of each shown view.
-        terms: Point terms of the poses.
-        maps: Maps of all views of the scene.
-        views: Indices of the shown views in the scene.
-        names: Names of the shown views.
-        poses: Names of the poses.
-        size: Width of an image in inches.
-    """
+    """Show the points of each pose by their classes: one row per pose, one column per view (a single view: one row)."""
     titles = [f"{pose}: {name}" for pose in poses for name in names]
     columns = len(images) if len(images) > 1 else len(poses)
     figure, axes = show_images(list(images) * len(poses), titles, columns=columns, size=size)
@@ -295,13 +265,7 @@ def show_term_curves(
     degrees: Float[np.ndarray, " m"], forward: Mapping[str, Float[np.ndarray, " m"]],
     reverse: Mapping[str, Float[np.ndarray, " m"]],
 ) -> Figure:  # fmt: skip
-    """Show how terms change as an object is turned: forward and reverse terms of the same name in one panel.
-
-    Args:
-        degrees: Angle of each pose.
-        forward: Values of the forward terms by name.
-        reverse: Values of the reverse terms by the same names.
-    """
+    """Show how terms change as an object is turned: forward and reverse terms of the same name in one panel."""
     columns = min(len(forward), 2)
     rows = -(-len(forward) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(4.4 * columns, 2.9 * rows), squeeze=False, layout="constrained")
@@ -320,12 +284,6 @@ def show_from_above(
     """Show the targets' points and the moved points of the reference from above, one panel per pose.
 
     Above means along the y axis of the scene's first target camera, which points down.
-
-    Args:
-        reference_points: Points of the reference in working units (see `Scene`).
-        target_points: Points of all target views in working units.
-        poses: The poses.
-        titles: Title of each panel.
     """
     columns = min(len(poses), 3)
     rows = -(-len(poses) // columns)
@@ -350,11 +308,7 @@ def show_from_above(
 
 
 def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> Figure:
-    """Show score against rotation error of every pose after each stage.
-
-    Args:
-        stages: Rotation errors in degrees and scores in nats, by name of the stage.
-    """
+    """Show score (nats) against rotation error (degrees) of every pose after each stage; a star marks the highest."""
     figure, axes = plt.subplots(
         1, len(stages), figsize=(3.1 * len(stages), 3.4), sharey=True, squeeze=False, layout="constrained"
     )
@@ -373,12 +327,7 @@ def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.nda
 
 
 def show_accuracy_intervals(accuracy: Mapping[str, tuple[float, float, float]], first: int = 1) -> Figure:
-    """Show the accuracy of several methods with intervals.
-
-    Args:
-        accuracy: Accuracy, lower and upper end of its interval in per cent, by name of the method.
-        first: Number of methods at the top that are drawn as orange squares; a line marks the next one.
-    """
+    """Show (accuracy, low, high) in per cent by method, the `first` ones in orange; a line marks the next one."""
     figure, axis = plt.subplots(figsize=(8, 0.9 + 0.3 * len(accuracy)), layout="constrained")
     for row, (value, low, high) in enumerate(accuracy.values()):
         marker, colour = ("s", ORANGE) if row < first else ("o", BLUE)
@@ -393,12 +342,7 @@ def show_accuracy_intervals(accuracy: Mapping[str, tuple[float, float, float]], 
 
 
 def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> Figure:
-    """Show a reliability diagram, and the accuracy among the most confident answers against their share.
-
-    Args:
-        confidence: Confidence of each answer.
-        correct: Whether it is correct.
-    """
+    """Show a reliability diagram, and the accuracy among the most confident answers against their share."""
     measured = reliability(confidence, correct, bins=max(2, min(10, len(correct) // 20)))
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 4.2), layout="constrained")
     draw_reliability(left, measured)
@@ -431,10 +375,3 @@ def _clip_to_image(axis: Axes, pixels: Float[np.ndarray, "n 2"]) -> Float[np.nda
     """Clip pixels to the limits of `axis`, which its image covers."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     return np.clip(pixels, [left, top], [right, bottom])
-
-
-def _drawn_views(axes: Sequence[Axes], maps: ViewMaps, views: Sequence[int] | None) -> list[int]:
-    views = list(range(len(maps)) if views is None else views)
-    if len(axes) != len(views):
-        raise InputError(f"{len(axes)} axes, expected one for each of the {len(views)} views")
-    return views
