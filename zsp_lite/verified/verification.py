@@ -90,15 +90,15 @@ FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 class ScoreWeights:
     """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
 
-    forward_similarity: float = 15.9
-    forward_overlap: float = 5.5
-    forward_silhouette: float = -14.7
-    forward_free_space: float = -16.7
-    reverse_similarity: float = 20.3
-    reverse_overlap: float = 18.0
-    reverse_silhouette: float = -6.1
-    reverse_free_space: float = -13.7
-    viewpoint: float = 21.5
+    forward_similarity: float = 13.3
+    forward_overlap: float = 5.3
+    forward_silhouette: float = -14.2
+    forward_free_space: float = -21.3
+    reverse_similarity: float = 18.5
+    reverse_overlap: float = 23.7
+    reverse_silhouette: float = -5.4
+    reverse_free_space: float = -16.6
+    viewpoint: float = 18.2
 
     def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
