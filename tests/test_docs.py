@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
+from tools import command_line
 from zsp_lite.cli.main import cli
 
 REPOSITORY = Path(__file__).parents[1]
 PAGES = [
     REPOSITORY / "README.md",
-    *sorted((REPOSITORY / "docs").glob("*.md")),
-    *sorted((REPOSITORY / "docs" / "slides").glob("*.md")),
+    *sorted((REPOSITORY / "docs").rglob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
     REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
     *sorted((REPOSITORY / "notebooks").glob("*.ipynb")),
@@ -61,7 +61,7 @@ def test_the_readme_has_at_most_150_lines():
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_no_page_has_a_placeholder(page):
-    assert not re.findall(r"<<\w+>>", page.read_text())
+    assert not re.findall(r"<<\w+>>|@@", markdown(page))
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -75,10 +75,23 @@ def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page)
         assert not anchor or anchor in headings(target), f"{page.name}: {link}"
 
 
-def test_the_index_links_to_every_page():
-    index = (REPOSITORY / "docs" / "README.md").read_text()
+def test_the_start_page_links_to_every_page():
+    start = (REPOSITORY / "docs" / "index.md").read_text()
     for page in (REPOSITORY / "docs").glob("*.md"):
-        assert page.name == "README.md" or f"({page.name})" in index, page.name
+        assert page.name == "index.md" or f"({page.name})" in start, page.name
+
+
+def test_the_page_of_the_command_line_is_that_of_the_program():
+    assert command_line.PAGE.read_text() == command_line.page(), "run python -m tools.command_line"
+
+
+def test_the_table_of_notebooks_has_every_notebook_and_the_start_page_includes_it():
+    readme, start = ((REPOSITORY / name).read_text() for name in ("README.md", "docs/index.md"))
+    marks = re.findall(r"^:(?:start-after|end-before): (.+)$", start, re.MULTILINE)
+    table = readme.partition(marks[0])[2].partition(marks[1])[0]
+    assert re.findall(r"\]\(notebooks/(.+?)\)", table) == sorted(
+        path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb")
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -119,7 +132,7 @@ def test_every_make_target_that_is_named_exists(page):
 def test_the_page_on_installation_lists_every_extra():
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     listed = re.findall(
-        r"^\| `pip install 'zsp-lite\[(\w+)\]'`", markdown(REPOSITORY / "docs" / "install.md"), re.MULTILINE
+        r"^- `pip install 'zsp-lite\[(\w+)\]'`", markdown(REPOSITORY / "docs" / "install.md"), re.MULTILINE
     )
     assert {*listed} == {*extras} - {"test", "dev"}
 
@@ -243,7 +256,3 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     exec(second, names)
     assert names["pose"].confidence is not None and len(names["pose"].matches) > 10
     assert (tmp_path / "outputs/cups/report.html").is_file()
-    blocks = python_blocks(REPOSITORY / "docs" / "data_and_backbones.md")
-    (frames,) = (block for block in blocks if "def load_frame" in block)
-    exec(frames, names)
-    assert names["estimate"].view == 0 and len(names["estimate"].matches) > 10

@@ -160,7 +160,7 @@ def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
 def run_links(docname: str, repository: str) -> str:
     """HTML with the links to download a notebook and to open it in Colab or in a dev container."""
     up = "../" * docname.count("/")
-    links = [(f"{up}docs/run_it.html", "Run it"), (f"{up}run/{docname}.ipynb", "Download")]
+    links = [(f"{up}docs/install.html#run-the-notebooks", "Run it"), (f"{up}run/{docname}.ipynb", "Download")]
     if repository:
         name = urlsplit(repository).path.strip("/")
         links += [
