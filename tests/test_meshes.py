@@ -27,15 +27,6 @@ def test_an_obj_file_gives_texture_coordinates_texture_colour_and_opacity(tmp_pa
     assert np.abs(mesh.normals) == pytest.approx(np.broadcast_to([0, 0, 1.0], (2, 3, 3)))
 
 
-def test_dull_and_shiny_materials_differ_in_roughness_and_specular(tmp_path):
-    path = write_quad(tmp_path / "quad.obj")
-    dull = read_mesh(path).materials[0]
-    text = path.with_suffix(".mtl").read_text()
-    path.with_suffix(".mtl").write_text(text.replace("Ks 0 0 0", "Ks 1 1 1").replace("Ns 1", "Ns 500"))
-    shiny = read_mesh(path).materials[0]
-    assert shiny.roughness < 0.5 < dull.roughness and shiny.specular > dull.specular
-
-
 def test_the_linear_colour_factor_of_gltf_becomes_srgb(tmp_path):
     linear = np.array([5, 51, 255]) / 255
     cube = box((1, 1, 1))

@@ -7,11 +7,10 @@ import pytest
 from model_files import painted, studio, view, wedge, write_quad
 
 from zsp_lite.synthetic.lighting import RoomLight
-from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh, smooth_normals
+from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo
 from zsp_lite.synthetic.photography import CheapCamera
-from zsp_lite.synthetic.primitives import cylinder
-from zsp_lite.synthetic.raytracing import MeshScene, Quality, _pixel_rays
+from zsp_lite.synthetic.raytracing import MeshScene, Quality
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.room import random_room
 from zsp_lite.synthetic.sampling import look_up
@@ -107,25 +106,6 @@ def test_a_surface_that_faces_up_receives_the_light_of_the_room_on_its_floor():
     assert up == pytest.approx(room.room.ambient, rel=0.1) and (down < 0.6 * up).all()
 
 
-def test_a_prepared_room_gives_the_same_pictures_as_the_room():
-    mesh, room = painted(wedge()), random_room(2)
-    camera = view(mesh.vertices)
-    one, two = (MeshScene(mesh, given, FAST).render(camera, 0).rgb for given in (room, RoomLight(room)))
-    assert (one == two).all()
-
-
-def test_normals_are_smooth_on_a_cylinder_and_sharp_at_its_rims():
-    mesh = cylinder(1.0, 1.0, 2.0, 24)
-    normals = smooth_normals(mesh.vertices, mesh.faces)
-    corners = mesh.vertices[mesh.faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    side = (np.abs(flat[:, 2]) < 1e-9) & (np.linalg.norm(flat, axis=1) > 1e-3)
-    radial = corners[side] * [1, 1, 0]
-    assert normals[side] == pytest.approx(radial, abs=0.06)  # a weighted mean; flat shading is 0.13 off
-    cap = np.abs(flat[:, 2]) > 1e-2
-    assert np.abs(normals[cap][..., 2]) == pytest.approx(1, abs=1e-3) and cap.sum() >= 48
-
-
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
     colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
     texture = np.repeat(np.repeat(colours, 16, 0), 16, 1)
@@ -165,18 +145,6 @@ def test_glass_belongs_to_the_object_and_shows_what_is_behind_it(tmp_path):
     assert not clear._occluded(np.float32([[-3, 0, 0]]), np.float32([[1, 0, 0]]))[0]
 
 
-def test_the_floor_is_dark_below_the_object_and_in_its_shadow():
-    mesh = painted(wedge())
-    room = studio()
-    for quality in (Quality(2, 1, 0), Quality(2, 3, 8)):
-        scene = MeshScene(mesh, room, quality)
-        shadow = [-0.5, 0] - room.light[:2] / room.light[2] * 0.8  # of a point of the back, 0.8 above the floor
-        key, around = scene.shadow.at(np.array([shadow, [4.0, 4.0], [0.0, 0.0]]))
-        assert key[0] < 0.3 and key[1] > 0.95
-        if quality.ambient_rays:
-            assert around[2] < 0.5 and around[1] > 0.95
-
-
 def test_soft_shadows_have_half_shades_and_hard_ones_have_none():
     mesh = painted(wedge())
     shades = []
@@ -184,22 +152,6 @@ def test_soft_shadows_have_half_shades_and_hard_ones_have_none():
         key = MeshScene(mesh, replace(studio(), light_radius=0.3), quality).shadow.light[..., 0]
         shades.append(((key > 0.1) & (key < 0.9)).mean())
     assert shades[0] == 0 and shades[1] > 0.02
-
-
-def test_more_samples_per_pixel_smooth_the_silhouette():
-    mesh = painted(wedge(), colour=(0.02, 0.02, 0.02, 1))
-    camera = view(mesh.vertices, size=48)
-    box = MeshScene(mesh, studio(), FAST)._object_box(camera)
-    errors, exact = [], None
-    for n in (8, 2, 1):
-        scene = MeshScene(mesh, studio(), Quality(n, 1, 0))
-        rays = _pixel_rays(camera, box, n)
-        _, through = scene._shade_rays(camera, flat := rays.reshape(-1, 3), scene._first_hits(camera, flat))
-        rows, cols = rays.shape[0] // n, rays.shape[1] // n
-        coverage = 1 - through.reshape(rows, n, cols, n).mean((1, 3))
-        exact = coverage if exact is None else exact
-        errors.append(np.abs(coverage - exact).sum())
-    assert errors[1] < 0.6 * errors[2]
 
 
 def test_metal_reflects_with_its_own_colour_and_a_mirror_shows_more_than_a_matte_surface():
