@@ -8,6 +8,7 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.benchmark import extractors
 from zsp_lite.benchmark.database import read_records
+from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows
 from zsp_lite.data.co3d import Co3D
@@ -117,15 +118,15 @@ class TrueViewpoints:
 
 
 def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):
-    monkeypatch.setitem(extractors.EXTRACTORS, "posecontrast-tiny", lambda backbone: TrueViewpoints())
-    summary = evaluate(small_folder(), BACKBONE, ["posecontrast-tiny"], 4, 3, out=tmp_path, categories=["pebble"])
-    assert summary["methods"]["posecontrast-tiny"]["median"] < 1e-5
+    monkeypatch.setitem(extractors.EXTRACTORS, "posecontrast", lambda backbone: TrueViewpoints())
+    summary = evaluate(small_folder(), BACKBONE, ["posecontrast"], 4, 3, out=tmp_path, categories=["pebble"])
+    assert summary["methods"]["posecontrast"]["median"] < 1e-5
 
 
 def test_convolutional_features_are_matched_as_mutual_neighbours(tmp_path, monkeypatch):
-    monkeypatch.setitem(extractors.EXTRACTORS, "swav-tiny", lambda backbone: BACKBONE)
-    summary = evaluate(small_folder(), BACKBONE, ["swav-tiny"], 4, 5, out=tmp_path, categories=["pebble"])
-    assert summary["methods"]["swav-tiny"]["acc30"] >= 75
+    monkeypatch.setitem(extractors.EXTRACTORS, "swav", lambda backbone: BACKBONE)
+    summary = evaluate(small_folder(), BACKBONE, ["swav"], 4, 5, out=tmp_path, categories=["pebble"])
+    assert summary["methods"]["swav"]["acc30"] >= 75
 
 
 def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, monkeypatch):
@@ -135,22 +136,21 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fingerprint_tells_apart_whatever_changes_the_features(monkeypatch):
+def test_a_fingerprint_tells_apart_whatever_changes_the_features():
     from zsp_lite.backbones.backbone import Backbone
     from zsp_lite.backbones.vit import VisionTransformer
 
-    monkeypatch.setattr("zsp_lite.backbones.precision.bfloat16_is_fast", lambda device_type: True)
     torch.manual_seed(0)
     vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)
 
     def of(**options):
-        return extractors.fingerprint(Backbone(vit, "same name", device="cpu", **options))
+        return fingerprint(Backbone(vit, "same name", device="cpu", **options))
 
     plain = of()
     assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
     changes = [
         dict(layer=1), dict(facet="query"), dict(saliency_heads=[1]), dict(image_size=64), dict(mean=(0, 0, 0)),
-        dict(std=(1, 1, 1)), dict(precision="bfloat16"),
+        dict(std=(1, 1, 1)),
     ]  # fmt: skip
     assert len({plain, *(of(**change) for change in changes)}) == 1 + len(changes)
     with torch.no_grad():
@@ -158,12 +158,3 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features(monkeypatch):
     assert of() != plain
     facet = extractors.random_backbone(Backbone(vit, "same name", device="cpu", facet="value", image_size=64))
     assert (facet.facet, facet.image_size) == ("value", 64)
-
-
-def test_rows_of_the_embedded_networks_use_their_own_features():
-    """Whatever the backbone of the run: the small transformer, and a convolutional network with the true mask."""
-    rows = resolve("photographs")
-    made = extractors.make_extractors(lambda images: [], {row.features for row in rows.values()} - {"backbone"})
-    names = {name: made[row.features].name for name, row in rows.items() if row.features != "backbone"}
-    assert names == {"tiny": "zsp-tiny", "effnet-mask": "effnet-lite0", "tiny-mask": "zsp-tiny"}
-    assert rows["effnet-mask"].settings["foreground"] == rows["tiny-mask"].settings["foreground"] == "mask"

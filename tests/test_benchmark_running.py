@@ -28,10 +28,9 @@ from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.database import DATABASE, SETTINGS, RunFolder, read_records, read_settings
 from zsp_lite.benchmark.execution import Evaluator, Setup, make_chunks, open_workers
 from zsp_lite.benchmark.methods import Method, resolve
-from zsp_lite.benchmark.plan import Plan
 from zsp_lite.benchmark.problem import frame_keys
 from zsp_lite.benchmark.results import read_results
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows, plan_run, rows_of_pairs
+from zsp_lite.benchmark.run import evaluate, pairs_of_rows, rows_of_pairs
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
@@ -335,9 +334,8 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
     first = provenance.library_version()
     other = {"version": first["version"], "revision": "0123abc"}
     monkeypatch.setattr(run_module, "library_version", lambda: other)
-    for call in (evaluate, plan_run):
-        with pytest.raises(InputError, match="this is .*0123abc.*; choose another folder, or .*--allow-other-version"):
-            call(small_folder(), BACKBONE, ["ours"], **arguments)
+    with pytest.raises(InputError, match="this is .*0123abc.*; choose another folder, or .*--allow-other-version"):
+        evaluate(small_folder(), BACKBONE, ["ours"], **arguments)
     evaluate(small_folder(), BACKBONE, ["ours"], allow_other_version=True, **arguments)
     assert read_settings(tmp_path)["library"] == [first, other]
     evaluate(small_folder(), BACKBONE, ["ours"], **arguments)  # both are now known
@@ -345,11 +343,8 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
 
 def test_what_a_folder_cannot_be_continued_from_is_named(undisturbed, tmp_path):
     settings = read_settings(undisturbed[0])
-    (tmp_path / "pairs.jsonl").write_text("{}\n")
-    with pytest.raises(InputError, match="pairs.jsonl without run.json"):
-        RunFolder(tmp_path, settings)
     (tmp_path / SETTINGS).write_text(json.dumps({"seed": 0}))
-    with pytest.raises(InputError, match="earlier version of zsp-lite"):
+    with pytest.raises(InputError, match="run.json: no library, expected the settings of a run"):
         RunFolder(tmp_path, settings)
     with pytest.raises(InputError, match="run.json: not the settings of a run"):
         (tmp_path / SETTINGS).write_text("{")
@@ -372,9 +367,8 @@ def test_results_without_their_settings_are_refused(undisturbed, tmp_path):
     with pytest.raises(InputError, match="run.json: no data, expected the settings of a run"):
         read_results(run)
     (run / SETTINGS).unlink()
-    for call in (evaluate, plan_run):
-        with pytest.raises(InputError, match="holds results in run.sqlite without run.json"):
-            call(small_folder(), QUICK, ROWS, 6, 3, seed=1, out=run)
+    with pytest.raises(InputError, match="holds results in run.sqlite without run.json"):
+        evaluate(small_folder(), QUICK, ROWS, 6, 3, seed=1, out=run)
 
 
 def test_a_database_that_cannot_be_opened_or_written_is_bad_input(undisturbed, tmp_path):
@@ -513,31 +507,6 @@ def test_the_second_poses_error_is_stored_apart_from_the_error(tmp_path):
     best_two = summary["methods"]["verified"]["best_two"]
     assert best_two["acc30"] == 100 * np.mean(np.array(either) < 30) and "best_two" not in summary["methods"]["ours"]
     assert not {"second_error", "one_of_two"} & {name for found in rows["ours"].values() for name in found}
-
-
-def test_a_plan_counts_what_the_run_then_does(tmp_path):
-    rows = ("ours", "ours-n1")
-    arguments = {"pairs": 3, "targets": 2, "out": tmp_path / "run", "seed": 1}
-    made = plan_run(small_folder(), BACKBONE, rows, **arguments)
-    assert not (tmp_path / "run").exists()
-    pairs = pairs_of_rows(small_folder(), resolve(rows), 3, 2, seed=1)
-    assert made.pairs == made.estimates == 12
-    frames = {(pair.category, *key) for found in pairs.values() for pair in found for key in frame_keys(pair)}
-    assert made.frames == len(frames)
-    assert made.frame_seconds > 0 and made.pair_seconds > 0 and made.memory > 2**26
-    evaluate(small_folder(), BACKBONE, rows, **arguments)
-    assert made.results_bytes / 5 < (tmp_path / "run" / DATABASE).stat().st_size < made.results_bytes * 5
-    left = plan_run(small_folder(), BACKBONE, rows, **arguments)
-    assert left.pairs == left.frames == 0 and left.calibration == "nothing is left to do"
-    with pytest.raises(InputError, match="other settings .backbone"):
-        plan_run(small_folder(), CoordinateBackbone(frequencies=8), rows, **arguments)
-
-
-def test_a_plan_divides_the_work_by_the_workers():
-    made = Plan(100, 10, 40, 2**30, 10_000, 2**40, 0.2, 0.3, 2, "4 pairs of lump")
-    assert made.seconds(1) - made.seconds(2) == pytest.approx((100 * 0.2 + 10 * 0.3) / 2)
-    text = "\n".join(made.lines(8))
-    assert "0:00:29 with 1 worker," in text and "8 workers" in text and "1.1 TB" in text and "10.0 kB" in text
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):

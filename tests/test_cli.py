@@ -119,7 +119,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys,
     data = ["--data", str(ellipsoids.root)] if takes_data else []
     assert cli.main(arguments + data) == 2
     assert names in assert_one_line(capsys)
-    assert not list(tmp_path.iterdir())
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_an_unknown_category_is_reported_with_the_known_ones(capsys, ellipsoids):
@@ -171,7 +171,7 @@ def test_the_demo_prints_no_result_before_its_report_is_written(ellipsoids, tmp_
     monkeypatch.setattr("zsp_lite.viz.report.write_report", fail)
     assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path / "a/b")]) == 2
     assert "No space left" in assert_one_line(capsys)
-    assert not list(tmp_path.iterdir())
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize("inside", ["", "deeper"])

@@ -180,14 +180,12 @@ def check_settings(out: str | Path, settings: Mapping[str, Any], allow_other_ver
     """
     out = Path(out)
     if not os.path.lexists(out / SETTINGS):  # a pipe or a broken link is no new run
-        if (out / "pairs.jsonl").is_file():
-            raise InputError(f"{out} holds pairs.jsonl without {SETTINGS}; choose another folder")
         if finished_results(out):
             raise InputError(f"{out} holds results in {DATABASE} without {SETTINGS}; choose another folder")
         return dict(settings) | {"library": [settings["library"]]}
     before = read_settings(out)
-    if (out / "pairs.jsonl").is_file() or "library" not in before:
-        raise InputError(f"{out} holds a run of an earlier version of zsp-lite; choose another folder")
+    if "library" not in before:
+        raise InputError(f"{out / SETTINGS}: no library, expected the settings of a run; choose another folder")
     for key, value in settings.items():
         if key not in (*_GROWING, "library") and before.get(key) != value:
             raise InputError(f"{out} holds a run with other settings ({key}); choose another folder")
@@ -214,8 +212,7 @@ def _version(library: Mapping[str, str | None]) -> str:
 
 def _query(out: Path, read: Any) -> Any:
     if not (out / DATABASE).is_file():
-        old = " of this version; read its results.json.gz instead" if (out / "pairs.jsonl").is_file() else ""
-        raise InputError(f"{out} holds no benchmark run{old}")
+        raise InputError(f"{out} holds no benchmark run")
     try:
         # Not read-only: after a crash, SQLite first has to roll back the unfinished transaction.
         with closing(sqlite3.connect(out / DATABASE, timeout=_TIMEOUT)) as database:

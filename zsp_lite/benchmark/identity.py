@@ -14,8 +14,8 @@ from zsp_lite.backbones.backbone import Backbone
 def described(value: Any) -> str:
     """Describe a setting or a function as text.
 
-    Functions, classes and objects are described by "module:name"; for a dataclass, its fields follow. A change of their
-    code does not change the text.
+    Functions, classes and objects are described by "module:name"; for a dataclass, its public fields follow. A change
+    of their code does not change the text.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return str(value)
@@ -24,8 +24,8 @@ def described(value: Any) -> str:
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = (f"{field.name}={described(getattr(value, field.name))}" for field in dataclasses.fields(value))
-        return f"{name}({', '.join(fields)})"
+        fields = [field.name for field in dataclasses.fields(value) if not field.name.startswith("_")]
+        return f"{name}({', '.join(f'{field}={described(getattr(value, field))}' for field in fields)})"
     return name
 
 

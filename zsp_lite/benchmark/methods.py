@@ -198,9 +198,6 @@ class _Estimator:
 
     estimator: Any
 
-    def __repr__(self) -> str:
-        return f"estimate of {described(self.estimator)}"
-
     def __call__(self, problem: Any) -> Any:
         reference, *targets = problem.full_frames()
         return self.estimator.estimate(reference, targets)
