@@ -33,7 +33,7 @@ Read the files in this order:
 import importlib
 from typing import TYPE_CHECKING
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HOMES`
     from zsp_lite import (
