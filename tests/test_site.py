@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -20,6 +21,7 @@ import zsp_lite
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
+DRAWINGS = sorted((REPOSITORY / "notebooks" / "figures").glob("*.svg"))
 DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
 URLS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"].get("urls", {})
 
@@ -125,6 +127,7 @@ def test_a_deck_of_slides_is_a_single_file_with_the_pictures_of_the_notebooks(pa
         len(picture["alt"]) > 20 for picture in page.pictures
     )
     stored = "".join(notebook.read_text(encoding="utf-8").replace("\\n", "") for notebook in NOTEBOOKS)
+    text += unescape("".join(drawing.read_text(encoding="utf-8") for drawing in DRAWINGS))
     for picture in page.pictures:
         form, data = picture["src"].split(";base64,")
         assert data in stored or picture["alt"] in text, picture["alt"]

@@ -8,12 +8,13 @@ one. The directive `picture` embeds a picture that a notebook shows, so that the
     ```
 
 is the first picture below the heading that contains these words. `:number: 2` is the second one. The path may also be
-that of a picture file (`:alt:` describes it). With `:beside:` the text of the slide stands to the right of the picture.
+that of a drawing, which has its description inside, or of a photograph (`:alt:` describes it). With `:beside:` the text
+of the slide stands to the right of the picture.
 """
 
 import base64
 import re
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 
 import nbformat
@@ -43,8 +44,8 @@ class Picture(SphinxDirective):
         if not path.is_file():
             raise self.error(f"no file {self.arguments[0]}")
         self.env.note_dependency(str(path))
-        needed = "heading" if path.suffix == ".ipynb" else "alt"
-        if needed not in self.options:
+        needed = {".ipynb": "heading", ".png": "alt", ".jpg": "alt"}.get(path.suffix)
+        if needed and needed not in self.options:
             raise self.error(f"picture {self.arguments[0]} has no option :{needed}:, which it needs")
         if path.suffix not in {".ipynb", *FORMATS}:
             raise self.error(f"picture {self.arguments[0]} is none of .ipynb, {', '.join(FORMATS)}")
@@ -59,8 +60,8 @@ class Picture(SphinxDirective):
                 )
             form, data, alt = found[number - 1]
         else:
-            form, alt = FORMATS[path.suffix], self.options["alt"]
-            data = base64.b64encode(path.read_bytes()).decode()
+            form, data = FORMATS[path.suffix], base64.b64encode(path.read_bytes()).decode()
+            alt = self.options.get("alt") or unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         kind = "picture beside" if "beside" in self.options else "picture"
         image = f'<img class="{kind}" src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
