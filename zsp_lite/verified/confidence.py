@@ -28,12 +28,12 @@ TIE_RATIO = float(np.exp(-1))
 class Calibration:
     r"""The six coefficients, fitted on validation categories of equal weight for N = 1 to 10 (`tools/tuning.py`)."""
 
-    scale: float = -1.33  # \alpha_0
-    scale_views: float = 0.62  # \alpha_1
-    none: float = 0.82  # \beta_0
-    none_views: float = -1.16  # \beta_1
-    none_std: float = -30.9  # \beta_2
-    none_shape: float = -0.269  # \beta_3
+    scale: float = -1.01  # \alpha_0
+    scale_views: float = 0.52  # \alpha_1
+    none: float = 1.23  # \beta_0
+    none_views: float = -0.99  # \beta_1
+    none_std: float = -32.6  # \beta_2
+    none_shape: float = -0.339  # \beta_3
 
     def probabilities(
         self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
