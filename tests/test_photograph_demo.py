@@ -9,8 +9,8 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, ren
 from zsp_lite import demo
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, REPOSITORY
-from zsp_lite.demo import photograph_pair, run_photograph
+from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
+from zsp_lite.demo import run_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.photograph import (
@@ -102,24 +102,6 @@ def test_the_sequence_may_be_given_and_must_exist(motorcycles, photograph, monke
         next(run_photograph(motorcycles, CoordinateBackbone(), "third"))
 
 
-def test_both_motorcycles_of_the_pair_face_the_same_way():
-    pair = photograph_pair(Co3D(REPOSITORY / "data_samples"), size=224)
-    assert pair.photograph.rgb.shape == pair.target.rgb.shape == (224, 224, 3)
-    for along, mask in ((pair.along, pair.photograph.mask), (pair.target_along, pair.target.mask)):
-        known = ~np.isnan(along)
-        assert 200 < known.sum() < 0.8 * along.size
-        # The front is on the right in both pictures, and positions go from 0 at the rear to 1 at the front.
-        assert np.corrcoef(np.nonzero(known)[1], along[known])[0, 1] > 0.95
-        assert along[known].min() == pytest.approx(0, abs=0.15)
-        assert along[known].max() == pytest.approx(1, abs=0.15)
-        assert (mask.reshape(28, 8, 28, 8).mean(axis=(1, 3))[known] > 0.2).all()
-
-
-def test_a_pair_with_the_photograph_needs_its_synthetic_motorcycle(motorcycles):
-    with pytest.raises(InputError, match="no sequence motorcycle/scooter, expected sample data"):
-        photograph_pair(motorcycles)
-
-
 def test_foregrounds_and_solvers_may_be_chosen_and_have_a_panel_each(motorcycles, photograph, monkeypatch):
     monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
     (one,) = run_photograph(motorcycles, CoordinateBackbone(), foregrounds=["mask"], solvers=["paper"])
@@ -154,10 +136,10 @@ def test_the_table_has_a_row_per_result(results):
 
 
 def test_the_page_begins_with_the_photograph_and_credits_it(results):
-    page = render_page([], "folder", "note", "backbone", results)
+    page = render_page([], "backbone", photograph=results)
     assert page.index("Which way does a real motorcycle stand?") < page.index("One pair of each category")
     assert PHOTOGRAPH_CREDIT in page and "judged by eye" in page and "first" in page
-    assert "real motorcycle" not in render_page([], "folder", "note", "backbone")
+    assert "real motorcycle" not in render_page([], "backbone")
 
 
 def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, monkeypatch, capsys):

@@ -40,7 +40,7 @@ def results(ellipsoids):
 
 @pytest.fixture(scope="module")
 def text(results):
-    return render_page(results, "some/folder", "synthetic ellipsoids <script>", "a & b", folder=REPOSITORY)
+    return render_page(results, "a & b", REPOSITORY, "some/folder", "synthetic ellipsoids <script>")
 
 
 def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
@@ -194,15 +194,15 @@ def test_terms_are_explained_and_stages_lead_to_their_notebooks(text):
 
 def test_links_lead_to_the_projects_site_where_its_address_is_known(results, monkeypatch):
     monkeypatch.setattr("zsp_lite.viz.report._project_url", {"Documentation": "https://host/course/"}.get)
-    assert 'href="https://host/course/notebooks/01_features.html"' in render_page(results, "d", "n", "b")
+    assert 'href="https://host/course/notebooks/01_features.html"' in render_page(results, "b")
 
 
 def test_outside_the_clone_notebooks_are_linked_in_the_repository_or_named_only(results, monkeypatch, tmp_path):
     monkeypatch.setattr("zsp_lite.viz.report.REPOSITORY", tmp_path)
     monkeypatch.setattr("zsp_lite.viz.report._project_url", {"Repository": "https://host/code"}.get)
-    assert 'href="https://host/code/blob/main/notebooks/01_features.ipynb"' in render_page(results, "d", "n", "b")
+    assert 'href="https://host/code/blob/main/notebooks/01_features.ipynb"' in render_page(results, "b")
     monkeypatch.setattr("zsp_lite.viz.report._project_url", lambda label: None)
-    page = render_page(results, "d", "n", "b")
+    page = render_page(results, "b")
     assert "More: notebook 01." in page and ".ipynb" not in page
 
 
@@ -242,7 +242,7 @@ def test_all_text_is_escaped(results, text):
         estimates={hostile: estimate},
         errors={hostile: 1.0},
     )
-    page = render_page([result], hostile, hostile, hostile)
+    page = render_page([result], hostile, data=hostile, data_note=hostile)
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15
 

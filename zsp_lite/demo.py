@@ -50,8 +50,7 @@ def example_pair(dataset: Co3D) -> Pair:
     """Return a pair of the sample data for a first try.
 
     Of `data_samples/`, this is a pair of cars that is chosen by its result: a stored pair with five targets on which
-    both solvers are within 5 degrees with zsp-tiny. Of other data, it is the first pair of the
-    first category.
+    both solvers are within 5 degrees with zsp-tiny. Of other data, it is the first pair of the first category.
 
     Raises:
         InputError: The data has no pose labels.
