@@ -168,7 +168,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
 @click.option(
     "--preset", metavar="NAME",
     help="Procedural objects: demo (3 categories, 15 s), samples (4), eval (10), paper-small (20 of 5 sequences of 24 "
-    "frames), or paper (20 of 10 sequences of 100 frames, an hour and a half and 1.4 GB). An existing folder is completed.",
+    "frames), or paper (20 of 10 sequences of 100 frames, 1.5 hours, 1.4 GB). An existing folder is completed.",
 )  # fmt: skip
 @click.option(
     "--category", "categories", multiple=True, metavar="NAME",
