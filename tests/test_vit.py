@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 
@@ -26,13 +27,13 @@ def images() -> torch.Tensor:
 
 
 def oracle(vit: VisionTransformer, images: torch.Tensor):
-    """Output tokens, keys of every block, attention of every block, by Conv2d and MultiheadAttention."""
+    """Output tokens, the facets of every block, attention of every block, by Conv2d and MultiheadAttention."""
     weights = vit.state_dict()
     kernel, bias = weights["patch_embed.proj.weight"], weights["patch_embed.proj.bias"]
     patches = F.conv2d(images, kernel, bias, stride=PATCH)
     x = torch.cat([weights["cls_token"].expand(len(images), 1, DIM), patches.flatten(2).transpose(1, 2)], 1)
     x = x + weights["pos_embed"]
-    keys, attentions = [], []
+    facets, attentions = [], []
     for index in range(DEPTH):
         w = {key.removeprefix(f"blocks.{index}."): value for key, value in weights.items()}
         attention = nn.MultiheadAttention(DIM, HEADS, batch_first=True)
@@ -45,14 +46,15 @@ def oracle(vit: VisionTransformer, images: torch.Tensor):
             }
         )
         normed = F.layer_norm(x, (DIM,), w["norm1.weight"], w["norm1.bias"], 1e-6)
-        keys.append(F.linear(normed, w["attn.qkv.weight"][DIM : 2 * DIM], w["attn.qkv.bias"][DIM : 2 * DIM]))
+        projections = F.linear(normed, w["attn.qkv.weight"], w["attn.qkv.bias"]).chunk(3, dim=-1)
         attended, probabilities = attention(normed, normed, normed, average_attn_weights=False)
         attentions.append(probabilities)
         x = x + attended
         hidden = F.layer_norm(x, (DIM,), w["norm2.weight"], w["norm2.bias"], 1e-6)
         hidden = F.gelu(F.linear(hidden, w["mlp.fc1.weight"], w["mlp.fc1.bias"]))
         x = x + F.linear(hidden, w["mlp.fc2.weight"], w["mlp.fc2.bias"])
-    return F.layer_norm(x, (DIM,), weights["norm.weight"], weights["norm.bias"], 1e-6), keys, attentions
+        facets.append(dict(zip(("query", "key", "value", "token"), (*projections, x))))
+    return F.layer_norm(x, (DIM,), weights["norm.weight"], weights["norm.bias"], 1e-6), facets, attentions
 
 
 @pytest.mark.parametrize("gradients", [False, True])
@@ -61,12 +63,13 @@ def test_forward_equals_an_independent_transformer(model, images, gradients):
         torch.testing.assert_close(model(images), oracle(model, images)[0], atol=2e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("facet", FACETS)
 @pytest.mark.parametrize("layer", range(DEPTH))
-def test_extract_gives_keys_cls_attention_and_cls_output(model, images, layer):
+def test_extract_gives_the_facet_cls_attention_and_cls_output(model, images, layer, facet):
     with torch.no_grad():
-        tokens = model.extract(images, layer)
-        output, keys, attentions = oracle(model, images)
-    torch.testing.assert_close(tokens.keys, keys[layer][:, 1:], atol=2e-5, rtol=1e-4)
+        tokens = model.extract(images, layer, facet)
+        output, facets, attentions = oracle(model, images)
+    torch.testing.assert_close(tokens.keys, facets[layer][facet][:, 1:], atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(tokens.attention, attentions[-1][:, :, 0, 1:], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(tokens.cls, output[:, 0], atol=2e-5, rtol=1e-4)
     assert tokens.grid == (4, 4)
@@ -87,16 +90,6 @@ def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, 
     loss = training.tokens.square().sum() + training.keys.sum() + training.cls_logits.square().sum()
     gradients = torch.autograd.grad(loss, list(model.parameters()))
     assert all(bool(gradient.isfinite().all()) and bool(gradient.any()) for gradient in gradients)
-
-
-def test_in_the_last_block_no_patch_passes_the_mlp(model, images):
-    widths = []
-    last = model.blocks[-1].mlp
-    handle = last.register_forward_hook(lambda _, inputs, __: widths.append(inputs[0].shape[1]))
-    with torch.no_grad():
-        model.extract(images, 1)
-    handle.remove()
-    assert widths == [1]
 
 
 def test_state_dict_has_the_keys_and_shapes_of_dino_vits8():

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import ArrayLike
@@ -77,8 +78,8 @@ def overlay_map(
     cmap: str = "viridis",
     limits: tuple[float, float] | None = None,
     label: str | None = None,
-) -> None:
-    """Draw a map on the patch grid (saliency, cyclical distances) over the image of an axis.
+) -> AxesImage:
+    """Draw a map on the patch grid (saliency, cyclical distances) over the image of an axis; fill it with `set_data`.
 
     Args:
         axis: Axis of an image from `show_images`.
@@ -105,6 +106,7 @@ def overlay_map(
         bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
         bar.set_label(label, fontsize=_FONT - 1)
         bar.ax.tick_params(labelsize=_FONT - 2)
+    return drawn
 
 
 def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:

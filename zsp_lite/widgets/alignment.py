@@ -28,22 +28,9 @@ def ransac_settings(
 ) -> "VBox":
     """Show the inliers of RANSAC on the matches of two images; choose trials, threshold and seed.
 
-    Args:
-        images: Two images of one size.
-        pixels: Matched pixels (x, y) of both images.
-        points: Matched points in the camera frames, in scene units.
-        truth: True rotation, if known.
-
-    Raises:
-        InputError: The numbers of matches differ, or are less than four.
+    A match is given by its pixels (x, y) in both images, which have one size, and its points in both camera frames.
     """
-    source, target = (np.asarray(part, np.float64) for part in points)
-    if not (len(source) == len(target) == len(pixels[0]) == len(pixels[1]) >= 4):
-        raise InputError(
-            f"{len(source)} and {len(target)} points, {len(pixels[0])} and {len(pixels[1])} pixels, "
-            "expected equal numbers, at least four"
-        )
-    n = len(source)
+    (source, target), n = points, len(points[0])
     figure, (matches, graph) = plt.subplots(1, 2, figsize=(9, 3.3), width_ratios=(1.5, 1), layout="constrained")
     canvas = match_canvas(matches, *images, ("reference", "target"))
     inside = graph.scatter([], [], s=26, color=BLUE, marker="o", label="inlier")
@@ -88,15 +75,7 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
     """Show the least-squares fit of corresponding points while the last target point moves along x.
 
     The plot shows x to the right and y down. The caption compares the fit with that of the unmoved points.
-
-    Args:
-        source: Source points.
-        target: Corresponding target points.
-
-    Raises:
-        InputError: As for `umeyama`.
     """
-    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     exact = umeyama(source, target)
     figure, axis = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
     circles = axis.scatter(*target[:, :2].T, s=70, facecolors="none", edgecolors=ORANGE, linewidths=1.8, label="target")

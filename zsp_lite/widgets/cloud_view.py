@@ -75,14 +75,9 @@ def point_under(
 ) -> int | None:
     """Return the index of the clicked point, or None.
 
-    Of the points within `reach` of the click on the screen, those far behind the front one are ignored; the nearest of
-    the others is returned.
-
-    Args:
-        points: Points in view units.
-        view: World-to-screen rotation; its rows are the directions right, down and forward.
-        at: Click (right, down) relative to the centre of the canvas, in view units.
-        reach: Largest distance on the screen, in view units.
+    Of the points (in view units) within `reach` of the click on the screen, those far behind the front one are ignored;
+    the nearest of the others is returned. The rows of `view` are the directions right, down and forward; `at` is the
+    click (right, down) relative to the centre of the canvas.
     """
     on_screen = points @ view.T
     distance = np.hypot(*(on_screen[:, :2] - at).T)
@@ -97,12 +92,9 @@ class CloudView:
     """A canvas with one point cloud; `widget` is its Jupyter widget."""
 
     def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any], side: int = 400):
-        """Create an empty canvas.
+        """Create an empty canvas with the CSS class `name`.
 
-        Args:
-            name: CSS class of the canvas.
-            on_pick: Called after a click with the clicked world point, or None if there is no point.
-            side: Width and height in CSS pixels.
+        After a click, `on_pick` is called with the clicked world point, or None if there is no point.
         """
         self.widget = _cloud_widget()(side=side)
         self.widget.add_class(name)
@@ -116,18 +108,10 @@ class CloudView:
         self, points: Real[np.ndarray, "n 3"], colours: UInt8[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"] | None,
         alt: str, overlay: tuple[Real[np.ndarray, "m 3"], tuple[int, int, int], tuple[int, int, int]] | None = None,
     ) -> None:  # fmt: skip
-        """Show a point cloud, optionally with a second one.
+        """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps the present one).
 
-        Args:
-            points: World points.
-            colours: Their colours.
-            view: World-to-screen rotation, see `point_under`; None keeps the present one.
-            alt: Description for screen readers.
-            overlay: World points of a second cloud (drawn as crosses), its colour, and the colour of the first cloud
-                (drawn as discs).
-
-        Raises:
-            InputError: As for `ViewBox.around`.
+        An `overlay` has the world points of a second cloud (drawn as crosses), its colour, and the colour of the first
+        one (drawn as discs). `alt` is the description for screen readers.
         """
         self._box = box = ViewBox.around(points)
         self._cloud, self._in_view = np.asarray(points, dtype=np.float64), box.to_view(points)

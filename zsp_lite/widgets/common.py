@@ -25,7 +25,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
@@ -124,13 +123,6 @@ def patch_outline(
 ) -> Callable[[int, int], None]:
     """Draw a labelled outline around one patch of an image, white on black so that it is visible on any image.
 
-    Args:
-        axis: Axes of the image.
-        grid: Patches (rows, columns).
-        size: Image (height, width) in pixels.
-        label: Text beside the patch.
-        label_left: Place the label on the left where there is room, otherwise on the right.
-
     Returns:
         Function that moves the outline to the patch (row, col).
     """
@@ -149,31 +141,6 @@ def patch_outline(
         text.set(x=(col + (1.5 if right else -0.5)) * width, y=(row + 0.5) * height, ha="left" if right else "right")
 
     return move
-
-
-def patch_heatmap(
-    axis: Axes, grid: tuple[int, int], size: tuple[int, int], limits: tuple[float, float] = (0, 1), alpha: float = 0.65,
-    label: str | None = None,
-) -> AxesImage:  # fmt: skip
-    """Draw an empty heat map over the patches of an image; fill it with `set_data` (NaN and masked are transparent).
-
-    Args:
-        axis: Axes of the image.
-        grid: Patches (rows, columns).
-        size: Image (height, width) in pixels.
-        limits: Values at the ends of the colour map.
-        alpha: Opacity.
-        label: Label of a colour bar below the image; no colour bar by default.
-    """
-    drawn = axis.imshow(
-        np.zeros(grid), cmap="viridis", alpha=alpha, extent=(0, size[1], size[0], 0), vmin=limits[0], vmax=limits[1],
-        interpolation="nearest",
-    )  # fmt: skip
-    if label is not None:
-        bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
-        bar.set_label(label, fontsize=9)
-        bar.ax.tick_params(labelsize=8)
-    return drawn
 
 
 def png(figure: Figure) -> bytes:

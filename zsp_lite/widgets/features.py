@@ -18,14 +18,7 @@ from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import (
-    choice,
-    interactive_figure,
-    patch_heatmap,
-    patch_outline,
-    patch_slider,
-    slider,
-)
+from zsp_lite.widgets.common import choice, interactive_figure, patch_outline, patch_slider, slider
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
@@ -36,15 +29,8 @@ Image = UInt8[np.ndarray, "height width 3"]
 def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, str], Float[Tensor, "batch tokens dim"]]:
     """Compute the query, key, value and output of every token in every layer in one forward pass.
 
-    Args:
-        backbone: Backbone in DINO's layout.
-        images: Images of one size.
-
     Returns:
         (layer, facet) to features; the first token is CLS.
-
-    Raises:
-        InputError: The backbone has another layout (Hugging Face's format).
     """
     model = backbone.model
     if not isinstance(model, VisionTransformer):
@@ -67,18 +53,15 @@ def attention(
 ) -> "VBox":
     """Show the attention weights of one patch over all patches; choose the patch, the layer and the head.
 
-    Args:
-        image: Image.
-        queries: Queries of all tokens, CLS first, heads concatenated.
-        keys: Keys of all tokens in the same order.
-        grid: Patches (rows, columns).
-        heads: Number of heads.
+    `queries` and `keys` are those of all tokens, CLS first, with the heads concatenated.
     """
     layers, _, dim = queries.shape
     size = image.shape[:2]
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
     outline = patch_outline(axes[0], grid, size, "query")
-    weights = patch_heatmap(axes[1], grid, size, alpha=0.8, label="weight relative to the largest")
+    weights = plots.overlay_map(
+        axes[1], np.zeros(grid), alpha=0.8, limits=(0, 1), label="weight relative to the largest"
+    )
     figure.set_figheight(4)  # space for the colour bar
     axes[0].set_anchor("N")
 
@@ -113,12 +96,8 @@ def facets(
 ) -> "VBox":
     """Show the similarities of one patch, its nearest neighbour and its true match; choose patch, layer and facet.
 
-    Args:
-        reference: Reference image.
-        target: Target image.
-        features: (layer, facet) to the features of both images.
-        cells: True matches of the reference patches, from `ground_truth_matches`.
-        valid: Reference patches with a true match.
+    `features` maps (layer, facet) to the features of both images; `cells` and `valid` are the true matches of the
+    reference patches, from `ground_truth_matches`.
     """
     layers, names = sorted({layer for layer, _ in features}), list(dict.fromkeys(facet for _, facet in features))
     grid = valid.shape
@@ -157,15 +136,7 @@ def context(
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
 ) -> "VBox":
-    """Show the similarities of one patch by keys alone and by log-binned descriptors.
-
-    Args:
-        reference: Reference image.
-        target: Target image.
-        keys: Keys of both images.
-        cells: True matches of the reference patches, from `ground_truth_matches`.
-        valid: Reference patches with a true match.
-    """
+    """Show the similarities of one patch by keys alone and by log-binned descriptors."""
     grid = valid.shape
     kinds = {"keys": key_similarities(keys[0], [keys[1]])[0], "log-binned": similarity(*keys)}
     sims = [sim.numpy() for sim in kinds.values()]
@@ -187,14 +158,14 @@ def context(
 
 def saliency(view: View) -> "VBox":
     """Show the foreground patches above a saliency threshold, and their overlap with the object mask."""
-    grid, size, values = view.features.grid, view.frame.camera.size, view.features.saliency.cpu().numpy()
+    grid, values = view.features.grid, view.features.saliency.cpu().numpy()
     truth = patch_mask(view.frame, grid)
     thresholds = np.linspace(0, 1, 101)
     overlaps = [mask_iou(torch.from_numpy(values > threshold), truth) for threshold in thresholds]
     figure, axes = plots.show_images(
         [view.frame.rgb, view.frame.rgb], ["foreground", "overlap with the mask"], size=3.2
     )
-    shown = patch_heatmap(axes[0], grid, size, label="saliency")
+    shown = plots.overlay_map(axes[0], np.zeros(grid), limits=(0, 1), label="saliency")
     figure.set_figheight(4)  # space for the colour bar
     axes[1].clear()
     axes[1].set_axis_on()
@@ -228,7 +199,7 @@ class _SimilarityPanels:
         self.figure, axes = plots.show_images([reference, *targets], ["reference", *titles], size=3.0)
         self.figure.set_figheight(3.9)  # space for the colour bars
         self._outline = patch_outline(axes[0], grid, reference.shape[:2], "u")
-        self._maps = [patch_heatmap(axis, grid, self.size, (0, 1), label="cosine") for axis in axes[1:]]
+        self._maps = [plots.overlay_map(axis, np.zeros(grid), limits=(0, 1), label="cosine") for axis in axes[1:]]
         style = {"markeredgecolor": "black", "linestyle": "none", "zorder": 8}
         star = {"marker": "*", "color": plots.ORANGE, "markersize": 19, "label": "true match"} | style
         dot = {"marker": "o", "color": "white", "markersize": 9, "label": "nearest neighbour"} | style

@@ -49,13 +49,9 @@ class Panel:
         on_change: Callable[[str], Any],
         on_button: Callable[[str], Any],
     ):
-        """Create the widgets.
+        """Create the widgets; the first of the sequences is the reference.
 
-        Args:
-            sequences: Names of sequences, the reference first.
-            on_click: Called with the name of a canvas ("reference" or "sequence") and the clicked world point.
-            on_change: Called with the name of a control after its value has changed.
-            on_button: Called with the name of a button.
+        `on_click` is called with the name of a canvas and the clicked world point, the others with the name of a part.
         """
         widgets = load_package()
         options = [(f"{sequences[0]} (reference)", sequences[0]), *((name, name) for name in sequences[1:])]

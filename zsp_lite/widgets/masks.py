@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
     """Show the mask that GrabCut segments in a bounding box; choose the sides of the box.
 
-    Args:
-        frame: Frame; if it has a mask, the caption gives the overlap (IoU) with it.
-        box: Initial box (top, left, height, width) in pixels.
+    The initial box is (top, left, height, width) in pixels. If the frame has a mask, the caption gives the overlap.
     """
     height, width = frame.camera.size
     top, left, box_height, box_width = box

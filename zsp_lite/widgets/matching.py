@@ -15,15 +15,7 @@ from zsp_lite.matching import match, nearest_neighbours
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import (
-    choice,
-    interactive_figure,
-    load_package,
-    patch_heatmap,
-    patch_outline,
-    patch_slider,
-    slider,
-)
+from zsp_lite.widgets.common import choice, interactive_figure, load_package, patch_outline, patch_slider, slider
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
@@ -34,11 +26,6 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
 
     v is the nearest neighbour of the patch u in the target, u' the nearest neighbour of v in the reference, and
     d(u, u') the cyclical distance.
-
-    Args:
-        reference: Reference view.
-        target: Target view.
-        sim: Similarities between the patches of both (`matching.similarity`).
     """
     grid, grid2 = reference.features.grid, target.features.grid
     forth, back = (x.numpy() for x in nearest_neighbours(sim))
@@ -47,7 +34,7 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
     size, size2 = crops[0].shape[:2], crops[1].shape[:2]
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images(crops, titles, size=3.7)
-    maps = [patch_heatmap(axis, g, s, alpha=0.55) for axis, g, s in zip(axes, (grid, grid2), (size, size2))]
+    maps = [plots.overlay_map(axis, np.zeros(g), 0.55, limits=(0, 1)) for axis, g in zip(axes, (grid, grid2))]
     outlines = [patch_outline(axes[0], grid, size, "u", label_left=True), patch_outline(axes[1], grid2, size2, "v")]
     # u' is a circle, inside the outline of u where the cycle closes.
     style = {"markersize": 11, "color": "white", "markeredgecolor": "black", "linestyle": "none", "zorder": 10}
@@ -100,15 +87,7 @@ def matches(
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
 ) -> "VBox":
-    """Show which matches are correct; choose the matcher, the number of matches and k-means.
-
-    Args:
-        reference: Reference view.
-        target: Target view.
-        sim: Similarities between the patches of both (`matching.similarity`).
-        cells: True matches of the reference patches, from `ground_truth_matches`.
-        valid: Reference patches with a true match.
-    """
+    """Show which matches are correct; choose the matcher, the number of matches and k-means."""
     grid = reference.features.grid
     height, width = reference.frame.rgb.shape[:2]
     gap = 12

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from sklearn.neighbors import NearestNeighbors
 
-from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.common import choice, interactive_figure, slider
 
@@ -23,10 +22,7 @@ _STEP = 5  # degrees between the angles with precomputed distances
 def order_probabilities(n: int, first: float, second: float) -> tuple[float, float]:
     """Return the probabilities that the second method measures above, and below, the first.
 
-    Args:
-        n: Pairs per method; each method has pairs of its own.
-        first: True accuracy of the first method, in [0, 1].
-        second: True accuracy of the second method, in [0, 1].
+    The methods have true accuracies in [0, 1], and n pairs of their own each.
     """
     k = np.arange(n + 1)
     probability = binom.pmf(k, n, second)
@@ -95,14 +91,8 @@ def rotated_distance(
 def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
     """Show an object rotated about z over itself, with its rotation error and its closest-point distance.
 
-    Args:
-        clouds: Name to point cloud, centred, z up, in scene units; about a thousand points each.
-
-    Raises:
-        InputError: There are no clouds.
+    The clouds, by name, are centred, in scene units with z up, and have about a thousand points each.
     """
-    if not clouds:
-        raise InputError("no clouds, expected at least one")
     angles = np.arange(0, 181, _STEP)
     curves = {name: rotated_distance(cloud, cloud, angles) for name, cloud in clouds.items()}
     figure, (above, graph) = plt.subplots(1, 2, figsize=(8, 3.3), width_ratios=(1, 1.3), layout="constrained")
@@ -140,16 +130,7 @@ def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
 
 
 def accuracy_threshold(errors: Mapping[str, Real[np.ndarray, " n"]]) -> "VBox":
-    """Show the share of pairs within a rotation error, a bar per method. The control is the threshold.
-
-    Args:
-        errors: Rotation errors in degrees by the name of the method.
-
-    Raises:
-        InputError: There are no methods.
-    """
-    if not errors:
-        raise InputError("no methods, expected the errors of at least one")
+    """Show the share of pairs within a rotation error (degrees), a bar per method. The control is the threshold."""
     figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
     bars = axis.barh(list(errors), np.zeros(len(errors)), color=BLUE)
     axis.invert_yaxis()

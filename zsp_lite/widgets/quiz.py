@@ -23,14 +23,7 @@ _COLOURS = {
 
 
 def read_questions(notebook: str) -> list[list[dict]]:
-    """Return the self-checks of a notebook, in their order.
-
-    Args:
-        notebook: Number of the notebook with two digits, "00".
-
-    Raises:
-        InputError: The notebook has no self-checks.
-    """
+    """Return the self-checks of a notebook ("00"), in their order."""
     known = {path.stem: path for path in sorted(QUESTIONS.glob("*.json"))}
     if notebook not in known:
         raise InputError(f"notebook is {notebook!r}, expected one with self-checks: {', '.join(known)}")

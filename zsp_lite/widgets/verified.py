@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from zsp_lite.errors import InputError
 from zsp_lite.verified import Solution
 from zsp_lite.verified.poses import rotation_angles
 from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights, forward_terms
@@ -29,23 +28,16 @@ def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: Sc
     """Show one hypothesis: point clouds in 3D, points in a target view, and the terms of the score.
 
     The controls are the rank of the hypothesis, the target view, and the azimuth of the 3D plot.
-
-    Args:
-        solution: Result of `VerifiedSolver.solve`.
-        targets: All target views, in the order given to the solver.
-        weights: Weights of the solver.
-
-    Raises:
-        InputError: The number of target views is not that of the solution.
     """
     used = sorted(solution.view_order)
-    if len(targets) != len(solution.view_angles):
-        raise InputError(f"{len(targets)} target views, expected all {len(solution.view_angles)} of the solution")
     found, scene = solution.hypotheses, solution.scene
     point_terms = forward_terms(scene, solution.poses)
     classes = [classify_points(point_terms, rank) for rank in range(len(found))]
     pixels = (point_terms.projection.pixels * scene.target_maps.pixel_scale[:, None]).numpy()
-    clouds = [_upright(cloud.numpy()) for cloud in solution.poses.apply(scene.reference_points[:: _step(scene)])]
+    clouds = [
+        _upright(cloud.numpy())
+        for cloud in solution.poses.apply(scene.reference_points[:: max(len(scene.reference_points) // _MAX_POINTS, 1)])
+    ]
     differences = rotation_angles(solution.poses.rotation, solution.poses.rotation[:1])[:, 0].numpy()
     parts = [score_contributions(one.terms, weights) for one in found]
     names = [name for name in TERM_NAMES if getattr(weights, name)]
@@ -131,10 +123,6 @@ def _clouds(figure: Figure, cell, solution: Solution, moved: np.ndarray):
     space.set_box_aspect((1, 1, 1), zoom=1.2)
     space.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2, fontsize=7, frameon=False, markerscale=2)
     return space, cloud
-
-
-def _step(scene) -> int:
-    return max(len(scene.reference_points) // _MAX_POINTS, 1)
 
 
 def _upright(points: np.ndarray) -> np.ndarray:

@@ -39,13 +39,7 @@ class MatchCanvas:
         second: Real[np.ndarray, "n 2"],
         inliers: Bool[np.ndarray, " n"] | None = None,
     ) -> None:
-        """Draw lines between matched pixels; the lines of outliers are thin, dashed and grey.
-
-        Args:
-            first: Pixels (x, y) of the first image.
-            second: Pixels (x, y) of the second image.
-            inliers: Matches that are inliers; all by default.
-        """
+        """Draw lines between matched pixels; the lines of outliers are thin, dashed and grey."""
         segments = np.stack([first, np.asarray(second) + (self.offset, 0)], axis=1)
         inliers = np.ones(len(segments), bool) if inliers is None else np.asarray(inliers, bool)
         self.inliers.set_segments(segments[inliers])
@@ -54,13 +48,7 @@ class MatchCanvas:
 
 
 def match_canvas(axis: Axes, first: np.ndarray, second: np.ndarray, titles: tuple[str, str]) -> MatchCanvas:
-    """Draw two images (H, W, 3) side by side, prepared for the lines of matches.
-
-    Raises:
-        InputError: The images have different sizes.
-    """
-    if first.shape != second.shape:
-        raise InputError(f"images have shapes {first.shape} and {second.shape}, expected equal shapes")
+    """Draw two images (H, W, 3) side by side, prepared for the lines of matches."""
     height, width = first.shape[:2]
     offset = width + _GAP
     images = tuple(
@@ -124,24 +112,11 @@ def best_view(
 ) -> "VBox":
     """Show the best of N target views by each view selector, and its matches.
 
-    The controls are the selector, the number of target views, and the first of them.
-
-    Args:
-        reference: Reference view.
-        targets: Target views in the order of the camera's path.
-        pairs: The reference matched with each target view.
-        positions: Positions of the targets and of the reference, from `viewpoints_from_above`.
-        angles: True rotation in degrees between each target view and the reference.
-
-    Raises:
-        InputError: The numbers of views differ.
+    The controls are the selector, the number of target views, and the first of them. Targets are in the order of the
+    camera's path; `positions` are those of the targets and of the reference, from `viewpoints_from_above`, and `angles`
+    the rotation in degrees between each target view and the reference.
     """
     n = len(targets)
-    if not (n == len(pairs) == len(positions[0]) == len(angles) > 0):
-        raise InputError(
-            f"{n} targets, {len(pairs)} pairs, {len(positions[0])} positions and {len(angles)} angles, "
-            "expected equal numbers, at least one"
-        )
     scores = {name: np.array([score(pair) for pair in pairs]) for name, score in VIEW_SELECTORS.items()}
     pixels = [_match_pixels(reference, target, pair) for target, pair in zip(targets, pairs)]
     figure, (above, graph, images) = plt.subplots(
