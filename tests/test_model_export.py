@@ -9,7 +9,9 @@ import pytest
 from model_files import write_quad, write_wedge
 
 from zsp_lite.cli import main as cli
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D, SequenceData
+from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.samples import REPOSITORY
@@ -148,12 +150,19 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, capsys, wrong, me
     assert message in capsys.readouterr().err
 
 
-def test_the_code_of_the_page_on_own_models_runs(tmp_path, monkeypatch, capsys):
-    page = (REPOSITORY / "docs" / "own_models.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
+def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL)
     exec(code, names := {})
-    assert names["dataset"].categories() == ["disc"] and "disc" in capsys.readouterr().out
-    first, second = (names["dataset"].point_cloud("disc", name)[0] for name in ("first", "second"))
-    label = read_labels(tmp_path / "outputs" / "discs", "disc")["second"].trans
+    rng = np.random.default_rng(0)
+    points, poses = rng.normal(size=(50, 3)), [np.eye(4), np.eye(4)]
+    poses[1][:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    camera = Camera(np.eye(3), np.zeros(3), np.full(2, 8.0), np.full(2, 4.0), (8, 8))
+    frame = Frame(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), np.ones((8, 8), np.float32), camera, "")
+    recordings = [
+        (SequenceData(name, [frame], [0.0], points @ pose[:3, :3].T + pose[:3, 3], np.zeros((50, 3), np.uint8)), pose)
+        for name, pose in zip(("first", "second"), poses)
+    ]
+    names["write_category"](tmp_path, "box", recordings)
+    first, second = (Co3D(tmp_path).point_cloud("box", name)[0] for name in ("first", "second"))
+    label = read_labels(tmp_path, "box")["second"].trans
     assert first @ label[:3, :3].T + label[:3, 3] == pytest.approx(second, abs=1e-4)

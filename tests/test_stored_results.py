@@ -1,0 +1,91 @@
+"""The figures of the pages are those of the stored runs, the code and the fitted constants."""
+
+import re
+from dataclasses import asdict, astuple
+
+import numpy as np
+import pytest
+
+from tools.models import read_catalogue
+from zsp_lite.benchmark.formats import insert_tables
+from zsp_lite.benchmark.results import read_results
+from zsp_lite.benchmark.tables import every_table
+from zsp_lite.data.samples import REPOSITORY
+from zsp_lite.metrics import reliability
+from zsp_lite.verified.confidence import Calibration
+from zsp_lite.verified.verification import ScoreWeights
+
+RUNS = {
+    name: REPOSITORY / "notebooks" / "results" / "paper_run" / f"{name}.json.gz" for name in ("procedural", "artists")
+}
+README_ROWS = ("ours", "ours-bv", "rootsift", "oracle-view", "verified")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return {name: read_results(path) for name, path in RUNS.items()}
+
+
+def page(name: str) -> str:
+    return (REPOSITORY / name).read_text(encoding="utf-8").replace("−", "-")
+
+
+def numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+def rows(text: str, start: str) -> list[str]:
+    """The lines of the table whose head begins with `start`."""
+    return re.search(rf"^{re.escape(start)}.*\n\|[-:|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)[1].splitlines()
+
+
+def test_the_readme_has_the_figures_of_both_runs(runs):
+    for line, row in zip(rows(page("README.md"), "| | procedural"), README_ROWS, strict=True):
+        found = [run.summary["methods"][row] for run in runs.values()]
+        expected = [value for one in found for value in (one["acc30"], *one["acc30_ci"], one["above150"])]
+        assert numbers(line.split("|", 2)[2]) == pytest.approx(expected, abs=0.051), row
+
+
+def test_the_table_of_artist_made_models_has_the_figures(runs):
+    methods = runs["artists"].summary["methods"]
+    lines = rows(page("docs/results.md"), "| row | median error")
+    names = [re.match(r"\| `([\w-]+)`", line)[1] for line in lines]
+    assert len(names) == 10
+    for name, line in zip(names, lines):
+        one = methods[name]
+        figures = ("median", "acc30", "acc15")
+        expected = [value for figure in figures for value in (one[figure], *one[f"{figure}_ci"])]
+        assert numbers(line.split("|", 2)[2]) == pytest.approx([*expected, one["above150"]], abs=0.051), name
+
+
+def test_the_marked_tables_are_those_of_the_procedural_run(runs):
+    text = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    summary = runs["procedural"].summary
+    assert insert_tables(text, every_table(summary), max(row["n"] for row in summary["methods"].values())) == text
+
+
+def test_the_artists_run_has_30_pairs_of_each_category_of_the_catalogue(runs):
+    summary = runs["artists"].summary
+    assert summary["data"]["categories"] == sorted(read_catalogue(REPOSITORY / "tools" / "artists.json").models)
+    assert {one["n"] for row in summary["methods"].values() for one in row["per_category"].values()} == {30}
+
+
+def test_the_page_on_solvers_has_the_confidences(runs):
+    for line, run in zip(rows(page("docs/solvers.md"), "| objects | mean confidence"), runs.values(), strict=True):
+        confidence = np.array(list(run.confidences("verified").values()))
+        right = np.array(list(run.errors("verified").values())) < 30
+        measured = reliability(confidence, right)
+        expected = [100 * confidence.mean(), 100 * right.mean(), 100 * measured.calibration_error]
+        assert numbers(line)[:3] == pytest.approx(expected, abs=0.051)
+        assert numbers(line)[3] == pytest.approx(measured.auroc, abs=0.0051)
+
+
+def test_the_page_on_solvers_has_the_weights_and_the_calibration_of_the_code():
+    text, weights = page("docs/solvers.md"), asdict(ScoreWeights())
+    stated = {}
+    for line in rows(text, "| term |"):
+        term, forward, reverse = re.match(r"\| `(\w+)` \|[^|]*\| (\S+) \| (\S*) ?\|", line).groups()
+        stated |= {term: forward} if not reverse else {f"forward_{term}": forward, f"reverse_{term}": reverse}
+    assert {name: float(value) for name, value in stated.items()} == weights
+    (line,) = rows(text, "| α₀")
+    assert numbers(line) == list(astuple(Calibration()))
