@@ -46,8 +46,9 @@ def small_folder() -> Path:
 
 @dataclass(frozen=True)
 class SlowBackbone(CoordinateBackbone):
-    """Takes its time, so that a test can come in between. (How much does not make it another backbone.)"""
+    """Takes its time, so that a test can come in between."""
 
+    name = "slow"
     _seconds: float = 0.05
 
     def __call__(self, images):

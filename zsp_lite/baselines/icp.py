@@ -25,15 +25,8 @@ _MAX_DISTANCE = 1e6
 def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Sim3:
     """Align two point clouds by Open3D's point-to-point ICP with scale, initialised with the identity.
 
-    Args:
-        source: (n, 3) points.
-        target: (m, 3) points.
-
     Returns:
         The similarity from source to target.
-
-    Raises:
-        InputError: The estimated scale is 0 or not finite.
     """
     open3d = load_open3d()
     clouds = [open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)) for points in (source, target)]
@@ -62,18 +55,8 @@ def align(
     Initially, both clouds are placed as if their camera (of the reference, of target `view`) were the first camera of
     its sequence. Both camera frames then coincide, up to the difference of the first cameras of the two sequences.
 
-    Args:
-        reference: Reference frame.
-        targets: Target frames; the target cloud is the union of their points.
-        view: Index of the target frame whose camera the result refers to.
-        firsts: First camera of the reference's and of the target's sequence.
-        seed: Seed or generator of the subsampling to `POINTS` points.
-
     Returns:
         Similarity from reference-camera points to points in the camera of target `view`.
-
-    Raises:
-        InputError: A frame has no depth on the object, or ICP fails.
     """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera

@@ -121,10 +121,6 @@ def load_posecontrast(path: str | Path | None = None) -> PoseContrast:
 def predict_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Float[Tensor, "b 3"]:
     """Compute the angles of the most probable bins with their offsets.
 
-    Args:
-        logits: (b, bins) of azimuth, elevation and in-plane rotation.
-        offsets: (b, bins) of the same.
-
     Returns:
         (b, 3) angles in degrees, in the convention of `euler_to_rotation`.
     """
@@ -138,10 +134,8 @@ def predict_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Float
 def euler_to_rotation(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Convert viewpoint angles to rotations from the canonical frame to the camera (OpenCV axes).
 
-    The rotation to an OpenGL camera is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
-
-    Args:
-        angles: (..., 3) azimuth in [0, 360), elevation in [0, 180] and in-plane rotation in [0, 360), degrees.
+    Azimuth and in-plane rotation are in [0, 360), the elevation in [0, 180] degrees. The rotation to an OpenGL camera is
+    Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
     """
     zxz = (np.asarray(angles, np.float64) - (0, 180, 180))[..., ::-1]
     rotation = Rotation.from_euler("ZXZ", zxz.reshape(-1, 3), degrees=True).as_matrix()

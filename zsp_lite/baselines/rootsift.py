@@ -38,12 +38,7 @@ class RootSift:
     device = torch.device("cpu")
 
     def __init__(self, keypoint_size: float = 24.0):
-        """Create the extractor.
-
-        Args:
-            keypoint_size: Size of the keypoints, pixels. A descriptor covers 4 x 4 cells of 1.5 times this side; the
-                default covers most of the object.
-        """
+        """Create the extractor; a descriptor covers 4 x 4 cells of 1.5 times `keypoint_size` pixels."""
         self.keypoint_size = keypoint_size
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
@@ -66,11 +61,6 @@ def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
     """Compute the descriptors of upright keypoints on a grid, equal to OpenCV's `SIFT.compute` up to rounding.
-
-    Args:
-        grey: (n, n) greyscale image.
-        centres: Coordinates of the keypoints along both axes, pixels.
-        size: Size of the keypoints, pixels.
 
     Returns:
         (side, side, 128) integers from 0 to 255.

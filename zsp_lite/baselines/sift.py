@@ -54,11 +54,6 @@ def mutual_matches(
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Match keypoints as mutual nearest neighbours of their descriptors.
 
-    Args:
-        first: Keypoints of one image.
-        second: Keypoints of the other image.
-        k: Maximum number of matches.
-
     Returns:
         Indices of the matched keypoints in `first` and in `second`, and the cosine similarities of their descriptors,
         most similar first.
@@ -74,15 +69,7 @@ def mutual_matches(
 
 
 def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Compute the points of pixels in camera coordinates, with in-painted depth where it is unknown.
-
-    Args:
-        frame: Frame with depth.
-        pixels: (n, 2) pixels (x, y).
-
-    Raises:
-        InputError: No depth is known.
-    """
+    """Compute the points of pixels in camera coordinates, with in-painted depth where it is unknown."""
     if frame.depth is None:
         raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to unproject matches")
     height, width = frame.camera.size

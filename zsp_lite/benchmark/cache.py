@@ -26,13 +26,6 @@ class FeatureCache:
     pixels, and for extractors with `describe` also the depth, the mask and the camera. Only results of the type
     FeatureMap are kept. The fingerprint of a user-defined extractor without weights is its name: use another folder
     when its code changes.
-
-    Args:
-        folder: The folder; made where it does not exist.
-        extractors: By name (see `extractors`).
-
-    Raises:
-        InputError: The folder cannot be made.
     """
 
     def __init__(self, folder: str | Path, extractors: Mapping[str, Any]):

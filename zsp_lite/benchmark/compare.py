@@ -58,11 +58,7 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
 
 
 def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
-    """Split "A:B" into a row of each run; "A" stands for the row A of both. Names of rows may hold colons themselves.
-
-    Raises:
-        InputError: If the text names no rows of the runs, or can be read in several ways.
-    """
+    """Split "A:B" into a row of each run; "A" stands for the row A of both. Names of rows may hold colons."""
     if text in first.rows and text in second.rows:
         return text, text
     ends = [i for i, sign in enumerate(text) if sign == ":"]

@@ -53,16 +53,7 @@ class Records:
 
 
 class RunFolder:
-    """A run's folder, open for writing; a context manager.
-
-    Args:
-        out: The folder; made where it does not exist.
-        settings: What decides the results (see `check_settings`).
-        allow_other_version: Continue a run of another version of the library.
-
-    Raises:
-        InputError: If another process writes to the folder, or it holds a run with other settings.
-    """
+    """A run's folder, open for writing; a context manager."""
 
     def __init__(self, out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False):
         self._out = out = make_folder(out, "folder of the run")
@@ -101,11 +92,7 @@ class RunFolder:
             self._database.execute(update, [seconds, self._invocation])
 
     def add(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Store evaluated pairs (see `evaluate_pair`) in one transaction.
-
-        Raises:
-            InputError: If the file cannot be written, for example because the disk is full.
-        """
+        """Store evaluated pairs (see `evaluate_pair`) in one transaction."""
         try:
             self._add(records)
         except sqlite3.OperationalError as error:
@@ -134,11 +121,7 @@ class RunFolder:
 
 
 def read_records(out: str | Path) -> Records:
-    """Read the records of a run's folder, finished or interrupted.
-
-    Raises:
-        InputError: If there is no run in it, or it is damaged.
-    """
+    """Read the records of a run's folder, finished or interrupted."""
     return _query(Path(out), _read)
 
 
@@ -148,11 +131,7 @@ def finished_results(out: str | Path) -> set[tuple[str, str]]:
 
 
 def read_settings(out: str | Path) -> dict[str, Any]:
-    """Read run.json.
-
-    Raises:
-        InputError: If there is none, or it is damaged.
-    """
+    """Read run.json."""
     path = Path(out) / SETTINGS
     try:
         settings = json.loads(read_bytes(path, "settings"))
@@ -166,17 +145,8 @@ def read_settings(out: str | Path) -> dict[str, Any]:
 def check_settings(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False) -> dict[str, Any]:
     """Check that a run can be continued with these settings, and merge them with its own. Writes nothing.
 
-    Args:
-        out: Folder of the run, or of none yet.
-        settings: "library": see `provenance.library_version`; "methods" and "labels": fingerprints of rows and pose
-            labels by name, which may grow; anything else decides all results.
-        allow_other_version: Accept another version of the library; run.json then lists both.
-
     Returns:
         The settings to write, with all rows, labels and library versions of the run.
-
-    Raises:
-        InputError: If the folder holds a run with other settings.
     """
     out = Path(out)
     if not os.path.lexists(out / SETTINGS):  # a pipe or a broken link is no new run

@@ -96,10 +96,6 @@ def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list
 
     Pairs are ordered by target sequence. Pairs that differ only in the number of target views stay together. Where
     possible, so do those of a target sequence.
-
-    Args:
-        pairs: The rows to evaluate on each pair.
-        size: Number of pairs.
     """
 
     def sequence(pair: Pair) -> tuple:
@@ -132,15 +128,10 @@ class Workers:
 
 @contextmanager
 def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[Workers]:
-    """Open an executor, and close it after the block.
+    """Open an executor, and close it after the block; an Executor stays open.
 
-    Args:
-        executor: None for this process or, with number > 1, a process pool; "dask://HOST:PORT"; "module:Class" of an
-            executor that is called with the number of workers; or an Executor, which stays open.
-        number: Number of workers.
-
-    Raises:
-        InputError: If the executor is none of these, or cannot be reached.
+    It is None for this process or, with number > 1, a process pool; "dask://HOST:PORT"; "module:Class" of an executor
+    that is called with the number of workers; or an Executor.
     """
     check_integer("workers", number, 1, MOST_WORKERS)
     if executor is None and number == 1:
@@ -183,18 +174,7 @@ def evaluate_chunks(
     save: Callable[[list[dict[str, Any]]], None],
     extractors: Mapping[str, Any],
 ) -> None:
-    """Evaluate chunks.
-
-    Args:
-        setup: What they have in common.
-        chunks: Pairs and rows.
-        workers: Executor.
-        save: Called in this process with the records of each chunk, or of each pair where this process evaluates them.
-        extractors: Those of this process.
-
-    Raises:
-        InputError: If a worker dies, a file cannot be read, or a pose label is missing.
-    """
+    """Evaluate chunks; `save` gets the records of each, or of each pair where this process evaluates them."""
     if workers.executor is None:
         evaluator = Evaluator(setup, extractors)
         with one_thread():

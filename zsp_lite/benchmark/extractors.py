@@ -31,11 +31,7 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
 
 
 def make_extractors(backbone: Extractor, names: Iterable[str]) -> dict[str, Any]:
-    """Make extractors by name.
-
-    Raises:
-        InputError: A name is unknown, or the weights of an extractor are not available.
-    """
+    """Make extractors by name."""
     names = list(dict.fromkeys(names))
     if unknown := [name for name in names if name not in EXTRACTORS]:
         raise InputError(f"features {unknown}: expected some of {', '.join(EXTRACTORS)}")

@@ -25,9 +25,6 @@ def error_distribution(results: Results, row: str = "ours") -> Figure:
     """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the supplement).
 
     A second cluster near 180 degrees consists of confusions of front and back.
-
-    Raises:
-        InputError: The run does not have the row.
     """
     by_category: dict[str, list[float]] = {}
     for key, error in results.errors(row).items():
@@ -51,9 +48,6 @@ def accuracy_against_views(results: Results) -> Figure:
     """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals.
 
     The results that the paper published for CO3D are dotted grey; those of the verified solver are dashed.
-
-    Raises:
-        InputError: The run has fewer than two numbers of target views.
     """
     methods, views = results.summary["methods"], results.summary["data"]["targets"]
     lines = {}
@@ -107,13 +101,6 @@ def reliability_diagram(results: Results, row: str | None = None) -> Figure:
     """Draw a reliability diagram and a histogram of the confidences.
 
     The diagram shows the fraction of errors below 30 degrees against the mean confidence, in ten bins of equal size.
-
-    Args:
-        results: The run.
-        row: Default: the first row with confidences.
-
-    Raises:
-        InputError: No row, or not this one, has enough confidences.
     """
     names = dict.fromkeys([*results.summary.get("methods", ()), *results.rows])  # in the order of the run
     stated = {name: found for name in names if len(found := results.confidences(name)) >= _LEAST_STATED}

@@ -71,14 +71,6 @@ def insert_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     """Replace the marked tables of a Markdown text, without notes and columns of single categories.
 
     A table stands between the lines <!-- table NAME --> and <!-- end of table -->.
-
-    Args:
-        text: The document.
-        tables: Tables of a run.
-        pairs: Number of pairs of the run; the titles state it.
-
-    Raises:
-        InputError: If there is no mark, a mark has no counterpart, or a name is not a table of the run.
     """
     by_name = {table.name: table for table in tables}
     marks = _MARK.findall(text)

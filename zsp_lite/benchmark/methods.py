@@ -173,11 +173,7 @@ def _method(name: str, meant: Any) -> Method:
 
 
 def import_object(path: str) -> Any:
-    """Import the object "module:name" from an installed module or a module in the current folder.
-
-    Raises:
-        InputError: There is no such module or object.
-    """
+    """Import the object "module:name" from an installed module or a module in the current folder."""
     module, _, name = path.partition(":")
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the path of a console script lacks the current folder

@@ -83,12 +83,7 @@ class Row(Protocol):
 
 
 def as_answer(found: Any) -> Answer:
-    """Convert what a row returns to an Answer.
-
-    Raises:
-        InputError: If it is none of the types of `Row`, its matrix is not a rotation, or its details have reserved
-            names or other values than numbers and texts.
-    """
+    """Convert what a row returns to an Answer."""
     if isinstance(found, Answer):
         return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
     if isinstance(found, PoseEstimate):

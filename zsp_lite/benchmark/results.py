@@ -62,11 +62,7 @@ class Results:
 
 
 def results_of(settings: Mapping[str, Any], records: Records) -> Results:
-    """Summarise the rows and categories of the last call of `evaluate`, as far as they are finished.
-
-    Raises:
-        InputError: If no pair is finished.
-    """
+    """Summarise the rows and categories of the last call of `evaluate`, as far as they are finished."""
     call = records.invocations[-1] if records.invocations else {"rows": [], "categories": []}
     place = {category: index for index, category in enumerate(call["categories"])}
     rows = {}

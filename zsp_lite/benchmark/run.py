@@ -130,19 +130,7 @@ def pairs_of_rows(
     seed: int = 0,
     categories: Sequence[str] | None = None,
 ) -> dict[str, list[Pair]]:
-    """Return the pairs that each row is evaluated on: the same for all rows of as many target views.
-
-    Args:
-        root: Folder in CO3D's layout with pose labels.
-        rows: The rows by name.
-        pairs: Number per category.
-        targets: Target views, for rows that do not fix them.
-        seed: Seed of the sampled pairs.
-        categories: Default: all that have pose labels.
-
-    Raises:
-        InputError: For unknown categories, and where these do not have so many pairs or views.
-    """
+    """Return the pairs that each row is evaluated on: the same for all rows of as many target views."""
     dataset = Co3D(root)
     categories = list(dict.fromkeys(categories or labelled_categories(dataset)))
     if missing := sorted(set(categories) - set(dataset.categories())) or not categories:

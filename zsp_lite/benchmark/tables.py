@@ -81,15 +81,7 @@ class Table:
 def make_table(
     name: str, title: str, columns: Sequence[tuple[str, str]], rows: Mapping[str, Sequence[Any]], note: str = ""
 ) -> Table:
-    """Make a table from its rows.
-
-    Args:
-        name: Stem of its files.
-        title: Its caption.
-        columns: (group, title) of each.
-        rows: Cells by label.
-        note: How to read it.
-    """
+    """Make a table from its rows."""
     index = pd.MultiIndex.from_tuples(columns, names=["group", "title"])
     return Table(name, title, pd.DataFrame(list(rows.values()), list(rows), index, dtype=object), note)
 
@@ -232,11 +224,7 @@ def category_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
-    """Return Acc30 of some rows with a line for each category, narrow enough for a terminal.
-
-    Raises:
-        InputError: If the run has no such row.
-    """
+    """Return Acc30 of some rows with a line for each category, narrow enough for a terminal."""
     methods = summary["methods"]
     if missing := [name for name in names if name not in methods]:
         raise InputError(f"the run has no row {', '.join(missing)}, expected some of {', '.join(methods)}")
