@@ -20,7 +20,7 @@ from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.huggingface import nearest_multiple
 from zsp_lite.backbones.load import verify
 from zsp_lite.backbones.pretrained import download
-from zsp_lite.benchmark.identity import backbone_digest
+from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.samples import sample_data
@@ -308,7 +308,7 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     kept = {key: x for key, x in weights.items() if "pooler" not in key}
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
     first, second = (load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2))  # nobody reads the pooler
-    assert backbone_digest(first) == backbone_digest(second)
+    assert fingerprint(first) == fingerprint(second)
     del kept["layernorm.weight"]
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
     refused(f"hf:{folder}", "1 weights are not in the file, first layernorm.weight")

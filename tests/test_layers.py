@@ -17,7 +17,6 @@ PACKAGE = Path(zsp_lite.__file__).parent
 # functions, which delay the loading of large libraries, follow the same rule.
 LAYERS = [
     "errors",
-    "arguments",
     "io",
     "alignment features matchers metrics minimal",
     "data",
