@@ -134,8 +134,8 @@ def predict_angles(logits: Sequence[Tensor], offsets: Sequence[Tensor]) -> Float
 def euler_to_rotation(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Convert viewpoint angles to rotations from the canonical frame to the camera (OpenCV axes).
 
-    Azimuth and in-plane rotation are in [0, 360), the elevation in [0, 180] degrees. The rotation to an OpenGL camera is
-    Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
+    Azimuth and in-plane rotation are in [0, 360), the elevation in [0, 180] degrees. The rotation to an OpenGL camera
+    is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
     """
     zxz = (np.asarray(angles, np.float64) - (0, 180, 180))[..., ::-1]
     rotation = Rotation.from_euler("ZXZ", zxz.reshape(-1, 3), degrees=True).as_matrix()
