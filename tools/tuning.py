@@ -39,7 +39,7 @@ from zsp_lite.metrics import reliability, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, different_poses, modes
-from zsp_lite.verified.verification import FEATURE_TERMS, TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
 from zsp_lite.views import View, usable_targets
 
 CORRECT_ANGLE = 30.0  # degrees
@@ -93,7 +93,7 @@ class Outcome:
     def circumstances(self, weights: ScoreWeights) -> tuple[int, float, float]:
         """Return what the probability of "none of these" depends on: number of views, view_std and shape fit."""
         best = self.terms[(self.terms @ np.array(astuple(weights))).argmax()]
-        return self.n_views, self.view_std, float(best @ np.array(astuple(weights.without(*FEATURE_TERMS))))
+        return self.n_views, self.view_std, float(best @ np.array(astuple(weights.of_shape())))
 
 
 def collect_outcomes(

@@ -32,8 +32,7 @@ _DEPTH, _WEIGHT, _SILHOUETTE, _PATCH = range(4)
 class ViewMaps:
     """Cameras of v views in working units, and one table row for each of their pixels."""
 
-    # world-to-camera, `x_cam = rotation @ x + translation` with x in the working frame
-    rotation: Float[Tensor, "v 3 3"]
+    rotation: Float[Tensor, "v 3 3"]  # world-to-camera: `x_cam = rotation @ x + translation`, x in the working frame
     translation: Float[Tensor, "v 3"]  # working units
     focal_length: Float[Tensor, " v"]  # in map pixels; the maps are resampled so that it is equal along both axes
     principal_point: Float[Tensor, "v 2"]  # (x, y) in map pixels
@@ -55,10 +54,8 @@ class Projection:
 
     depth: Float[Tensor, "m v n"]  # depth of the point, working units
     surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
-    # weight of the measured depth in [0, 1], 0 where it is unknown or background
-    weight: Float[Tensor, "m v n"]
-    # distance to the silhouette at the point's depth, working units, 0 inside
-    silhouette_distance: Float[Tensor, "m v n"]
+    weight: Float[Tensor, "m v n"]  # of the measured depth, in [0, 1]; 0 where it is unknown or background
+    silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
     patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
     pixels: Float[Tensor, "m v n 2"]  # (x, y) in map pixels
 
@@ -74,7 +71,6 @@ def build_maps(
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
     origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
     lengths = [table.shape[1] for table in tables]
-
     sizes = np.array([camera.size[::-1] for camera in cameras])
     translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(

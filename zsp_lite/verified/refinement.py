@@ -24,6 +24,7 @@ _MAX_POLISHED = 3
 _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
 # Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
 _PARENTS = 6
+Score = Callable[[Poses], Float[Tensor, " m"]]
 
 
 class SearchSchedule(NamedTuple):
@@ -59,10 +60,7 @@ def refine_coarse_to_fine(
 
 
 def refine(
-    poses: Poses,
-    score: Callable[[Poses], Float[Tensor, " m"]],
-    schedule: SearchSchedule,
-    seed: int | np.random.Generator = 0,
+    poses: Poses, score: Score, schedule: SearchSchedule, seed: int | np.random.Generator = 0
 ) -> tuple[Poses, Float[Tensor, " m"]]:
     """Improve every pose by random search; scales stay within `SCALE_RANGE`.
 
@@ -108,9 +106,7 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
 
 
-def _score_function(
-    scene: Scene, weights: ScoreWeights, counts: tuple[int, int]
-) -> Callable[[Poses], Float[Tensor, " m"]]:
+def _score_function(scene: Scene, weights: ScoreWeights, counts: tuple[int, int]) -> Score:
     """Return a function that scores poses by about `counts` points of the reference and of the targets."""
     totals = len(scene.reference_points), len(scene.target_points)
     stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))

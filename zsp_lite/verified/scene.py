@@ -40,18 +40,14 @@ class Scene:
     target_points: Float[Tensor, "m 3"]  # the same of all target views
     target_column: Int[Tensor, " m"]  # column of each target point in `similarity`
     target_weight: Float[Tensor, " m"]  # share of the surface that each target point represents; they sum to 1
-    # double-centred feature similarity of each reference point to each foreground patch of all targets
-    # (see `double_centre`)
-    similarity: Float[Tensor, "n columns"]
+    similarity: Float[Tensor, "n columns"]  # of each point to each foreground patch of all targets, double-centred
     reference_maps: ViewMaps  # per-pixel maps of the reference
     target_maps: ViewMaps  # per-pixel maps of the targets
     reference_to_working: Sim3  # Reference camera to working units
     target_to_working: Sim3  # first target camera to working units
     target_cameras: tuple[Camera, ...]  # cameras of the targets
-    # Per target, the matched points of reference and target, working units
-    matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
-    # feature similarity of each target view to the reference less their mean (see `view_similarity`)
-    view_similarity: Float[Tensor, " v"]
+    matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]  # points of reference and target, per target
+    view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
 
     @property
     def view_similarity_std(self) -> float:
@@ -72,8 +68,8 @@ def build_scene(
     """Prepare the scene of a reference view and its target views."""
     first = targets[0].frame.camera
     to_camera = [_relative_pose(first, target.frame.camera) for target in targets]
-    source, source_valid = _patch_cloud(reference)
-    clouds, valid = zip(*(_patch_cloud(target) for target in targets))
+    source, *clouds = [view.measured_points[0].reshape(-1, 3) for view in (reference, *targets)]
+    source_valid, *valid = [view.known_foreground.ravel() for view in (reference, *targets)]
     clouds = [(points - t) @ R for points, (R, t) in zip(clouds, to_camera)]
     reference_to_working, (source_valid,) = _normalisation(
         [source], [source_valid], reference.frame.name or "reference"
@@ -154,11 +150,6 @@ def _relative_pose(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 
     """Return the rotation and translation from the first camera's frame to the second's."""
     rotation = second.R @ first.R.T
     return rotation, second.t - rotation @ first.t
-
-
-def _patch_cloud(view: View) -> tuple[Float[np.ndarray, "patches 3"], Bool[np.ndarray, " patches"]]:
-    """Return the camera-frame points of all patches, and which of them are foreground of known depth."""
-    return view.measured_points[0].reshape(-1, 3), view.known_foreground.ravel()
 
 
 def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:

@@ -17,7 +17,7 @@ from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import ScoreTerms, ScoreWeights, score_terms
+from zsp_lite.verified.verification import TERM_NAMES, ScoreTerms, ScoreWeights, score_terms
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
@@ -36,8 +36,6 @@ class Solution:
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
     # (N,) angle in degrees between the reference's camera and each target view's under the best one
     view_angles: Float[np.ndarray, " n"]
-    flags: tuple[str, ...]  # one line per reason not to trust the best one
-    one_of_two: bool  # whether the answer is one of two poses (see `confidence.is_one_of_two`)
     timings: dict[str, float]  # seconds per stage
     scene: Scene  # the scene that poses were scored on
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
@@ -65,7 +63,8 @@ class VerifiedSolver:
         Inliers are matches with measured depth on both sides.
         """
         solution = self.solve(reference, targets, pairs, seed)
-        best = solution.hypotheses[0]
+        rotation, best = solution.poses.rotation, solution.hypotheses[0]
+        flags, one_of_two = reliability_flags(solution.hypotheses, rotation_angles(rotation, rotation).numpy())
         matches = pairs[best.view].matches
         (source, known), (target, seen) = (view.measured_points for view in (reference, targets[best.view]))
         u, v = tuple(matches.reference.T), tuple(matches.target.T)
@@ -73,7 +72,7 @@ class VerifiedSolver:
         inliers = known[u] & seen[v] & (residual < threshold * solution.target_spread)
         return PoseEstimate(
             best.sim3, best.view, matches, inliers, -solution.view_angles,
-            reference, tuple(targets), solution.timings, solution.flags, solution.hypotheses, solution.one_of_two,
+            reference, tuple(targets), solution.timings, flags, solution.hypotheses, one_of_two,
         )  # fmt: skip
 
     def solve(
@@ -110,26 +109,22 @@ class VerifiedSolver:
                 hypotheses = self._hypotheses(scene, poses, terms, order)
         view_angles = np.empty(len(order))
         view_angles[list(order)] = _view_angles(scene, poses)[0]
-        flags, one_of_two = reliability_flags(hypotheses, rotation_angles(poses.rotation, poses.rotation).numpy())
-        return Solution(hypotheses, view_angles, flags, one_of_two, timings, scene, order, poses)
+        return Solution(hypotheses, view_angles, timings, scene, order, poses)
 
     def _hypotheses(
         self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
     ) -> tuple[Hypothesis, ...]:
         """Build the hypotheses of ranked poses."""
-        score = self.weights.score(terms).double().numpy()
+        score, shape_fit = (one.score(terms).double().numpy() for one in (self.weights, self.weights.of_shape()))
         mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
         confidence = hypothesis_probabilities(
-            score, mode, len(order), scene.view_similarity_std, float(self.weights.shape_fit(terms)[0]),
-            self.calibration,
-        )  # fmt: skip
-        return tuple(
-            Hypothesis(
-                scene.to_sim3(poses, i, view), order[view], float(score[i]), terms.as_dict(i), float(confidence[i]),
-                int(mode[i]),
-            )
-            for i, view in enumerate(_view_angles(scene, poses).argmin(axis=1))
-        )  # fmt: skip
+            score, mode, len(order), scene.view_similarity_std, shape_fit[0], self.calibration
+        )
+        views = _view_angles(scene, poses).argmin(axis=1)
+        sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views)]
+        named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
+        parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
+        return tuple(Hypothesis(*one) for one in zip(*parts))
 
 
 def _view_angles(scene: Scene, poses: Poses) -> Float[np.ndarray, "m v"]:
@@ -161,6 +156,6 @@ def reliability_flags(
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
-    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+    content = (target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets)
     keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
     return tuple(sorted(range(len(targets)), key=keys.__getitem__))

@@ -76,10 +76,6 @@ class ScoreTerms:
         """Return the terms as a matrix with one column per term, in the order of `TERM_NAMES`."""
         return torch.stack([getattr(self, name) for name in TERM_NAMES], dim=1)
 
-    def as_dict(self, index: int) -> dict[str, float]:
-        """Return the terms of one pose by name."""
-        return {name: float(getattr(self, name)[index]) for name in TERM_NAMES}
-
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
 # Terms that need features; the others compare shapes.
@@ -104,13 +100,9 @@ class ScoreWeights:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
         return terms.matrix() @ torch.tensor(astuple(self), dtype=torch.float32)
 
-    def shape_fit(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
-        """Return the part of the scores that compares shapes: that of the terms without features."""
-        return self.without(*FEATURE_TERMS).score(terms)
-
-    def without(self, *names: str) -> "ScoreWeights":
-        """Return these weights with those of the named terms set to 0."""
-        return replace(self, **dict.fromkeys(names, 0.0))
+    def of_shape(self) -> "ScoreWeights":
+        """Return the weights of the terms that compare shapes; those of `FEATURE_TERMS` are 0."""
+        return replace(self, **dict.fromkeys(FEATURE_TERMS, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +152,7 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         some = poses[first : first + size]
         forward, reverse = forward_terms(scene, some, rows), reverse_terms(scene, some, indices)
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
-    return ScoreTerms(
-        *(torch.cat(term) for term in zip(*chunks)),
-        viewpoint_term(scene, poses),
-    )  # fmt: skip
+    return ScoreTerms(*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses))
 
 
 def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
