@@ -1,4 +1,4 @@
-"""Cases, and the files that they damage."""
+"""Cases, and the folder that they damage."""
 
 import gzip
 import io
@@ -9,9 +9,12 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from co3d_folders import sequence_data
+from safetensors.torch import save_file
 
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
@@ -30,35 +33,21 @@ class Case:
     Attributes:
         group: Its class, a line of the table.
         name: What is hostile.
-        call: Called with the case's own copy of the folder of `prepare`. Checks of an answer raise `Wrong`.
-        answers: The call may return. Otherwise it must raise InputError.
-        says: Part of the message, where another defect of the input would be refused as well.
+        call: Called with the case's own copy of the folder of `prepare`. It must raise InputError, or return `REFUSED`
+            or `RIGHT`.
     """
 
     group: str
     name: str
     call: Callable[[Path], object]
-    answers: bool = False
-    says: str = ""
-
-    def outcome(self, folder: Path) -> tuple[str, str]:
-        found = self.call(folder)
-        if isinstance(found, tuple) and isinstance(found[0], str) and found[0] == "refused":
-            return found
-        return ("right" if self.answers else "wrong"), " ".join(repr(found).split())[:300]
-
-    def refused(self, error: Exception) -> tuple[str, str]:
-        text = str(error)
-        if "\n" in text or len(text) > 1500:
-            return "wrong", f"error of {len(text)} characters in {text.count(chr(10)) + 1} lines: {text}"
-        if self.says not in text:
-            return "wrong", f"refused for another reason than {self.says!r}: {text}"
-        return "refused", text
 
 
-def case(group: str, name: str, call: Callable[[Path], object], answers: bool = False, says: str = "") -> None:
-    """Register a case."""
-    CASES.append(Case(group, name, call, answers, says))
+REFUSED, RIGHT = object(), object()
+
+
+def case(group: str, name: str, read: Callable[[Path], object], change: Callable[[Path], object]) -> None:
+    """Register a reader that must raise InputError after a change of the folder."""
+    CASES.append(Case(group, name, lambda folder: (change(folder), read(folder))[1]))
 
 
 def command(group: str, name: str, *argv: str, change: Callable[[Path], object] | None = None, codes=(2,)) -> None:
@@ -76,64 +65,111 @@ def command(group: str, name: str, *argv: str, change: Callable[[Path], object] 
             raise Wrong(f"exit code {code}, expected {codes}: {text}")
         if code == 2 and len(text.strip().splitlines()) != 1:
             raise Wrong(f"{len(text.splitlines())} lines on stderr: {text}")
-        return "refused" if code == 2 else "right", text
+        if "Traceback" in text or (folder / "executed").exists():
+            raise Wrong(f"a traceback, or code of the input was executed: {text}")
+        return REFUSED if code == 2 else RIGHT
 
-    CASES.append(Case(group, name, lambda folder: _keep(call(folder)), answers=True))
-
-
-def _keep(found: tuple[str, str]) -> object:
-    return found if found[0] == "refused" else found[1]
+    CASES.append(Case(group, name, call))
 
 
 def prepare(folder: Path) -> Path:
-    """Write a data set of two labelled sequences of one category, and pictures; every case gets a copy."""
+    """Write what the cases change, each in its own copy.
+
+    data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame as lists and as
+    nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a small network.
+    """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
     for name in ("a", "b"):
         write_label(data, "cup", PoseLabel(np.eye(4), name, "a"))
+    if main([*BENCHMARK, "--data", str(data), "--out", str(folder / "out"), "--quiet"]):
+        raise Wrong("the benchmark of the prepared data failed")
+    capture = folder / "capture"
+    for part in ("rgb", "depth"):
+        (capture / part).mkdir(parents=True)
+    cv2.imwrite(str(capture / "rgb/0.png"), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(capture / "depth/0.png"), np.full((24, 32), 1000, np.uint16))
+    for name, text in LISTS.items():
+        (capture / name).write_text(text)
+    (capture / "transforms.json").write_text(json.dumps(NERFSTUDIO))
+    y, x = np.mgrid[:64, :64]
+    disc = (y - 32) ** 2 + (x - 32) ** 2 < 24**2
+    depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
+    for name in ("a", "b"):
+        picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
+        for end, image in (("", picture), ("_depth", depth), ("_mask", 255 * disc.astype(np.uint8))):
+            cv2.imwrite(str(folder / f"{name}{end}.png"), image)
+    save_file(VisionTransformer(32, 8, 64, 2, 1).state_dict(), folder / "x.safetensors", {"num_heads": "1"})
     return folder
 
 
-def edit_frames(folder: Path, change: Callable[[list], object]) -> None:
-    """Change the frame annotations of the category."""
-    edit(folder / "data/cup/frame_annotations.jgz", change)
+BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
+LISTS = {
+    "rgb.txt": "rgb/0.png\n",
+    "depth.txt": "depth/0.png\n",
+    "poses.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n",
+    "intrinsics.txt": "30 0 16\n0 30 12\n0 0 1\n",
+}
+NERFSTUDIO = {
+    "fl_x": 30, "cx": 16, "cy": 12, "w": 32, "h": 24,
+    "frames": [{"file_path": "rgb/0.png", "depth_file_path": "depth/0.png", "transform_matrix": np.eye(4).tolist()}],
+}  # fmt: skip
 
 
-def edit(path: Path, change: Callable[[object], object]) -> None:
-    content = json.loads(gzip.decompress(path.read_bytes()))
-    changed = change(content)
-    path.write_bytes(gzip.compress(json.dumps(content if changed is None else changed).encode()))
+def edited(name: str, change: Callable[[object], object]) -> Callable[[Path], object]:
+    """Return a function that changes a JSON file of the folder, gzipped or not."""
+
+    def write(folder: Path):
+        path = folder / name
+        zipped = path.suffix in (".jgz", ".gz")
+        content = json.loads(gzip.decompress(path.read_bytes()) if zipped else path.read_bytes())
+        change(content)
+        data = json.dumps(content).encode()
+        path.write_bytes(gzip.compress(data) if zipped else data)
+
+    return write
+
+
+def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Path], object]:
+    """Return a function that replaces a file of the folder."""
+
+    def write(folder: Path):
+        content = data() if callable(data) else data
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return write
 
 
 def gzip_bomb(gigabytes: int = 8, start: bytes = b"") -> bytes:
-    """Compressed zeros."""
-    step = gzip.compress(b" " * (1 << 26))
-    return gzip.compress(start) + step * (16 * gigabytes)
+    """Compressed spaces."""
+    return gzip.compress(start) + gzip.compress(b" " * (1 << 26)) * (16 * gigabytes)
+
+
+def _sparse(path: Path) -> None:
+    with open(path, "wb") as file:
+        file.truncate(20 << 30)
 
 
 # What is not an ordinary file, or not of ordinary size.
-def strange_files() -> dict[str, Callable[[Path], object]]:
-    def replaced(make):
-        def write(path: Path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)
-            make(path)
+STRANGE: dict[str, Callable[[Path], object]] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "random bytes": lambda path: path.write_bytes(np.random.default_rng(0).bytes(5000)),
+    "pipe": os.mkfifo,
+    "link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+    "20 GB of nothing": _sparse,
+    "link to itself": lambda path: path.symlink_to(path),
+    "missing": lambda path: None,
+}
 
-        return write
 
-    def sparse(path: Path):
-        with open(path, "wb") as file:
-            file.truncate(20 << 30)
+def strange(name: str, kind: str) -> Callable[[Path], object]:
+    """Return a function that replaces a file of the folder by a strange one."""
 
-    return {
-        "empty": replaced(lambda path: path.write_bytes(b"")),
-        "text": replaced(lambda path: path.write_text("hello")),
-        "random bytes": replaced(lambda path: path.write_bytes(np.random.default_rng(0).bytes(5000))),
-        "pipe": replaced(os.mkfifo),
-        "link to /dev/zero": replaced(lambda path: path.symlink_to("/dev/zero")),
-        "link to a terminal": replaced(lambda path: path.symlink_to("/dev/tty")),
-        "folder": replaced(lambda path: path.mkdir()),
-        "20 GB of nothing": replaced(sparse),
-        "link to itself": replaced(lambda path: path.symlink_to(path)),
-        "missing": replaced(lambda path: None),
-    }
+    def write(folder: Path):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).unlink(missing_ok=True)
+        STRANGE[kind](folder / name)
+
+    return write

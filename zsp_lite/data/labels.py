@@ -50,13 +50,13 @@ class PoseLabel:
 
     def __post_init__(self):
         trans = np.array(self.trans, dtype=np.float64)
-        if trans.shape != (4, 4) or not np.isfinite(trans).all():
-            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a finite 4x4 matrix")
+        check_magnitude(f"label of {self.seq}: trans", trans)
+        if trans.shape != (4, 4):
+            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a 4x4 matrix")
         rotation = trans[:3, :3]
         deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
         if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
             raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid transform")
-        check_magnitude(f"label of {self.seq}: trans", trans)
         object.__setattr__(self, "trans", trans)
 
 
