@@ -78,6 +78,7 @@ def test_the_page_on_solvers_has_the_confidences(runs):
         expected = [100 * confidence.mean(), 100 * right.mean(), 100 * measured.calibration_error]
         assert numbers(line)[:3] == pytest.approx(expected, abs=0.051)
         assert numbers(line)[3] == pytest.approx(measured.auroc, abs=0.0051)
+        assert numbers(line)[4] == pytest.approx(run.summary["methods"]["verified"]["best_two"]["acc30"], abs=0.051)
 
 
 def test_the_page_on_solvers_has_the_weights_and_the_calibration_of_the_code():
