@@ -38,7 +38,7 @@ def describe_failure(error: BaseException) -> str:
     return " ".join(f"{place}{type(error).__name__}: {error}".split())
 
 
-def check_integer(name: str, value: object, minimum: int, maximum: float = math.inf) -> None:
+def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:
     """Raise InputError if a value is not an integer from `minimum` to `maximum`."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not minimum <= value <= maximum:
         limits = f"of at least {minimum}" if maximum == math.inf else f"from {minimum} to {maximum}"
