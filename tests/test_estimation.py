@@ -254,4 +254,4 @@ def test_bad_input_is_one_line_with_the_cure_and_nothing_is_written(
     assert cli.main(["estimate", *(word.format(**names) for word in words)]) == 2
     captured = capsys.readouterr()
     assert message in captured.err and captured.err.count("\n") == 1 and captured.out == ""
-    assert not list(tmp_path.iterdir())
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
