@@ -43,7 +43,7 @@ from zsp_lite.verified.poses import (
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, propose_poses
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
-from zsp_lite.verified.soft_icp import evenly_spaced_indices, soft_icp
+from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
     ScoreTerms,
@@ -307,11 +307,6 @@ def test_a_pose_is_aligned_by_itself(scene, truth):
     start = concatenate([truth, poses_from_views(scene)])
     together = soft_icp(scene, start)
     np.testing.assert_allclose(soft_icp(scene, start[[1]]).rotation, together.rotation[[1]], atol=1e-4)
-
-
-def test_evenly_spaced_indices_are_evenly_spaced():
-    assert evenly_spaced_indices(10, 4).tolist() == [0, 2, 5, 7]
-    assert evenly_spaced_indices(3, 10).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("scale", "reached"), [(0.3, 0.5), (0.6, 0.6), (1.8, 1.8), (3.0, 2.0)])

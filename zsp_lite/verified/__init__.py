@@ -10,8 +10,6 @@ all of them have depth, so a pose can be tested in every view. Each stage is a f
     refinement    random search that increases the score
     solver        the ranked hypotheses, and the `VerifiedSolver` that runs all stages
     confidence    calibrated probability that a hypothesis is correct
-
-docs/solvers.md compares it with the paper's solver.
 """
 
 from zsp_lite.verified.solver import Solution, VerifiedSolver

@@ -20,8 +20,7 @@ from jaxtyping import Float, Int
 
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
 MODE_ANGLE = 30.0
-# Another pose is nearly as probable as the best one above this fraction of its probability.
-TIE_RATIO = float(np.exp(-1))
+TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, another pose is nearly as probable
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,6 @@ def build_maps(
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
     origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
-    lengths = [table.shape[1] for table in tables]
     sizes = np.array([camera.size[::-1] for camera in cameras])
     translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(
@@ -79,7 +78,7 @@ def build_maps(
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
         float_tensor(sizes),
-        torch.from_numpy(np.cumsum([0, *lengths[:-1]])),
+        torch.from_numpy(np.cumsum([0, *(table.shape[1] for table in tables[:-1])])),
         torch.from_numpy(np.concatenate(tables, axis=1)).T,
         float_tensor([view.frame.camera.size[::-1] for view in views] / sizes),
     )

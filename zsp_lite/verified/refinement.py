@@ -46,10 +46,7 @@ POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, s
 def refine_coarse_to_fine(
     scene: Scene, poses: Poses, weights: ScoreWeights, seed: int | np.random.Generator = 0
 ) -> Poses:
-    """Refine poses in three searches of decreasing width, with non-maximum suppression in between.
-
-    Scores are computed from a subset of the points.
-    """
+    """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
     rng = np.random.default_rng(seed)
     score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):

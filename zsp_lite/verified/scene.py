@@ -28,8 +28,7 @@ from zsp_lite.views import View
 _OUTLIER_DISTANCE = 3.0
 _DENSITY_SIGMA = 0.25  # working units
 _DENSITY_ROWS = 200  # points at a time
-# Fewer points do not determine a shape to align.
-MIN_POINTS = 8
+MIN_POINTS = 8  # fewer do not determine a shape to align
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,6 @@ point that is near and similar has nearly no influence. \sigma decreases geometr
 
 import numpy as np
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, nearest_rotation
 from zsp_lite.verified.scene import Scene
@@ -27,8 +25,8 @@ _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 
 def soft_icp(scene: Scene, poses: Poses) -> Poses:
     """Align every pose to the local optimum, independently of the others."""
-    rows = evenly_spaced_indices(len(scene.reference_points), _MAX_POINTS[0])
-    columns = evenly_spaced_indices(len(scene.target_points), _MAX_POINTS[1])
+    totals = len(scene.reference_points), len(scene.target_points)
+    rows, columns = (torch.arange(min(n, most)) * n // min(n, most) for n, most in zip(totals, _MAX_POINTS))
     source, target = scene.reference_points[rows], scene.target_points[columns]
     feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
     target_square = target.square().sum(dim=1)
@@ -51,8 +49,3 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         rotated_mean = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * rotated_mean)
     return poses
-
-
-def evenly_spaced_indices(n: int, max_count: int) -> Int[Tensor, " count"]:
-    """Select at most `max_count` of the indices 0 to n - 1, evenly spaced."""
-    return torch.arange(min(n, max_count)) * n // min(n, max_count)

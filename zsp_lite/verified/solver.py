@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from zsp_lite.best_view import ViewPair
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
@@ -106,30 +106,25 @@ class VerifiedSolver:
                 terms = score_terms(scene, poses)
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
-                hypotheses = self._hypotheses(scene, poses, terms, order)
+                angles = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
+                hypotheses = self._hypotheses(scene, poses, terms, angles.argmin(axis=1), order)
         view_angles = np.empty(len(order))
-        view_angles[list(order)] = _view_angles(scene, poses)[0]
+        view_angles[list(order)] = angles[0]
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
 
     def _hypotheses(
-        self, scene: Scene, poses: Poses, terms: ScoreTerms, order: Sequence[int]
+        self, scene: Scene, poses: Poses, terms: ScoreTerms, views: Int[np.ndarray, " m"], order: Sequence[int]
     ) -> tuple[Hypothesis, ...]:
-        """Build the hypotheses of ranked poses."""
+        """Build the hypotheses of ranked poses, each with the view of the scene that is closest under it."""
         score, shape_fit = (one.score(terms).double().numpy() for one in (self.weights, self.weights.of_shape()))
         mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
         confidence = hypothesis_probabilities(
             score, mode, len(order), scene.view_similarity_std, shape_fit[0], self.calibration
         )
-        views = _view_angles(scene, poses).argmin(axis=1)
         sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views)]
         named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
         parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
         return tuple(Hypothesis(*one) for one in zip(*parts))
-
-
-def _view_angles(scene: Scene, poses: Poses) -> Float[np.ndarray, "m v"]:
-    """Compute the angle in degrees between the reference's camera under each pose and each target view's."""
-    return rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
 
 
 def reliability_flags(

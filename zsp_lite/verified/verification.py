@@ -50,8 +50,7 @@ SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
-# Projected points at a time, so that intermediate results stay in the processor's cache.
-_CHUNK = 250_000
+_CHUNK = 250_000  # projected points at a time, so that intermediate results stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
