@@ -145,7 +145,7 @@ def _list_methods() -> None:
         "tables outputs/benchmark",
         "tables outputs/seed0 outputs/seed1 outputs/seed2",
         "tables results.json.gz --out outputs/tables",
-        "tables notebooks/results/paper_run/results.json.gz --into docs/results.md",
+        "tables notebooks/results/paper_run/procedural.json.gz --into docs/results.md",
     )
 )
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="RUN...")
