@@ -121,7 +121,7 @@ class VerifiedSolver:
         confidence = hypothesis_probabilities(
             score, mode, len(order), scene.view_similarity_std, shape_fit[0], self.calibration
         )
-        sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views)]
+        sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
         named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
         parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
         return tuple(Hypothesis(*one) for one in zip(*parts))
