@@ -96,7 +96,7 @@ def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
     assert description(METHODS["ours-k30"]) == "backbone; pose; k=30"
     assert description(METHODS["verified-mask-n3"]) == "backbone; pose; foreground=mask, solver=verified; 3 views"
     rows = resolve(
-        {"own": own_method, "matcher": Method(settings={"matcher": one_way}), "object": ZeroShotPose(None, k=7)}
+        {"own": own_method, "matcher": Method(settings={"matcher": one_way}), "object": ZeroShotPose(BACKBONE, k=7)}
     )
     own, matcher, estimator = map(description, rows.values())
     assert own == "backbone; pose; benchmark_folder:own_method"

@@ -215,7 +215,7 @@ def test_a_document_gets_the_tables_that_it_has_marks_for(run):
 
 def test_the_tables_of_the_documentation_are_those_of_the_stored_run():
     repository = Path(__file__).parents[1]
-    summary = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz").summary
+    summary = read_results(repository / "notebooks" / "results" / "paper_run" / "procedural.json.gz").summary
     text = (repository / "docs" / "results.md").read_text()
     assert insert_tables(text, every_table(summary), summary["methods"]["ours"]["n"]) == text
     assert set(GROUPS["all"]) <= summary["methods"].keys() and len(summary["data"]["categories"]) == 20
@@ -331,7 +331,7 @@ def test_runs_on_different_objects_are_pooled(tmp_path):
 
 def test_exports_of_the_stored_run_can_be_pooled(tmp_path):
     repository = Path(__file__).parents[1]
-    stored = read_results(repository / "notebooks" / "results" / "paper_run" / "results.json.gz")
+    stored = read_results(repository / "notebooks" / "results" / "paper_run" / "procedural.json.gz")
     paths = []
     for part in (0, 1):
         rows = {"ours": dict(list(stored.rows["ours"].items())[part:200:2])}

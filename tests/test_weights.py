@@ -57,7 +57,7 @@ def test_the_log_of_its_last_run_is_complete_and_of_the_same_network():
 
 def test_it_was_trained_on_none_of_the_categories_that_it_is_judged_by():
     words = set(re.findall(r"\w+", (TINY.parent / "MODEL_CARD.md").read_text().partition("## Figures")[0]))
-    assert (TRAINING | VALIDATION).keys() <= words
+    assert TRAINING.keys() <= words
     assert not TRAINING.keys() & (EVALUATION | VALIDATION).keys()
     assert {path.name for path in sample_data().iterdir() if path.name in GENERATORS} <= EVALUATION.keys()
 

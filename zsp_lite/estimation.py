@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
+from zsp_lite.backbones.pretrained import DEFAULT
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.data.labels import read_labels
@@ -137,7 +138,7 @@ def estimate_pose(
     targets: int = 5,
     mask: str | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
-    backbone: str | BackboneConfig | FeatureExtractor = "zsp-tiny-photo",
+    backbone: str | BackboneConfig | FeatureExtractor = DEFAULT,
     out: str | Path | None = None,
     upright: bool = True,
 ) -> OwnPair:

@@ -5,7 +5,7 @@
 distinguishable with colour-vision deficiencies.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -293,7 +293,7 @@ def draw_axes(
 
 
 def draw_moved_cloud(
-    axes: Sequence[Axes],
+    axes: Iterable[Axes],
     cameras: Sequence[Camera],
     cloud: Real[np.ndarray, "n 3"],
     poses: Sequence[Sim3],

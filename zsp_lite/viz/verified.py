@@ -326,21 +326,6 @@ def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.nda
     return figure
 
 
-def show_accuracy_intervals(accuracy: Mapping[str, tuple[float, float, float]], first: int = 1) -> Figure:
-    """Show (accuracy, low, high) in per cent by method, the `first` ones in orange; a line marks the next one."""
-    figure, axis = plt.subplots(figsize=(8, 0.9 + 0.3 * len(accuracy)), layout="constrained")
-    for row, (value, low, high) in enumerate(accuracy.values()):
-        marker, colour = ("s", ORANGE) if row < first else ("o", BLUE)
-        axis.plot([low, high], [row, row], color="0.4", linewidth=1.5)
-        axis.plot(value, row, marker, color=colour, markeredgecolor="black")
-    if len(accuracy) > first:
-        axis.axvline(list(accuracy.values())[first][0], color="0.6", linestyle=":")
-    axis.set(xlabel="pairs within 30 degrees (per cent), with 95 % intervals", xlim=(0, 100))
-    axis.set_yticks(range(len(accuracy)), accuracy)
-    axis.invert_yaxis()
-    return figure
-
-
 def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> Figure:
     """Show a reliability diagram, and the accuracy among the most confident answers against their share."""
     measured = reliability(confidence, correct, bins=max(2, min(10, len(correct) // 20)))
