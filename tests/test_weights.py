@@ -45,12 +45,12 @@ def test_it_loads_strictly_into_a_plain_dino_transformer():
 
 
 def test_the_log_of_its_last_run_is_complete_and_of_the_same_network():
-    config = json.loads((WEIGHTS / "config-4.json").read_text())
+    config = json.loads((WEIGHTS / "config.json").read_text())
     model = load_backbone("zsp-tiny", device="cpu").model
     assert {name: config[name] for name in ("embed_dim", "depth", "num_heads")} == {
         name: getattr(model, name) for name in ("embed_dim", "depth", "num_heads")
     }
-    rows = [json.loads(line) for line in (WEIGHTS / "log-4.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (WEIGHTS / "log.jsonl").read_text().splitlines()]
     assert rows[-1]["step"] == sum(stage["steps"] for stage in config["stages"])
     assert rows[-1]["held_out_iou"] > rows[9]["held_out_iou"] > 0
 

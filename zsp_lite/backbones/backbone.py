@@ -1,7 +1,6 @@
 """A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,8 +9,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from zsp_lite.backbones.facets import Facet, block_index, check_facet
-from zsp_lite.backbones.huggingface import nearest_multiple
-from zsp_lite.backbones.vit import Tokens
+from zsp_lite.backbones.huggingface import HuggingFaceViT, nearest_multiple
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import FeatureMap
 
@@ -19,24 +18,6 @@ Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-
-
-@runtime_checkable
-class TransformerNetwork(Protocol):
-    """A `torch.nn.Module` with these members, such as `vit.VisionTransformer`, which documents them.
-
-    A network whose images must have sides that are multiples of more than the patch size has an attribute `multiple`.
-    """
-
-    image_size: int
-    patch_size: int
-    embed_dim: int
-    depth: int
-    num_heads: int
-
-    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int, facet: Facet) -> Tokens:
-        """Compute patch descriptors, CLS attention and CLS output."""
-        ...
 
 
 class Backbone:
@@ -52,8 +33,8 @@ class Backbone:
         device: Default: the GPU if there is one, else the CPU.
         batch_size: Number of images in one forward pass.
         facet: Activation of the block used as descriptor; the paper's is "key".
-        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size, or of the
-            model's `multiple`. Default: the model's.
+        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default:
+            the model's.
         mean, std: Normalisation of RGB values in [0, 1].
 
     Attributes:
@@ -68,7 +49,7 @@ class Backbone:
 
     def __init__(
         self,
-        model: TransformerNetwork,
+        model: VisionTransformer | HuggingFaceViT,
         name: str,
         layer: int | str | None = None,
         saliency_heads: Sequence[int] | None = None,
@@ -93,8 +74,7 @@ class Backbone:
         self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
         self.batch_size = batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
-        multiple = getattr(model, "multiple", model.patch_size)
-        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, multiple)
+        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
         self.device = choose_device(device)
         self.model = model.to(self.device).eval().requires_grad_(False)
 

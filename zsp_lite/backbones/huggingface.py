@@ -270,10 +270,9 @@ def _attend(
     from transformers import AttentionInterface
 
     if (rows := getattr(module, _ROWS, None)) is not None:
-        with torch.autocast(query.device.type, enabled=False):
-            scale = query.shape[-1] ** -0.5 if scaling is None else scaling
-            logits = ((query[:, :, :1].float() * scale) @ key.float().transpose(-1, -2))[:, :, 0]
-            rows.append((logits if attention_mask is None else logits + attention_mask[:, :, 0]).softmax(-1))
+        scale = query.shape[-1] ** -0.5 if scaling is None else scaling
+        logits = ((query[:, :, :1] * scale) @ key.transpose(-1, -2))[:, :, 0]
+        rows.append((logits if attention_mask is None else logits + attention_mask[:, :, 0]).softmax(-1))
     return AttentionInterface()["sdpa"](module, query, key, value, attention_mask, scaling=scaling, **options)
 
 

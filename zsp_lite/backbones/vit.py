@@ -92,22 +92,14 @@ class Attention(nn.Module):
     ) -> Float[Tensor, "batch m dim"]:
         """Attend from each query to all keys and apply the output projection; heads are slices of the last axis."""
         q, k, v = self.split_heads(q), self.split_heads(k), self.split_heads(v)
-        if torch.is_grad_enabled() and q.device.type == "cpu":
-            # Forward and backward pass in bfloat16 (24 x 257 tokens): 30 ms with explicit products, 74 ms with the
-            # fused function. Without gradients the fused function is faster and never stores the attention matrix.
-            with torch.autocast("cpu", enabled=False):
-                out = ((q * self.scale) @ k.transpose(-1, -2)).softmax(-1) @ v
-        else:
-            out = F.scaled_dot_product_attention(q, k, v)
-        return self.proj(out.transpose(1, 2).flatten(2))
+        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
     def cls_logits(
         self, q: Float[Tensor, "batch m dim"], k: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch heads n"]:
-        """Return the scaled attention logits of the first query (the CLS token) for all keys, in float32."""
+        """Return the scaled attention logits of the first query (the CLS token) for all keys."""
         q, k = self.split_heads(q[:, :1]), self.split_heads(k)
-        with torch.autocast(q.device.type, enabled=False):
-            return ((q.float() * self.scale) @ k.float().transpose(-1, -2))[:, :, 0]
+        return ((q * self.scale) @ k.transpose(-1, -2))[:, :, 0]
 
 
 class Mlp(nn.Module):

@@ -23,11 +23,13 @@ SEED = click.IntRange(min=0)
 
 
 class _Path(click.Path):
-    """A path as `pathlib.Path`; null bytes, which no file system has, are refused."""
+    """A path as `pathlib.Path`; an empty one, and null bytes, which no file system has, are refused."""
 
     def convert(self, value, parameter, context):
         if "\0" in str(value):
             self.fail(f"got {value!r}, expected a path without null bytes", parameter, context)
+        if not str(value):
+            self.fail("got an empty path", parameter, context)
         return Path(super().convert(value, parameter, context))
 
 

@@ -77,5 +77,5 @@ def _data(name: str, folder: Path, dataset: type) -> Check:
     if categories:
         listed = ", ".join(categories[:6]) + (", ..." if len(categories) > 6 else "")
         return Check(f"data: {name}", OK, f"{folder}: {len(categories)} categories ({listed})")
-    fix = "zsp-lite demo (makes them once)" if sample else f"set {name} to a CO3D folder"
+    fix = "zsp-lite demo (makes them once)" if sample else f"give {name} a CO3D folder"
     return Check(f"data: {name}", NOTE if sample else BAD, problem, fix)

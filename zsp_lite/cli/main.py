@@ -30,7 +30,7 @@ SYNTHETIC_NOTE = (
     "synthetic objects, composed of primitives by zsp_lite.synthetic and rendered with depth holes and soft masks "
     "as in CO3D."
 )
-MODELS_NOTE = "3D models, rendered by zsp_lite.synthetic with depth holes and soft masks as in CO3D."
+MODELS_NOTE = "renderings of 3D models, with depth holes and soft masks as in CO3D."
 USER_NOTE = "the given folder in CO3D's layout."
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 

@@ -212,8 +212,7 @@ def tram(a: Assembly) -> None:
     a.add(box((0.05, w * 0.7, 0.03), arm), 3)
 
 
-# The last four are long bodies whose ends differ only in details. They measure errors of half a turn (see the model
-# card).
+# The last four are long bodies whose ends differ only in details. They measure errors of half a turn.
 VALIDATION = {
     generator.__name__: generator
     for generator in (

@@ -126,8 +126,6 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
 
 def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
     """Average each foreground patch's highest similarity in the other view, in both directions."""
-    if not similarity.numel():
-        return similarity.newfloat_tensor(-1.0)
     return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
 
 
