@@ -25,20 +25,6 @@ def test_the_bits_are_those_of_a_float16():
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
 
 
-def test_fewer_bits_round_to_the_nearest_value_and_keep_unknown_pixels():
-    depth = np.random.default_rng(0).uniform(0.5, 50, (20, 30)) * (np.random.default_rng(1).random((20, 30)) < 0.9)
-    encoded = encode_depth(depth, bits=7)
-    assert not (encoded & 0b111).any() and ((encoded == 0) == (depth == 0)).all()
-    np.testing.assert_allclose(decode_depth(encoded), depth, rtol=2**-8 + 2**-11)
-    assert abs((decode_depth(encoded)[depth > 0] / depth[depth > 0]).mean() - 1) < 3e-4
-
-
-@pytest.mark.parametrize("bits", [0, 11, 7.0])
-def test_a_precision_out_of_range_is_an_input_error(bits):
-    with pytest.raises(InputError, match=f"bits is {bits}, expected an integer"):
-        encode_depth(np.ones((2, 2)), bits=bits)
-
-
 def test_values_that_are_not_positive_and_finite_are_unknown():
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
     assert not decode_depth(np.array([[infinite, nan, negative, 0]], np.uint16)).any()

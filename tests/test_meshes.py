@@ -95,7 +95,7 @@ def test_edges_of_a_box_stay_sharp_and_an_ellipsoid_is_smooth(tmp_path):
     cube = box((1, 2, 3))
     sharp = painted(cube)
     assert np.abs(sharp.normals).max(-1) == pytest.approx(np.ones((12, 3)))
-    ball = ellipsoid((1, 1, 1), sides=32, rings=24)
+    ball = ellipsoid((1, 1, 1), sides=32)
     smooth = painted(ball)
     corners = ball.vertices[ball.faces]
     along = np.abs((smooth.normals * corners).sum(-1) / np.linalg.norm(corners, axis=-1))

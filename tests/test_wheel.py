@@ -14,7 +14,6 @@ import pytest
 from zsp_lite.data import samples
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic.export import RENDERER
 
 REPOSITORY = Path(__file__).parents[1]
 FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
@@ -64,7 +63,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     assert run.returncode == 0, run.stderr
     assert run.stderr.count("making synthetic samples") == 1
     assert "Photographed motorcycle" in run.stdout and (empty / "outputs/demo/report.html").is_file()
-    assert [path.name for path in cache.iterdir()] == [f"samples-{RENDERER}"]
+    assert [path.name for path in cache.iterdir()] == ["samples"]
 
 
 def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_path, monkeypatch):
@@ -84,7 +83,7 @@ def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_
     monkeypatch.setattr(samples.subprocess, "run", synth)
     with pytest.raises(KeyboardInterrupt):
         samples.sample_data()
-    made = tmp_path / "cache" / f"samples-{RENDERER}"
+    made = tmp_path / "cache" / "samples"
     assert samples.find_sample_data() == made and not made.exists()
     assert samples.sample_data() == made
     assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]

@@ -70,11 +70,6 @@ class FrameKey(msgspec.Struct, frozen=True, gc=False):
     frame_number: int
 
 
-class VideoAnnotation(msgspec.Struct, frozen=True, gc=False):
-    path: str
-    length: float | None = None  # s
-
-
 class PointCloudAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
     quality_score: float | None = None
@@ -84,7 +79,7 @@ class PointCloudAnnotation(msgspec.Struct, frozen=True, gc=False):
 class SequenceAnnotation(msgspec.Struct, frozen=True):
     sequence_name: str
     category: str
-    video: VideoAnnotation | None = None
+    video: dict | None = None
     point_cloud: PointCloudAnnotation | None = None
     viewpoint_quality_score: float | None = None
 

@@ -291,7 +291,6 @@ def write_co3d(
     sequences: Iterable[SequenceData],
     quality: int = 92,
     intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
-    depth_bits: int = 10,
 ) -> None:
     """Write sequences into `root / category` in CO3D's layout; the same input gives the same bytes.
 
@@ -305,7 +304,6 @@ def write_co3d(
         sequences: The sequences.
         quality: JPEG quality, 0 to 100.
         intrinsics_format: "ndc_norm_image_bounds" (v1) or "ndc_isotropic" (v2).
-        depth_bits: Bits of the mantissa of stored depth to keep, 1 to 10. Less precise depth makes smaller files.
 
     Raises:
         InputError: A name is not a plain folder name, the parts of a sequence do not fit together, or another process
@@ -324,7 +322,7 @@ def write_co3d(
             listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in raws]
 
         for sequence in sequences:
-            annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format, depth_bits)
+            annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
             kept = [position for position, key in enumerate(keys) if key.sequence_name != sequence.name]
             entries = [entries[position] for position in kept] + annotations
             keys = [keys[position] for position in kept]
@@ -335,7 +333,7 @@ def write_co3d(
 
 
 def _write_sequence(
-    root: Path, category: str, sequence: SequenceData, quality: int, intrinsics_format: str, depth_bits: int
+    root: Path, category: str, sequence: SequenceData, quality: int, intrinsics_format: str
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     if len(sequence.frames) != len(sequence.timestamps):
@@ -349,7 +347,7 @@ def _write_sequence(
         if frame.depth is not None:
             path, mask_path = f"{base}/depths/{stem}.jpg.geometric.png", f"{base}/depth_masks/{stem}.png"
             depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment, depth_bits)
+            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
             write_binary_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every machine.

@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number
+from zsp_lite.errors import InputError, check_magnitude, check_number
+
+_INPAINT_RADIUS = 3  # pixels
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
@@ -27,35 +29,19 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def encode_depth(
-    depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
-) -> UInt16[np.ndarray, "h w"]:
-    """Encode depth as the bits of float16 values; the inverse of `decode_depth`.
-
-    Args:
-        depth: Depth, 0 where unknown.
-        scale_adjustment: Factor applied to the decoded depth.
-        bits: Bits of the mantissa to keep, 1 to 10. The relative precision is 2^-(bits + 1); files with fewer bits
-            are smaller.
-
-    Raises:
-        InputError: `bits` is out of its range.
-    """
-    check_integer("bits", bits, 1, 10)
+def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> UInt16[np.ndarray, "h w"]:
+    """Encode depth (0 where unknown) as the bits of float16 values; the inverse of `decode_depth`."""
     depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
-    encoded = np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
-    step = np.uint16(1 << (10 - bits))
-    return (encoded + step // 2) // step * step
+    return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
 
 
-def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np.ndarray, "h w"]:
+def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting.
 
     Args:
         depth: (H, W) depth, 0 where unknown.
-        radius: Radius of the neighbourhood, pixels.
 
     Returns:
         (H, W) depth, float32. Known pixels are unchanged; filled ones are clipped to the range of the known depths.
@@ -70,7 +56,7 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"], radius: float = 3) -> Float[np
     if known.all():
         return depth.copy()
     low, high = depth[known].min(), depth[known].max()
-    filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), radius, cv2.INPAINT_NS)
+    filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), _INPAINT_RADIUS, cv2.INPAINT_NS)
     filled = np.nan_to_num(filled, nan=low)  # OpenCV divides by weights that can be 0
     return np.where(known, depth, filled.clip(low, high))
 

@@ -224,14 +224,9 @@ def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
     _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
 
 
-def write_depth(
-    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0, bits: int = 10
-) -> None:
-    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth / scale_adjustment`.
-
-    `bits` is the number of bits of the mantissa to keep, see `zsp_lite.data.depth.encode_depth`.
-    """
-    _encode(path, ".png", encode_depth(depth, scale_adjustment, bits), [])
+def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> None:
+    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth / scale_adjustment`."""
+    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
 
 
 def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:

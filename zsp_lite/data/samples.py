@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 DATA_VARIABLE = "ZSP_LITE_DATA"  # environment variable with the path of the user's CO3D folder
 REPOSITORY = Path(__file__).resolve().parents[2]
-MADE_SAMPLES = "samples-2"  # in the cache; the number is that of the renderer, `synthetic.export.RENDERER`
+MADE_SAMPLES = "samples"  # in the cache
 
 PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was

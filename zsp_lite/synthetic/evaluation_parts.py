@@ -8,11 +8,12 @@ from zsp_lite.synthetic.primitives import Mesh, cylinder, extrusion, rod
 Y = (0.0, 1.0, 0.0)
 
 
-def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0, cells: int = 10) -> Mesh:
+def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0) -> Mesh:
     """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10.
 
-    Each side of a cube becomes a grid of `cells` x `cells`, denser at the edges, where the curvature is largest.
+    Each side of a cube becomes a grid of 10 x 10 cells, denser at the edges, where the curvature is largest.
     """
+    cells = 10
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, cells + 1))
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
     i, j = (grid.ravel() for grid in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))

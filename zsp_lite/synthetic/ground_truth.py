@@ -158,17 +158,13 @@ def correct_matches(
     return np.abs(np.asarray(cells) - true_cells).max(axis=-1) <= tolerance
 
 
-def ground_truth_pair(dataset: Co3D, pair: Pair, grid: tuple[int, int] = (28, 28)) -> GroundTruthPair:
-    """Load a pair with its ground-truth matches, for the target view that has the most of them.
-
-    Args:
-        dataset: Synthetic export.
-        pair: Evaluation pair.
-        grid: Patches (rows, columns).
+def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
+    """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has the most of them.
 
     Raises:
         InputError: The folder is not a synthetic export, or lacks a frame of the pair.
     """
+    grid = (28, 28)
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)
     reference, targets = object_crop(reference), [object_crop(target) for target in targets]

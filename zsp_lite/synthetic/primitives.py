@@ -72,9 +72,9 @@ def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
     return lathe([[1e-4, -height / 2], [bottom, -height / 2], [top, height / 2], [1e-4, height / 2]], sides)
 
 
-def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18, rings: int = 12) -> Mesh:
+def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18) -> Mesh:
     """Return an axis-aligned ellipsoid with the given radii (3,)."""
-    t = np.linspace(-np.pi / 2, np.pi / 2, rings)
+    t = np.linspace(-np.pi / 2, np.pi / 2, 12)
     unit = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
     return unit.scaled(radii).translated(centre)
 
@@ -100,8 +100,9 @@ def capsule(start, end, radius: float, end_radius: float | None = None, sides: i
 
 
 def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start: float = 0.0, stop: float = TAU,
-          sides: int = 24, tube_sides: int = 10) -> Mesh:  # fmt: skip
+          sides: int = 24) -> Mesh:  # fmt: skip
     """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
+    tube_sides = 10
     closed = abs(stop - start - TAU) < 1e-6
     p, q = np.meshgrid(np.linspace(start, stop, sides, endpoint=not closed),
                        np.linspace(0, TAU, tube_sides, endpoint=False), indexing="ij")  # fmt: skip

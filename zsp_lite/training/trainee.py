@@ -84,9 +84,9 @@ def initial_backbone(
     return backbone
 
 
-def _sine_cosine_embedding(dim: int, side: int, span: float = 12.0) -> Float[Tensor, "n dim"]:
+def _sine_cosine_embedding(dim: int, side: int) -> Float[Tensor, "n dim"]:
     """Position embedding of a grid of side x side patches, row by row."""
-    centre = (torch.arange(side) + 0.5) / side * span
+    centre = (torch.arange(side) + 0.5) / side * 12
     wave = torch.exp(-math.log(60) * torch.arange(dim // 4) / (dim // 4))
     y, x = torch.meshgrid(centre, centre, indexing="ij")
     return torch.cat([f(p[..., None] * wave) for p in (y, x) for f in (torch.sin, torch.cos)], -1).flatten(0, 1)
