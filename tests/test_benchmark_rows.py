@@ -123,7 +123,7 @@ def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatc
     assert summary["methods"]["posecontrast"]["median"] < 1e-5
 
 
-def test_convolutional_features_are_matched_as_mutual_neighbours(tmp_path, monkeypatch):
+def test_swav_is_matched_as_mutual_neighbours(tmp_path, monkeypatch):
     monkeypatch.setitem(extractors.EXTRACTORS, "swav", lambda backbone: BACKBONE)
     summary = evaluate(small_folder(), BACKBONE, ["swav"], 4, 5, out=tmp_path, categories=["pebble"])
     assert summary["methods"]["swav"]["acc30"] >= 75

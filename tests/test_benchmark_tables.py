@@ -415,7 +415,7 @@ def read_results_of(out, rows):
 
 
 def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
-    with pytest.raises(InputError, match="reliability: no row has fewer than 20 confidences"):
+    with pytest.raises(InputError, match="reliability: no row has 20 confidences"):
         reliability_diagram(read_once(run[0]))
     rng = np.random.default_rng(0)
     sure = rng.random(200)

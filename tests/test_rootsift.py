@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from zsp_lite.baselines import rootsift
 from zsp_lite.baselines.rootsift import RootSift, dense_sift
 from zsp_lite.errors import InputError
 from zsp_lite.matching import match
@@ -32,9 +33,10 @@ def test_a_key_describes_the_patch_at_its_grid_position(picture):
     np.testing.assert_allclose(RootSift()([picture])[0].keys[9, 17], root, atol=1e-6)
 
 
-def test_a_shifted_picture_matches_at_the_shift(picture):
+def test_a_shifted_picture_matches_at_the_shift(picture, monkeypatch):
+    monkeypatch.setattr(rootsift, "KEYPOINT_SIZE", 4.0)  # small, because the shift is cyclic
     shifted = np.roll(picture, (16, 24), axis=(0, 1))  # two patches down, three to the right
-    ref, target = RootSift(keypoint_size=4.0)([picture, shifted])  # small, because the shift is cyclic
+    ref, target = RootSift()([picture, shifted])
     inner = torch.zeros(28, 28, dtype=torch.bool)
     inner[6:20, 6:20] = True
     matches = match(ref, target, k=30, ref_foreground=inner)

@@ -70,10 +70,7 @@ def mutual_nearest_neighbours(
 
 
 def dual_softmax(
-    similarity: Float[Tensor, "n1 n2"],
-    foreground1: Bool[Tensor, " n1"],
-    foreground2: Bool[Tensor, " n2"],
-    temperature: float = SOFTMAX_TEMPERATURE,
+    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
     """Match each patch with the partner of highest probability under a dual softmax (Cheng et al. 2021).
 
@@ -81,7 +78,7 @@ def dual_softmax(
     """
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
-        sharp = sim / temperature
+        sharp = sim / SOFTMAX_TEMPERATURE
         # The sum of logarithms keeps the order where a product of small probabilities would underflow.
         best, partner = (sharp.log_softmax(0) + sharp.log_softmax(1)).max(dim=1)
         return partner, best
@@ -90,11 +87,7 @@ def dual_softmax(
 
 
 def optimal_transport(
-    similarity: Float[Tensor, "n1 n2"],
-    foreground1: Bool[Tensor, " n1"],
-    foreground2: Bool[Tensor, " n2"],
-    regularisation: float = TRANSPORT_REGULARISATION,
-    steps: int = TRANSPORT_STEPS,
+    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
 ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
     """Match each patch with the partner that receives most of its mass under optimal transport (Liu et al. 2020).
 
@@ -102,7 +95,7 @@ def optimal_transport(
     """
 
     def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
-        best, partner = sinkhorn(1 - sim, regularisation, steps).max(dim=1)
+        best, partner = sinkhorn(1 - sim, TRANSPORT_REGULARISATION, TRANSPORT_STEPS).max(dim=1)
         return partner, best
 
     return _match_foreground(choose, similarity, foreground1, foreground2)

@@ -73,7 +73,6 @@ class PoseContrast:
     """Estimator of absolute viewpoints."""
 
     name = "posecontrast"
-    device = torch.device("cpu")
 
     def __init__(self, network: ResNet50, head: ViewpointHead):
         self.network, self.head = network.eval().requires_grad_(False), head.eval().requires_grad_(False)

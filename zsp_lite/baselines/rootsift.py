@@ -1,7 +1,7 @@
 """Dense RootSIFT descriptors on the patch grid, in place of the features of a network.
 
 All descriptors are upright and their centres form a grid, so the weights of the histograms are separable in rows and
-columns. Two small matrix products compute all descriptors, 60 times faster than OpenCV's loop over keypoints.
+columns. Two small matrix products compute all descriptors, faster than OpenCV's loop over keypoints.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from zsp_lite.backbones.backbone import Image, prepare_images
 from zsp_lite.features import FeatureMap
 
+KEYPOINT_SIZE = 24.0  # pixels
 _CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
 # OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5), clipping, scale.
@@ -34,12 +35,6 @@ class RootSift:
     has_saliency = False
     image_size = 224
     patch_size = 8
-    embed_dim = 128
-    device = torch.device("cpu")
-
-    def __init__(self, keypoint_size: float = 24.0):
-        """Create the extractor; a descriptor covers 4 x 4 cells of 1.5 times `keypoint_size` pixels."""
-        self.keypoint_size = keypoint_size
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]; InputError for others."""
@@ -50,7 +45,7 @@ class RootSift:
         grey = cv2.cvtColor(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
         side = self.image_size // self.patch_size
         centres = (np.arange(side) + 0.5) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
-        histograms = dense_sift(grey, centres, self.keypoint_size)
+        histograms = dense_sift(grey, centres, KEYPOINT_SIZE)
         total = histograms.sum(axis=-1, keepdims=True)
         keys = torch.from_numpy(np.sqrt(histograms / np.maximum(total, 1e-12)).astype(np.float32))
         mean = torch.nn.functional.normalize(keys.mean((0, 1)), dim=0)

@@ -32,7 +32,6 @@ class Swav:
     name = "swav"
     has_saliency = False
     image_size = 448
-    device = torch.device("cpu")
 
     def __init__(self, model: ResNet50):
         self.model = model.eval().requires_grad_(False)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
@@ -13,29 +12,7 @@ from zsp_lite.baselines.rootsift import RootSift
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.baselines.swav import load_swav
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureMap
-
-Extractor = Callable[[list[np.ndarray]], list[FeatureMap]]
-
-# Functions that make an extractor from the backbone under test. An extractor is called on a list of images, or, if it
-# has the method `describe`, on a list of frames.
-EXTRACTORS: dict[str, Callable[[Any], Any]] = {
-    "none": lambda backbone: None,  # for rows that use depth only
-    "backbone": lambda backbone: backbone,
-    "random": lambda backbone: random_backbone(backbone),
-    "rootsift": lambda backbone: RootSift(),
-    "sift": lambda backbone: Sift(),
-    "swav": lambda backbone: load_swav(),
-    "posecontrast": lambda backbone: load_posecontrast(),
-}
-
-
-def make_extractors(backbone: Extractor, names: Iterable[str]) -> dict[str, Any]:
-    """Make extractors by name."""
-    names = list(dict.fromkeys(names))
-    if unknown := [name for name in names if name not in EXTRACTORS]:
-        raise InputError(f"features {unknown}: expected some of {', '.join(EXTRACTORS)}")
-    return {name: EXTRACTORS[name](backbone) for name in names}
+from zsp_lite.features import FeatureExtractor
 
 
 def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
@@ -48,3 +25,24 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
         fresh = VisionTransformer(model.image_size, model.patch_size, model.embed_dim, model.depth, model.num_heads)
     same = dict(facet=like.facet, image_size=like.image_size, mean=like.mean, std=like.std)
     return Backbone(fresh, f"random like {like.name}", like.layer, like.saliency_heads, like.device, **same)
+
+
+# Functions that make an extractor from the backbone under test. An extractor is called on a list of images, or, if it
+# has the method `describe`, on a list of frames.
+EXTRACTORS: dict[str, Callable[[Any], Any]] = {
+    "none": lambda backbone: None,  # for rows that use depth only
+    "backbone": lambda backbone: backbone,
+    "random": random_backbone,
+    "rootsift": lambda backbone: RootSift(),
+    "sift": lambda backbone: Sift(),
+    "swav": lambda backbone: load_swav(),
+    "posecontrast": lambda backbone: load_posecontrast(),
+}
+
+
+def make_extractors(backbone: FeatureExtractor, names: Iterable[str]) -> dict[str, Any]:
+    """Make extractors by name."""
+    names = list(dict.fromkeys(names))
+    if unknown := [name for name in names if name not in EXTRACTORS]:
+        raise InputError(f"features {unknown}: expected some of {', '.join(EXTRACTORS)}")
+    return {name: EXTRACTORS[name](backbone) for name in names}

@@ -97,19 +97,18 @@ def error_curves(results: Results, rows: Sequence[str] | None = None) -> Figure:
     return figure
 
 
-def reliability_diagram(results: Results, row: str | None = None) -> Figure:
-    """Draw a reliability diagram and a histogram of the confidences.
+def reliability_diagram(results: Results) -> Figure:
+    """Draw a reliability diagram and a histogram of the confidences of the first row that states enough of them.
 
     The diagram shows the fraction of errors below 30 degrees against the mean confidence, in ten bins of equal size.
     """
     names = dict.fromkeys([*results.summary.get("methods", ()), *results.rows])  # in the order of the run
-    stated = {name: found for name in names if len(found := results.confidences(name)) >= _LEAST_STATED}
-    row = row or next(iter(stated), None)
-    if row not in stated:
-        raise InputError(f"reliability: {row or 'no row'} has fewer than {_LEAST_STATED} confidences")
-    errors = results.errors(row)
-    confidence = np.array(list(stated[row].values()))
-    right = np.array([errors[key] < RIGHT for key in stated[row]])
+    row = next((name for name in names if len(results.confidences(name)) >= _LEAST_STATED), None)
+    if row is None:
+        raise InputError(f"reliability: no row has {_LEAST_STATED} confidences")
+    errors, stated = results.errors(row), results.confidences(row)
+    confidence = np.array(list(stated.values()))
+    right = np.array([errors[key] < RIGHT for key in stated])
     found = reliability(confidence, right, min(10, len(right) // 5))
     figure, (above, below) = plt.subplots(
         2, 1, figsize=(5, 5.6), layout="constrained", sharex=True, gridspec_kw={"height_ratios": [3, 1]}

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.database import RunFolder
 from zsp_lite.benchmark.execution import (
@@ -19,7 +18,7 @@ from zsp_lite.benchmark.execution import (
     make_chunks,
     open_workers,
 )
-from zsp_lite.benchmark.extractors import Extractor, make_extractors
+from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import array_digest, fingerprint
 from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
 from zsp_lite.benchmark.provenance import environment, library_version
@@ -28,13 +27,14 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import make_folder, write_atomic
 from zsp_lite.pipeline import ZeroShotPose
 
 
 def evaluate(
     root: str | Path,
-    backbone: Backbone | Extractor | str | BackboneConfig,
+    backbone: FeatureExtractor | str | BackboneConfig,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int = 100,
     targets: int = 5,

@@ -68,7 +68,7 @@ def float_tensor(values) -> Tensor:
 
 
 def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Compute exp(max(x, -80)) in place: underflow would take ten times as long."""
+    """Compute exp(max(x, -80)) in place: underflow would be slow."""
     return x.clamp_min_(-80).exp_()
 
 
