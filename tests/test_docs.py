@@ -139,29 +139,11 @@ def test_the_page_on_installation_lists_every_extra():
 
 def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
     jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
-    runs = {name: [step["run"] for step in job["steps"] if "run" in step] for name, job in jobs.items()}
-    (publish,), (install,) = runs.pop("publish"), runs.pop("install")
-    assert 'pip" install .' in install and install.strip().endswith('zsp-lite" demo')
-    assert runs == {
-        "test": ["make test"],
-        "avx2": ["make test"],
-        "site": ["make site"],
-        "browser": [
-            "make .venv/.installed",
-            ".venv/bin/python -m playwright install --with-deps chromium",
-            "make browser",
-        ],
-        "hostile": ["make hostile"],
-    }
-    assert "gh-pages" in publish and jobs["publish"]["needs"] == ["test", "site"]
-    assert (
-        jobs["publish"]["if"] == "github.event_name == 'push'" and jobs["publish"]["permissions"]["contents"] == "write"
+    steps = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
+    made = set(
+        re.findall(r"^(?:exec )?make ([a-z-]+)", "\n".join([*steps, (REPOSITORY / ".ci" / "run").read_text()]), re.M)
     )
-    assert jobs["avx2"]["env"] == {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
-    assert {"test", "site", "browser", "hostile"} <= set(
-        re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
-    )
-    assert (REPOSITORY / ".ci" / "run").read_text().endswith("exec make test\n")
+    assert made and made <= set(re.findall(r"^(\S+):", (REPOSITORY / "Makefile").read_text(), re.M))
 
 
 def parse(words: list[str]) -> None:

@@ -423,8 +423,8 @@ def accuracies_with_intervals(
     return figure
 
 
-def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str], limit: float = 30.0) -> Figure:
-    """Show all rotation errors, a row of dots for each category, with the median as a bar; a line marks the limit."""
+def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str]) -> Figure:
+    """Show all rotation errors, a row of dots for each category, with the median as a bar; a line marks 30 degrees."""
     categories, names = np.asarray(categories), list(dict.fromkeys(categories))
     scatter = np.random.default_rng(0).uniform(-0.28, 0.28, len(errors))
     figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
@@ -433,10 +433,10 @@ def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str]
         style = {"s": 40, "marker": marker, "color": BLUE, "edgecolors": "white", "linewidths": 0.4}
         axis.scatter(errors[here], row + scatter[here], **style)
         axis.plot([np.median(errors[here])] * 2, [row - 0.4, row + 0.4], color=VERMILLION, linewidth=2.5)
-    axis.axvline(limit, color="0.5", linestyle="--", linewidth=1)
+    axis.axvline(30, color="0.5", linestyle="--", linewidth=1)
     axis.set_yticks(range(len(names)), names)
     axis.set(xlim=(-3, 183), xticks=range(0, 181, 30))
-    axis.set_xlabel(f"rotation error (degrees); bar: median; dashed: {limit:.0f}°")
+    axis.set_xlabel("rotation error (degrees); bar: median; dashed: 30°")
     return figure
 
 
@@ -465,14 +465,14 @@ def distances_between_instances(
     return figure
 
 
-def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]], limit: float = 30.0) -> Figure:
-    """Show the rotation errors of two methods on the same pairs against each other; lines mark the limit."""
+def paired_errors(errors: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
+    """Show the rotation errors of two methods on the same pairs against each other; lines mark 30 degrees."""
     (first, x), (second, y) = errors.items()
     figure, axis = plt.subplots(figsize=(5.6, 5.4), layout="constrained")
     axis.scatter(x, y, s=36, color=BLUE, alpha=0.6, edgecolors="black", linewidths=0.5)
     axis.plot([0, 180], [0, 180], color="0.8", zorder=0)
     for draw in (axis.axvline, axis.axhline):
-        draw(limit, color="0.5", linestyle="--", linewidth=1)
+        draw(30, color="0.5", linestyle="--", linewidth=1)
     ticks = range(0, 181, 30)
     axis.set(xlabel=f"error, {first} (degrees)", ylabel=f"error, {second} (degrees)", xticks=ticks, yticks=ticks)
     axis.set_aspect("equal")

@@ -79,10 +79,9 @@ def moved_points_in_frames(
     return figure
 
 
-def image_in_patches(
-    image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int], count: int = 8
-) -> Figure:
-    """Show an image under the grid of its patches, and `count` x `count` of them, from `corner` on, pulled apart."""
+def image_in_patches(image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int]) -> Figure:
+    """Show an image under the grid of its patches, and 8 x 8 of them, from `corner` on, pulled apart."""
+    count = 8
     rows, cols, p = patches.shape[:3]
     (top, left), last = corner, count - 1
     titles = [f"{rows} x {cols} patches", f"rows {top} to {top + last}, columns {left} to {left + last}"]
@@ -145,10 +144,10 @@ def similarities_of_patch(
     return figure
 
 
-def true_partners(pair: GroundTruthPair, count: int = 14, seed: int = 0) -> Figure:
-    """Show `count` patches of the reference, drawn at random, with those of the target that show the same place."""
+def true_partners(pair: GroundTruthPair, seed: int = 0) -> Figure:
+    """Show 14 patches of the reference, drawn at random, with those of the target that show the same place."""
     known = np.argwhere(pair.valid)
-    some = known[np.random.default_rng(seed).choice(len(known), min(count, len(known)), replace=False)]
+    some = known[np.random.default_rng(seed).choice(len(known), min(14, len(known)), replace=False)]
     grid = pair.valid.shape
     ends = [
         plots.patch_centres(cells, grid, frame.rgb.shape[:2])

@@ -200,20 +200,18 @@ def foregrounds(views: Sequence[View], titles: Sequence[str], columns: int | Non
     return figure
 
 
-def errors_against_viewpoint(
-    angles: Sequence[float], errors: Sequence[float], groups: Sequence[str], near: float = 45.0, correct: float = 30.0
-) -> Figure:
+def errors_against_viewpoint(angles: Sequence[float], errors: Sequence[float], groups: Sequence[str]) -> Figure:
     """Draw rotation errors over the angle between the reference and the chosen view, a marker for each group.
 
-    Lines mark the largest angle of a near view, the largest error of a correct pose, and errors equal to the angle.
+    Lines mark an angle of 45 degrees (near views), an error of 30 (correct poses), and errors equal to the angle.
     """
     figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
     styles = zip(dict.fromkeys(groups), cycle("osD^vP*X"), cycle(plots.COLOURS))
     for group, marker, colour in styles:
         at = [(angle, error) for angle, error, own in zip(angles, errors, groups) if own == group]
         axis.scatter(*np.transpose(at), marker=marker, color=colour, s=60, edgecolors="black", label=group)
-    axis.axhline(correct, color="0.4", linestyle="--")
-    axis.axvline(near, color="0.4", linestyle=":")
+    axis.axhline(30, color="0.4", linestyle="--")
+    axis.axvline(45, color="0.4", linestyle=":")
     axis.plot([0, 180], [0, 180], color="0.8", zorder=0)
     axis.set(xlabel="angle between reference and chosen view (degrees)", ylabel="rotation error (degrees)")
     axis.set(xlim=(-6, 186), ylim=(-6, 186), xticks=range(0, 181, 45), yticks=(0, 30, 90, 150, 180))
