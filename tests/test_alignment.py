@@ -131,6 +131,9 @@ def test_a_mirrored_target_gets_a_rotation_and_not_a_reflection(seed):
     assert np.linalg.det(sim3.R) == pytest.approx(1)
     # The thinnest axis is the one a mirror is cheapest to forgo: the identity is close to the best rotation.
     assert np.square(sim3.apply(source) - mirrored).sum() <= np.square(source - mirrored).sum() + 1e-9
+    # The scale is the least-squares one for this rotation.
+    x, y = source - source.mean(axis=0), mirrored - mirrored.mean(axis=0)
+    assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())
 
 
 @settings(deadline=None)

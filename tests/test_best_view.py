@@ -70,6 +70,10 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     # Off the reference's foreground a cycle does not count.
     assert cyclical_iou(similarity, everything & (torch.arange(6) > 0), first_four) == pytest.approx(2 / 4)
     assert cyclical_iou(similarity, everything, everything, threshold=3.0) == pytest.approx(4 / 6)
+    # Target patch 5 goes to reference patch 0 and comes back: each foreground holds for its own view.
+    shifted = torch.eye(6).roll(1, 0)
+    first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
+    assert cyclical_iou(shifted, first, last) == 1 and cyclical_iou(shifted, last, first) == 0
 
 
 def test_all_selectors_take_the_same_comparison():

@@ -110,6 +110,11 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
     assert (low, high) == pytest.approx(tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5])))
 
 
+def test_the_seed_of_the_bootstrap_decides_the_draws():
+    first, again, other = (object_weights(PAIRS, resamples=50, seed=seed) for seed in (1, 1, 2))
+    assert (first == again).all() and (first != other).any()
+
+
 def test_equal_errors_have_no_spread():
     summary = summarise([20.0] * 5)
     assert summary == {

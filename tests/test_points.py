@@ -18,6 +18,7 @@ def soft_frame(mask):
 def test_a_pixel_is_on_the_object_if_that_is_more_probable_than_not_and_its_depth_is_known():
     assert object_pixels(soft_frame(MASK)).tolist() == [[False, False, True, True, True, False]]
     assert len(object_points(soft_frame(MASK))) == 3
+    assert object_pixels(soft_frame(MASK), 0.9).tolist() == [[False, False, False, False, True, False]]
     assert object_pixels(soft_frame(None)).tolist() == (DEPTH > 0).tolist()
     assert "mask above 0.5 at 67%" in repr(soft_frame(MASK))
 
