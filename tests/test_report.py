@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite.choices import SOLVERS
 from zsp_lite.data.frames import read_image
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pair_result import SOLVER_CHOICES
 from zsp_lite.points import object_cloud
 from zsp_lite.viz.report import (
     COLUMNS,
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def results(ellipsoids):
-    return list(run_demo(ellipsoids, CoordinateBackbone(), SOLVER_CHOICES["both"]))
+    return list(run_demo(ellipsoids, CoordinateBackbone(), SOLVERS["both"]))
 
 
 @pytest.fixture(scope="module")
@@ -237,8 +237,7 @@ def test_all_text_is_escaped(results, text):
     result = replace(
         results[0],
         title=hostile,
-        reference=hostile,
-        target=hostile,
+        sources=(hostile, hostile),
         estimates={hostile: estimate},
         errors={hostile: 1.0},
     )

@@ -273,6 +273,28 @@ class ZeroShotPose:
         return self.solver
 
 
+def solve_pair(
+    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
+) -> dict[str, PoseEstimate]:
+    """Estimate the pose of a pair by each of several solvers; crops and features are computed once.
+
+    Args:
+        method: The method.
+        reference: Frame of the reference object.
+        targets: Frames of the target object.
+        solvers: Names of solvers; by default the method's own.
+
+    Raises:
+        InputError: The pose cannot be estimated (see `ZeroShotPose.estimate`).
+    """
+    if solvers is None:
+        name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
+        return {name: method.estimate(reference, targets)}
+    timings: dict[str, float] = {}
+    turns, views = method.pair_views(reference, targets, timings)
+    return {name: replace(method, solver=name).estimate_from_turns(turns, views, timings) for name in solvers}
+
+
 def align_best_view(
     reference: View,
     targets: Sequence[View],
