@@ -1,6 +1,7 @@
 """One's own pair: sources opened by their path, masks, poses, report, point clouds, JSON, by command and by call."""
 
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -13,7 +14,7 @@ import zsp_lite
 from zsp_lite.cli import main as cli
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers.convert import _SIGNS, READERS, capture_format
+from zsp_lite.importers.convert import capture_format
 from zsp_lite.importers.geometry_masks import masks_from_depth
 from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
@@ -21,7 +22,7 @@ from zsp_lite.own_objects import estimate_pose, open_pair, open_source, write_pa
 
 pytestmark = pytest.mark.slow
 
-RADIUS, INTRINSICS = 0.3, (190.0, 190.0, 89.5, 69.5)
+RADIUS, INTRINSICS = 0.3, (190.0, 190.0, 90.0, 70.0)
 
 
 def ball_on_floor(direction, distance: float = 2.0) -> tuple[Frame, np.ndarray]:
@@ -71,7 +72,7 @@ def test_depth_without_an_object_is_refused():
     with pytest.raises(InputError, match="no depth map"):
         masks_from_depth([replace(frame, depth=None)])
     wall = replace(frame, depth=np.full_like(frame.depth, 2))
-    with pytest.raises(InputError, match="nothing stands out"):
+    with pytest.raises(InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"):
         masks_from_depth([wall])
 
 
@@ -155,9 +156,11 @@ def test_a_box_gives_masks_to_every_frame(tmp_path, frames):
     (top, left), (bottom, right) = inside.min(axis=0) - 4, inside.max(axis=0) + 5
     source = open_source(tmp_path, box=(int(top), int(left), int(bottom - top), int(right - left)))
     assert source.mask == "box"
-    masked = source.load([3, 1])
-    assert [frame.name for frame in masked] == ["0003.jpg", "0001.jpg"]
-    assert min(overlap(frame.mask, frames[k].mask > 0.5) for frame, k in zip(masked, (3, 1))) > 0.7
+    cv2.imwrite(str(tmp_path / "pictures/0002.jpg"), np.zeros_like(frames[2].rgb))
+    masked = source.load([3, 2, 1])
+    assert [frame.name for frame in masked] == ["0003.jpg", "0002.jpg", "0001.jpg"]
+    assert min(overlap(masked[k].mask, frames[n].mask > 0.5) for k, n in ((0, 3), (2, 1))) > 0.7
+    assert not masked[1].mask.any(), "nothing is found in a black frame"
 
 
 def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, frames):
@@ -165,12 +168,14 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
     sequence = ellipsoids.root / "ellipsoid/a"
     first, second = open_pair(sequence, other, {"intrinsics": (INTRINSICS,), "mask": ()})
     assert (first.format, second.format, second.mask) == ("sequence", "image", "auto")
-    wide = (100.0, 100.0, 89.5, 69.5)
+    wide = (100.0, 100.0, 90.0, 70.0)
     pair = open_pair(image, other, {"intrinsics": (INTRINSICS, wide), "mask": ("auto",), "box": ()})
     assert [one.load([0])[0].camera.focal_length[0] for one in pair] == [190, 100]
     assert [one.mask for one in pair] == ["auto", "auto"]
     pair = open_pair(image, other, {"intrinsics": (INTRINSICS,), "box": ((1, 2, 30, 40),)})
     assert [one.box for one in pair] == [(1, 2, 30, 40), None]
+    ways = {"intrinsics": (INTRINSICS,), "mask": ("given", "box"), "box": ((1, 2, 30, 40),)}
+    assert [(one.mask, one.box) for one in open_pair(image, other, ways)] == [("given", None), ("box", (1, 2, 30, 40))]
     pair = open_pair(image, sequence, {"intrinsics": (INTRINSICS,), "depth": (tmp_path / "mug_depth.png",)})
     np.testing.assert_allclose(pair[0].load([0])[0].depth, frames[1].depth, atol=6e-4)
 
@@ -227,10 +232,6 @@ def test_options_that_no_source_takes_are_refused(ellipsoids, image):
         open_pair(sequence, sequence, {"mask": ("auto",) * 3})
     with pytest.raises(InputError, match="--depth is given 1 times, expected one for each image"):
         open_pair(image, image, {"intrinsics": (INTRINSICS,), "depth": ("z.png",)})
-
-
-def test_every_reader_has_a_sign_by_which_it_is_recognised():
-    assert set(_SIGNS) == set(READERS)
 
 
 @pytest.fixture(scope="module")
@@ -368,6 +369,7 @@ def test_the_pose_does_not_depend_on_the_unit_of_length_of_a_capture(pictures):
         for unit in (0.001, 1.0)
     )  # fmt: skip
     np.testing.assert_array_equal(metres.inliers, millimetres.inliers)
+    assert [any("from the camera" in flag for flag in one.flags) for one in (metres, millimetres)] == [False, True]
     assert rotation_error(metres.sim3.R, millimetres.sim3.R) < 0.1
     assert millimetres.sim3.scale == pytest.approx(1000 * metres.sim3.scale, rel=1e-3)
     np.testing.assert_allclose(millimetres.sim3.t, 1000 * metres.sim3.t, rtol=1e-2)
@@ -376,28 +378,50 @@ def test_the_pose_does_not_depend_on_the_unit_of_length_of_a_capture(pictures):
         assert np.linalg.norm(estimate.sim3.apply(source) - target, axis=1).max() < 0.3 * unit
 
 
-def test_a_capture_is_a_target_of_several_views(pictures, tmp_path):
-    cup, _, _ = pictures
-    angles = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+def around(count, arc=360):
+    """Views of the object elsewhere, evenly spaced in an arc of degrees."""
+    angles = np.radians(np.arange(count) * arc / count)
     cameras = [look_at(ELSEWHERE.R @ (np.cos(a), np.sin(a), 0.3)) for a in angles]
-    write_lists(tmp_path, [render(camera, ELSEWHERE, f"{k:04d}") for k, camera in enumerate(cameras)])
-    found = estimate_pose(cup, tmp_path, targets=3, intrinsics=INTRINSICS, backbone=CoordinateBackbone())
+    return [render(camera, ELSEWHERE, f"{k:04d}") for k, camera in enumerate(cameras)]
+
+
+def test_a_capture_is_a_target_of_several_views_without_those_that_are_black_or_empty(pictures, tmp_path):
+    cup, _, _ = pictures
+    views = around(6)
+    views[2] = replace(views[2], rgb=np.zeros_like(views[2].rgb))
+    views[3] = replace(views[3], mask=np.zeros_like(views[3].mask))
+    write_lists(tmp_path, views)
+    for view in views:
+        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
+    found = estimate_pose(cup, tmp_path, targets=6, intrinsics=INTRINSICS, backbone=CoordinateBackbone())
     estimate = found.estimates["verified"]
-    view = cameras[2 * estimate.view]
-    truth = true_pose(look_at((1, 0.3, 0.3)), AT_HOME, view, ELSEWHERE)
-    assert len(found.targets) == 3 and rotation_error(estimate.sim3.R, truth.R) < 15
+    truth = true_pose(look_at((1, 0.3, 0.3)), AT_HOME, views[estimate.view].camera, ELSEWHERE)
+    assert found.masks[1] == "given" and rotation_error(estimate.sim3.R, truth.R) < 15
+    assert estimate.flags == ("0002.jpg left out: black image", "0003.jpg left out: empty object mask")
 
 
-def test_wrong_settings_are_refused(pictures):
+def test_a_target_that_is_seen_from_one_side_is_flagged(pictures, tmp_path):
     cup, mug, _ = pictures
-    with pytest.raises(InputError, match="solver is 'best', expected one of paper, verified, both"):
-        estimate_pose(cup, mug, "best", intrinsics=INTRINSICS)
-    with pytest.raises(InputError, match="targets is 0"):
-        estimate_pose(cup, mug, targets=0, intrinsics=INTRINSICS)
-    with pytest.raises(InputError, match="expected --intrinsics"):
-        estimate_pose(cup, mug)
-    with pytest.raises(InputError, match="has no frame 4"):
-        estimate_pose(cup, mug, reference_frame=4, intrinsics=INTRINSICS)
+    write_lists(tmp_path, around(5, 90))
+    options = {"mask": "auto", "intrinsics": INTRINSICS, "backbone": CoordinateBackbone()}
+    for target, degrees in ((mug, "0"), (tmp_path, "7[0-5]")):
+        (flag,) = estimate_pose(cup, target, "paper", **options).estimates["paper"].flags
+        assert re.fullmatch(rf"the target was seen from one side only \({degrees} degrees\): if .* is wrong", flag)
+    found = estimate_pose(cup, tmp_path, "paper", targets=2, **options, out=tmp_path / "out")
+    assert "the target was seen from one side only" in (tmp_path / "out/report.html").read_text()
+    assert "one side only" in found.as_json()["estimates"]["paper"]["flags"][-1]
+
+
+def test_depth_in_another_unit_is_questioned(image, frames, tmp_path):
+    np.save(tmp_path / "z.npy", frames[0].depth)  # in metres
+    with pytest.raises(InputError, match=r"0.00\d+ m from the camera, expected 0.05 to 20 m; .* --depth-unit"):
+        open_source(image, INTRINSICS, depth=tmp_path / "z.npy").load([0])
+    chosen = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=30.0)
+    (flag,) = chosen.unit_flags(chosen.load([0]))
+    assert "m from the camera, expected 0.05 to 20 m" in flag
+    right = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=1.0)
+    assert right.unit_flags(right.load([0])) == ()
+    assert not open_source(image, INTRINSICS).unit_flags(right.load([0]))
 
 
 def test_an_output_that_is_no_folder_is_refused_before_the_computation(pictures, tmp_path):
@@ -454,9 +478,9 @@ def test_the_command_without_labels_says_so(backbone, pictures, tmp_path, capsys
         (["{cup}", "{mug}", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
         (["{cup}", "{mug}", "--intrinsics", "1,2"], "expected four numbers"),
         (["{cup}", "{mug}", "--targets", "0"], "'--targets': 0 is not in the range"),
-        (["{cup}", "{mug}", "--intrinsics", "190,190,89.5,69.5", "--reference-frame", "3"], "has no frame 3"),
-        (["{cup}", "{mug}", "--intrinsics", "190,190,89.5,69.5", "--box", "0,0,500,500"], "expected one inside"),
-        (["{cup}", "{mug}", "--intrinsics", "190,190,89.5,69.5", "--mask", "given"], "expected --mask auto or --box"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--reference-frame", "3"], "has no frame 3"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--box", "0,0,500,500"], "expected one inside"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--mask", "given"], "expected --mask auto or --box"),
     ],
 )
 def test_bad_input_is_one_line_with_the_cure_and_nothing_is_written(

@@ -17,10 +17,10 @@ from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.backbones.pretrained import DEFAULT
 from zsp_lite.choices import MASKS, SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.cameras import Box
+from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import ON_OBJECT, Frame
+from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
@@ -33,8 +33,8 @@ from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
-from zsp_lite.points import near_median
-from zsp_lite.views import View, frame_defect, has_saliency
+from zsp_lite.points import near_median, object_pixels
+from zsp_lite.views import View, has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
 # What each format of `_format` is, and the options that it takes.
@@ -42,6 +42,16 @@ _WHAT = {"image": "an image", "sequence": "a sequence of a data folder"} | {
     name: f"a capture of the format {name}" for name in READERS
 }
 _TAKEN = {"image": ("intrinsics", "depth", "depth_unit"), "tum": ("intrinsics",), "lists": ("depth_unit",)}
+# What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
+_UNITS = {
+    "image": "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)",
+    "lists": "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)",
+    "nerfstudio": "set depth_unit_scale_factor in transforms.json",
+    "open3d": "depth of this format is in millimetres",
+    "tum": "depth of this format is in 1/5000 m",
+}
+_NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
+_ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
 _FAR = 4.0  # points farther from the median than this multiple of the median distance are not written
 
@@ -57,6 +67,7 @@ class Source:
         read: Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
         mask: Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth).
         box: Bounding box of the object in the first frame, for "box".
+        unit_given: Whether the unit of the depth is the user's choice or the format's, and not the default.
     """
 
     path: Path
@@ -65,6 +76,7 @@ class Source:
     read: Callable[[int], Frame]
     mask: str
     box: Box | None = None
+    unit_given: bool = True
 
     @property
     def name(self) -> str:
@@ -91,6 +103,8 @@ class Source:
         elif self.mask == "auto":
             ordered |= set(np.linspace(0, len(self.numbers) - 1, _CONTEXT).round().astype(int).tolist())
         frames = {position: self.read(position) for position in sorted(ordered)}
+        if not self.unit_given and (flags := self.unit_flags(list(frames.values()))):
+            raise InputError(flags[0])
         if self.mask == "given":
             if bare := [position for position, frame in frames.items() if frame.mask is None]:
                 raise InputError(
@@ -101,6 +115,17 @@ class Source:
             some = list(frames.values())
             frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
         return [frames[position] for position in positions]
+
+    def unit_flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
+        """Question the unit of length if the object, or what is near in frames without masks, is implausibly far."""
+        if self.format == "sequence":
+            return ()
+        depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
+        distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
+        if _NEAREST <= distance <= _FARTHEST:
+            return ()
+        expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m"
+        return (f"{self.path}: the object is {distance:.3g} m from the camera, {expected}; {_UNITS[self.format]}",)
 
     def reference(self, number: int | None) -> tuple[int, Frame]:
         """Return the position and the frame of a number; by default, of the first usable one among some."""
@@ -113,7 +138,9 @@ class Source:
             (frame,) = self.load([position])
             if not (defect := frame_defect(frame)):
                 return position, frame
-        raise InputError(f"{self.path}: no usable reference frame: {defect}")
+        raise InputError(
+            f"{self.path}: no usable reference frame: {defect}, expected another --reference-frame, --mask or --box"
+        )
 
 
 def estimate_pose(
@@ -132,6 +159,7 @@ def estimate_pose(
 
     Each path is a sequence of a data folder, a folder with a capture, or an image with depth. `open_source` explains
     them, and takes the settings that only one of the two has, such as a box around the object. No label is needed.
+    Implausible lengths, and target views that show one side of the object, are flags of the estimates.
 
     Args:
         reference: The reference object.
@@ -141,7 +169,7 @@ def estimate_pose(
         targets: Number of target views, evenly spaced over the target's frames.
         mask: Where the masks of both come from: "given", "auto", or as `open_source` decides. For "box", open the
             sources, which take a box each.
-        intrinsics: Camera intrinsics of both, where they are images.
+        intrinsics: Camera intrinsics of both, where they are images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
         upright: Whether the reference image is upright; False tries its four turns by 90 degrees (see `ZeroShotPose`).
@@ -163,10 +191,18 @@ def estimate_pose(
         frames = [loaded[k] for k in positions]
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
-        scales = _unit_scale(first, [frame]), _unit_scale(second, frames)
+        clouds = _object_cloud([frame])[0], _object_cloud(frames)[0]
+        # The method expects objects of about unit standard deviation. Sequences of data folders have it.
+        scales = [
+            1.0 if source.format == "sequence" or len(cloud) < 2 else unit_scale(cloud)
+            for source, cloud in zip((first, second), clouds)
+        ]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         estimates = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
-        estimates = {name: _in_units(one, *scales) for name, one in estimates.items()}
+        flags = *first.unit_flags([frame]), *second.unit_flags(frames), *_side_flags(frames, clouds[1])
+        estimates = {
+            name: replace(_in_units(one, *scales), flags=(*one.flags, *flags)) for name, one in estimates.items()
+        }
         result = PairResult(
             f"{first.name} to {second.name}", (first.describe([position]), second.describe(positions)), frame,
             tuple(frames), estimates, _errors(first, second, frame, frames, estimates),
@@ -220,10 +256,10 @@ def open_source(
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder of a capture in a format of `importers.READERS`; or a
-            JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, and its mask, if
-            there is one, NAME_mask.png.
-        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at integers as OpenCV states them; for an image, and
-            for a capture of TUM's format.
+            JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
+            its colours, and its mask, if there is one, NAME_mask.png.
+        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at half-integers (0.5 more than OpenCV's cx and cy);
+            for an image, and for a capture of TUM's format.
         depth: Depth file of an image, if it is named otherwise.
         depth_unit: World units per stored depth value, for an image and for a capture of plain lists; 0.001 by default.
         mask: "given", "box" or "auto". By default "box" if there is a box, "given" if the first frame has a mask, and
@@ -258,7 +294,8 @@ def _open(path: Path, layout: str, mask: str | None = None, box: Box | None = No
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box)
+    unit_given = "depth_unit" in options or "depth_unit" not in _TAKEN.get(layout, ())
+    return Source(path, layout, numbers, read, mask, box, unit_given)
 
 
 def open_pair(
@@ -270,7 +307,8 @@ def open_pair(
         reference: Path of the reference, see `open_source`; or an open source, which takes no options.
         target: The same of the target.
         options: For each argument of `open_source` at most two values: the reference's and the target's. A single one
-            is for each path that takes the option; a single box is the reference's.
+            is for each path that takes the option; a single box is the reference's, or the target's if only its mask is
+            "box".
 
     Raises:
         InputError: See `open_source`; or an option has too many values, or goes with neither path.
@@ -291,7 +329,8 @@ def open_pair(
         if len(values) == 2 and name != "depth":
             takers = [0, 1]
         elif name == "box":
-            takers = takers[:1]
+            boxed = [k for k, way in enumerate(options.get("mask", ())) if way == "box" and k in takers]
+            takers = (boxed or takers)[:1]
         for k, value in zip(takers, values if len(values) == 2 else [*values] * 2):
             given[k][name] = value
     first, second = (
@@ -342,7 +381,7 @@ def _open_image(
         names = " or ".join(file.name for file in beside)
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
     fx, fy, cx, cy = intrinsics
-    camera = camera_from_pose(np.eye(4), (fx, fy), (cx + 0.5, cy + 0.5), size, f"image {path}, --intrinsics")
+    camera = camera_from_pose(np.eye(4), (fx, fy), (cx, cy), size, f"image {path}, --intrinsics")
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, 0.0, depth_unit, mask=mask if mask.is_file() else None)
 
@@ -361,10 +400,17 @@ def _errors(
     return {name: label_error(one, ends[0], reference, ends[1], targets) for name, one in estimates.items()}
 
 
-def _unit_scale(source: Source, frames: Sequence[Frame]) -> float:
-    """Compute the factor that gives the object about unit standard deviation, which sequences of data folders have."""
-    points, _ = _object_cloud(frames)
-    return 1.0 if source.format == "sequence" or len(points) < 2 else unit_scale(points)
+def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
+    """Say where the usable target views do not show all sides of the object, of which some points are known."""
+    cameras = [frame.camera for frame in targets if not frame_defect(frame)]
+    span = view_span(cameras, np.median(points, axis=0)) if len(points) else 0.0
+    if len(cameras) > 2 and span >= _ALL_SIDES:
+        return ()
+    sides = "two sides" if span >= _ALL_SIDES else "one side"
+    return (
+        f"the target was seen from {sides} only ({span:.0f} degrees): if the reference was taken from another side, "
+        "this pose is wrong",
+    )
 
 
 def _in_units(estimate: PoseEstimate, reference_scale: float, target_scale: float) -> PoseEstimate:

@@ -45,20 +45,21 @@ _TWICE = "May be given twice: for REFERENCE, then for TARGET."
 @click.option(
     "--box", type=four_integers, metavar="T,L,H,W", multiple=True,
     help="Bounding box of the object in the first image in pixels: top, left, height, width. Once for REFERENCE, "
-    "twice for both.",
+    "twice for both; for TARGET alone once, with --mask given --mask box (or auto, box).",
 )  # fmt: skip
 @click.option(
     "--intrinsics", type=four_numbers, metavar="FX,FY,CX,CY", multiple=True,
-    help="Camera intrinsics of an image, or of a capture in TUM's format, in pixels, with pixel centres at integers. "
-    f"Once for both. {_TWICE}",
+    help="Camera intrinsics of an image, or of a capture in TUM's format, in pixels, with pixel centres at "
+    f"half-integers (0.5 more than OpenCV's cx and cy). Once for both. {_TWICE}",
 )  # fmt: skip
 @click.option(
     "--depth", type=PATH, metavar="FILE", multiple=True, show_default="NAME_depth.png or NAME_depth.npy beside it",
-    help="Depth of the image NAME.jpg: a 16-bit PNG or .npy. With two images twice.",
+    help="Depth of the image NAME.jpg, registered to its colours: a 16-bit PNG or .npy. With two images twice.",
 )  # fmt: skip
 @click.option(
     "--depth-unit", type=positive, metavar="M", multiple=True, show_default="0.001",
-    help=f"World units per stored depth value of an image, or of a capture given as lists. Once for both. {_TWICE}",
+    help="Metres per stored depth value of an image, or of a capture given as lists: 0.001 for millimetres, 1 for "
+    f"metres. Once for both. {_TWICE}",
 )  # fmt: skip
 @click.option(
     "--not-upright", is_flag=True,

@@ -24,14 +24,14 @@ from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.demo import PhotographResult
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.points import coloured_cloud, object_cloud
-from zsp_lite.views import View, frame_defect, object_crop
+from zsp_lite.views import View, object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
