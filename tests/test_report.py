@@ -60,10 +60,6 @@ def test_a_notebook_on_another_drive_is_named_without_a_link(monkeypatch):
     assert _notebook_link("01_features", REPOSITORY) == "notebook 01"
 
 
-def test_demo_pairs_are_deterministic(ellipsoids):
-    assert demo_pairs(ellipsoids) == demo_pairs(ellipsoids)
-
-
 def test_shipped_evaluation_pairs_are_preferred(ellipsoids):
     from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
 
@@ -263,12 +259,8 @@ def test_views_of_the_verified_solver_have_their_angle_to_the_reference(results)
     assert titles[1:] == [f"target {k}\nangle {-score:.0f}°" for k, score in enumerate(verified.view_scores, 1)]
 
 
-def test_the_report_is_written_to_its_path(results, tmp_path):
-    path = write_report(tmp_path / "deep" / "report.html", results, "folder", "note", "name")
-    assert path.read_text().startswith("<!doctype html>")
-
-
 def test_the_overview_shows_all_results(results, tmp_path):
+    assert write_report(tmp_path / "in/report.html", results, "folder", "note", "name").read_text()[0] == "<"
     picture = read_image(write_overview(tmp_path / "deep" / "overview.jpg", results * 2))
     height, width = picture.shape[:2]
     assert 2 < width / height < 4  # two rows of six square images

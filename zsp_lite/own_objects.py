@@ -1,4 +1,4 @@
-"""One's own pair, from files to files: open, load and mask, estimate, express in the inputs' lengths, write.
+"""One's own pair, from files to files: open, load and mask, estimate, write.
 
 A source is a sequence of a data folder, a folder with a capture, or an image with depth.
 """
@@ -43,9 +43,8 @@ _WHAT = {"image": "an image", "sequence": "a sequence of a data folder"} | {
 }
 _TAKEN = {"image": ("intrinsics", "depth", "depth_unit"), "tum": ("intrinsics",), "lists": ("depth_unit",)}
 # What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
+_UNIT_OPTION = "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)"
 _UNITS = {
-    "image": "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)",
-    "lists": "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)",
     "nerfstudio": "set depth_unit_scale_factor in transforms.json",
     "open3d": "depth of this format is in millimetres",
     "tum": "depth of this format is in 1/5000 m",
@@ -67,7 +66,7 @@ class Source:
         read: Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
         mask: Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth).
         box: Bounding box of the object in the first frame, for "box".
-        unit_given: Whether the unit of the depth is the user's choice or the format's, and not the default.
+        unit_given: Whether the unit of the depth is not the default, but the user's or the format's.
     """
 
     path: Path
@@ -105,15 +104,13 @@ class Source:
         frames = {position: self.read(position) for position in sorted(ordered)}
         if not self.unit_given and (flags := self.unit_flags(list(frames.values()))):
             raise InputError(flags[0])
-        if self.mask == "given":
-            if bare := [position for position, frame in frames.items() if frame.mask is None]:
-                raise InputError(
-                    f"{self.path}, frame {self.numbers[bare[0]]}: no mask, expected --mask auto or "
-                    "--box TOP,LEFT,HEIGHT,WIDTH"
-                )
-        else:
+        if self.mask != "given":
             some = list(frames.values())
             frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
+        for position, frame in frames.items():
+            if frame.mask is None:
+                where = f"{self.path}, frame {self.numbers[position]}"
+                raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
         return [frames[position] for position in positions]
 
     def unit_flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
@@ -124,16 +121,14 @@ class Source:
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if _NEAREST <= distance <= _FARTHEST:
             return ()
-        expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m"
-        return (f"{self.path}: the object is {distance:.3g} m from the camera, {expected}; {_UNITS[self.format]}",)
+        cure = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {_UNITS.get(self.format, _UNIT_OPTION)}"
+        return (f"{self.path}: the object is {distance:.3g} m from the camera, {cure}",)
 
     def reference(self, number: int | None) -> tuple[int, Frame]:
         """Return the position and the frame of a number; by default, of the first usable one among some."""
         if number not in (None, *self.numbers):
-            low, high = min(self.numbers), max(self.numbers)
-            raise InputError(
-                f"{self.path} has no frame {number}, expected one of {len(self.numbers)} from {low} to {high}"
-            )
+            known = f"{len(self.numbers)} from {min(self.numbers)} to {max(self.numbers)}"
+            raise InputError(f"{self.path} has no frame {number}, expected one of {known}")
         for position in self.spread(_CONTEXT) if number is None else [self.numbers.index(number)]:
             (frame,) = self.load([position])
             if not (defect := frame_defect(frame)):
@@ -307,8 +302,7 @@ def open_pair(
         reference: Path of the reference, see `open_source`; or an open source, which takes no options.
         target: The same of the target.
         options: For each argument of `open_source` at most two values: the reference's and the target's. A single one
-            is for each path that takes the option; a single box is the reference's, or the target's if only its mask is
-            "box".
+            is for each path that takes the option; a single box for the first whose mask is "box", if any, or first.
 
     Raises:
         InputError: See `open_source`; or an option has too many values, or goes with neither path.
@@ -390,14 +384,14 @@ def _errors(
     first: Source, second: Source, reference: Frame, targets: Sequence[Frame], estimates: dict[str, PoseEstimate]
 ) -> dict[str, float]:
     """Compute rotation errors if both are labelled sequences of one category; {} otherwise."""
-    paths = [source.path.resolve() for source in (first, second)]
-    if {first.format, second.format} != {"sequence"} or paths[0].parent != paths[1].parent:
+    one, other = (source.path.resolve() for source in (first, second))
+    if {first.format, second.format} != {"sequence"} or one.parent != other.parent:
         return {}
-    labels = read_labels(paths[0].parent.parent, paths[0].parent.name)
-    if any(path.name not in labels for path in paths):
+    labels = read_labels(one.parent.parent, one.parent.name)
+    if not {one.name, other.name} <= set(labels):
         return {}
-    ends = [labels[path.name] for path in paths]
-    return {name: label_error(one, ends[0], reference, ends[1], targets) for name, one in estimates.items()}
+    ends = labels[one.name], reference, labels[other.name], targets
+    return {solver: label_error(estimate, *ends) for solver, estimate in estimates.items()}
 
 
 def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
@@ -406,11 +400,8 @@ def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> t
     span = view_span(cameras, np.median(points, axis=0)) if len(points) else 0.0
     if len(cameras) > 2 and span >= _ALL_SIDES:
         return ()
-    sides = "two sides" if span >= _ALL_SIDES else "one side"
-    return (
-        f"the target was seen from {sides} only ({span:.0f} degrees): if the reference was taken from another side, "
-        "this pose is wrong",
-    )
+    seen = f"{'two sides' if span >= _ALL_SIDES else 'one side'} only ({span:.0f} degrees)"
+    return (f"the target was seen from {seen}: if the reference was taken from another side, this pose is wrong",)
 
 
 def _in_units(estimate: PoseEstimate, reference_scale: float, target_scale: float) -> PoseEstimate:

@@ -126,8 +126,8 @@ def _print_tables(found) -> None:
     console.print(table)
     console.print(legend([COLUMNS[k] for k in kept]))
     for solver, one in found.estimates.items():
-        view = found.targets[one.view].name
-        console.print(f"{solver}: reference-camera points to camera points of view {one.view + 1} ({view})")
+        view = f"view {one.view + 1} ({found.targets[one.view].name})"
+        console.print(f"{solver}: reference-camera points to camera points of {view}")
         for line in one.sim3.matrix:
             console.print("  " + " ".join(f"{value:10.5f}" for value in line))
         if one.reference_turn:
