@@ -180,7 +180,7 @@ def test_the_span_of_views_is_that_around_the_object(roll):
             away = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
             right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
             R = np.stack([right, np.cross(-away, right), -away])
-            cameras.append(view(R=R, t=[0, 0, 3] - R @ [1, 2, 3]).turn(roll))
+            cameras.append(replace(random_camera(), R=R, t=np.array([0, 0, 3]) - R @ [1, 2, 3]).turn(roll))
         return view_span(cameras, np.array([1.0, 2, 3]))
 
     assert span((40, 20)) == 0
