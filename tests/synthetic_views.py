@@ -98,7 +98,7 @@ class CoordinateBackbone:
         keys[share < 0.5] = 0.05 * np.random.default_rng(6).normal(size=keys.shape[-1])
         keys = torch.as_tensor(keys, dtype=torch.float32)
         saliency = torch.as_tensor(np.where(share < 0.5, 0, share), dtype=torch.float32)
-        return FeatureMap(keys, saliency, keys[share >= 0.5].mean(dim=0))
+        return FeatureMap(keys, saliency, keys[share >= 0.5].mean(dim=0).nan_to_num())
 
 
 def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placement: Sim3) -> Sim3:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera
+from zsp_lite.data.cameras import Camera, view_span
 from zsp_lite.errors import InputError
 
 FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
@@ -170,3 +170,23 @@ def test_the_repr_has_five_lines_with_the_intrinsics_and_the_pose():
     camera = Camera(np.eye(3), np.array([0.0, 0, 2]), np.full(2, 500.0), np.array([320.0, 240]), SIZE)
     lines = repr(camera).splitlines()
     assert len(lines) == 5 and "size=(480, 640), focal_length=[500. 500.]" in lines[0] and "t=[0. 0. 2.]" in lines[1]
+
+
+@pytest.mark.parametrize("roll", [0, 1])
+def test_the_span_of_views_is_that_around_the_object(roll):
+    def span(*angles):
+        cameras = []
+        for azimuth, height in np.radians(angles):
+            away = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+            right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+            R = np.stack([right, np.cross(-away, right), -away])
+            cameras.append(replace(random_camera(), R=R, t=np.array([0, 0, 3]) - R @ [1, 2, 3]).turn(roll))
+        return view_span(cameras, np.array([1.0, 2, 3]))
+
+    assert span((40, 20)) == 0
+    assert span(*((az, 0) for az in range(0, 73, 18))) == pytest.approx(72)
+    for height in (0, 30, 60):
+        assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)
+    assert 15 < span((0, 60), (20, 60), (40, 60)) < 40  # a cluster above is one side, too
+    assert span((0, 20), (20, 25), (40, 15), (180, 85)) < 60  # a view from the top does not show the back
+    assert span(*((az, 75) for az in range(0, 360, 72))) < 60

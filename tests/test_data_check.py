@@ -1,9 +1,11 @@
 """The check of a data folder counts its content and names the problems."""
 
+import cv2
 import numpy as np
 import pytest
 from co3d_folders import edit_json, sequence_data
 
+from zsp_lite.cli.main import main
 from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
@@ -55,6 +57,16 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
     assert not check_folder(root)[0].problems
     problems = check_folder(root, deep=True)[0].problems
     assert len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
+
+
+def test_black_and_empty_frames_are_counted_by_a_deep_check(root):
+    for part, count in (("images", 3), ("masks", 2)):
+        for path in sorted((root / "chair" / "a" / part).iterdir())[-count:]:
+            cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
+    assert check_folder(root)[0].defects == {} and check_folder(root)[0].usable == 2
+    (check,) = check_folder(root, deep=True)
+    assert check.defects == {"black image": 3} and not check.problems and check.usable == 1
+    assert main(["data", "check", str(root), "--deep"]) == 0
 
 
 def test_an_invalid_camera_is_named(root):

@@ -60,7 +60,7 @@ def write_tum(folder, frames):
     for name, rows in lines.items():
         (folder / name).write_text("\n".join(rows) + "\n")
     (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
-    return {"intrinsics": (fx, fy, cx - 0.5, cy - 0.5)}
+    return {"intrinsics": (fx, fy, cx, cy)}
 
 
 def write_nerfstudio(folder, frames):

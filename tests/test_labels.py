@@ -81,7 +81,7 @@ def test_a_category_without_labels_has_none(tmp_path):
     [
         ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "expected a rigid transform"),
         ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rigid transform"),
-        ({"trans": [[1.0, 0], [0, 1]]}, "trans"),
+        ({"trans": [[1.0, 0], [0, 1]]}, 'a label is {"trans": 4x4, "seq": NAME'),
         ({"seq": "b"}, "of sequence 'b', expected 'a'"),
         ({"seq": None}, "seq"),
     ],

@@ -16,7 +16,7 @@ PACKAGE = Path(zsp_lite.__file__).parent
 # From the bottom to the top. A module imports from lower layers and from its own subpackage only. Imports inside
 # functions, which delay the loading of large libraries, follow the same rule.
 LAYERS = [
-    "errors",
+    "choices errors",
     "io",
     "alignment features matchers metrics minimal",
     "data",
@@ -24,10 +24,10 @@ LAYERS = [
     "best_view points",
     "estimates",
     "pipeline backbones",
-    "pair_result verified labelling importers synthetic baselines",
-    "demo sources",
+    "verified labelling importers synthetic baselines",
+    "demo",
     "viz training",
-    "benchmark estimation",
+    "benchmark own_objects",
     "widgets",
     "cli",
     "__main__",

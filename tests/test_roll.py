@@ -18,10 +18,10 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
+from zsp_lite.estimates import label_error
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pair_result import label_error, solve_pair
-from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.pipeline import ZeroShotPose, solve_pair
 from zsp_lite.views import object_crop, turn_view
 
 TURNS = (1, 2, 3)

@@ -14,12 +14,10 @@ Read the files in this order:
     best_view    selection of the target view to align with
     alignment    Umeyama's method in RANSAC
     points       points of the object
-    estimates    the result, and the protocol of solvers
+    estimates    the results, and the protocol of solvers
     metrics      rotation errors and their statistics
-    pair_result  the estimates of both solvers for one pair
     demo         one pair of each category, from data folder to pose error
-    sources      frames of a sequence, a capture or an image
-    estimation   one pair of your own, from files to a pose
+    own_objects  one pair of your own, from files to files
 
     data         CO3D folders, frames, cameras, depth, labels, pairs
     backbones    vision transformers and how to load them
@@ -42,12 +40,12 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         baselines,
         benchmark,
         best_view,
+        choices,
         cli,
         data,
         demo,
         errors,
         estimates,
-        estimation,
         features,
         importers,
         io,
@@ -56,10 +54,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         matching,
         metrics,
         minimal,
-        pair_result,
+        own_objects,
         pipeline,
         points,
-        sources,
         synthetic,
         training,
         verified,
@@ -77,19 +74,18 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
     from zsp_lite.data.frames import Frame
     from zsp_lite.errors import InputError
     from zsp_lite.estimates import PoseEstimate
-    from zsp_lite.estimation import estimate_pose
     from zsp_lite.features import FeatureMap
     from zsp_lite.io import download, files, ply
     from zsp_lite.matching import Matches
+    from zsp_lite.own_objects import estimate_pose, open_source
     from zsp_lite.pipeline import ZeroShotPose
-    from zsp_lite.sources import open_source
     from zsp_lite.viz import plots, report, scene3d
 
 # Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
 # which `zsp-lite --help` does not need.
 _HOMES = {
-    "": "alignment best_view demo errors estimates estimation features matchers matching metrics minimal pair_result "
-    "pipeline points sources views backbones baselines benchmark cli data importers io labelling synthetic training "
+    "": "alignment best_view choices demo errors estimates features matchers matching metrics minimal own_objects "
+    "pipeline points views backbones baselines benchmark cli data importers io labelling synthetic training "
     "verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",
@@ -101,12 +97,11 @@ _HOMES = {
     "data.frames": "Frame",
     "errors": "InputError",
     "estimates": "PoseEstimate",
-    "estimation": "estimate_pose",
     "features": "FeatureMap",
     "io": "download files ply",
     "matching": "Matches",
+    "own_objects": "estimate_pose open_source",
     "pipeline": "ZeroShotPose",
-    "sources": "open_source",
     "viz": "plots report scene3d",
 }
 _FUNCTIONS = ("load_backbone", "estimate_pose", "open_source")

@@ -18,10 +18,9 @@ from zsp_lite.data.samples import (
     motorcycle_photograph,
 )
 from zsp_lite.errors import InputError
-from zsp_lite.estimates import PoseEstimate
+from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.pair_result import SEQUENCE_FRAMES, PairResult, label_error, solve_pair
-from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.pipeline import ZeroShotPose, solve_pair
 from zsp_lite.synthetic.ground_truth import object_poses
 from zsp_lite.synthetic.recording import POSES_FILE
 
@@ -93,9 +92,12 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[
     chosen = np.linspace(0, len(annotations), SEQUENCE_FRAMES, endpoint=False).astype(int)
     return PairResult(
         pair.category,
-        f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
-        f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
-        estimates, errors, tuple(dataset.load(annotations[i]) for i in np.unique(chosen)), pair,
+        (
+            f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
+            f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
+        ),
+        reference, tuple(targets), estimates, errors, tuple(dataset.load(annotations[i]) for i in np.unique(chosen)),
+        pair, backbone=getattr(method.backbone, "name", ""),
     )  # fmt: skip
 
 

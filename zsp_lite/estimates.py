@@ -1,11 +1,11 @@
-"""Pose estimates, and the protocol of the solvers that compute them from matched views."""
+"""Pose estimates, of one solver and of a pair, and the protocol of the solvers that compute them from matched views."""
 
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,10 +13,15 @@ from jaxtyping import Bool, Float
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewPair
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import PoseLabel, relative_pose
+from zsp_lite.data.pairs import Pair
 from zsp_lite.io.html import picture_html
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import View, turn_view
+
+SEQUENCE_FRAMES = 6  # frames of the target sequence that the pose of a pair is shown in
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +180,101 @@ class PoseEstimate:
             rotation = camera.R @ best.R.T
             poses.append(Sim3(1.0, rotation, camera.t - rotation @ best.t) @ self.sim3)
         return poses
+
+
+@dataclass(frozen=True, eq=False)
+class PairResult:
+    """Pose estimates of one pair by one or several solvers. `print` shows them.
+
+    Attributes:
+        title: Name of the pair, such as its category.
+        sources: Where the reference and the target views come from, in words.
+        reference: Reference frame, whole.
+        targets: Target frames, whole.
+        estimates: Estimate of each solver by its name, at least one.
+        errors: Rotation error of each estimate in degrees; empty without pose labels.
+        sequence: Some whole frames of the target sequence, for displaying the propagated pose.
+        pair: The evaluation pair, or None.
+        masks: Where the masks of the reference and of the targets come from: "given", "box" or "auto".
+        backbone: Name of the backbone.
+    """
+
+    title: str
+    sources: tuple[str, str]
+    reference: Frame
+    targets: tuple[Frame, ...]
+    estimates: dict[str, PoseEstimate]
+    errors: dict[str, float]
+    sequence: tuple[Frame, ...]
+    pair: Pair | None = None
+    masks: tuple[str, str] = ("given", "given")
+    backbone: str = ""
+
+    @property
+    def estimate(self) -> PoseEstimate:
+        """Estimate of the first solver."""
+        return next(iter(self.estimates.values()))
+
+    @property
+    def error(self) -> float:
+        """Rotation error of the first solver in degrees; NaN without pose labels."""
+        return next(iter(self.errors.values()), float("nan"))
+
+    @property
+    def disagreement(self) -> float | None:
+        """Angle in degrees between the rotations of two solvers; None if only one ran."""
+        if len(self.estimates) < 2:
+            return None
+        first, second = (one.world_rotation() for one in self.estimates.values())
+        return float(rotation_error(first, second))
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{solver}: {estimate!r}" for solver, estimate in self.estimates.items())
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all numbers in the types of JSON. Matrices are for column vectors; `null` marks what is unknown."""
+        solved = {}
+        for solver, estimate in self.estimates.items():
+            solved[solver] = {
+                "view": estimate.view,
+                "view_name": self.targets[estimate.view].name,
+                "matrix": estimate.sim3.matrix.tolist(),
+                "rotation": estimate.sim3.R.tolist(),
+                "translation": estimate.sim3.t.tolist(),
+                "scale": float(estimate.sim3.scale),
+                "inliers": int(estimate.inliers.sum()),
+                "matches": len(estimate.matches),
+                "reference_turn_degrees": estimate.reference_turn,
+                "confidence": estimate.confidence,
+                "error_degrees": self.errors.get(solver),
+                "flags": list(estimate.flags),
+                "one_of_two": estimate.one_of_two,
+                "alternatives": [
+                    {
+                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.probability,
+                        "degrees_from_best": one.angle, "score_below_best": one.deficit,
+                    }
+                    for one in estimate.alternatives
+                ],
+                "seconds": dict(estimate.timings),
+            }  # fmt: skip
+        views = [frame.name for frame in self.targets]
+        return {
+            "reference": {"source": self.sources[0], "masks": self.masks[0]},
+            "target": {"source": self.sources[1], "masks": self.masks[1], "views": views},
+            "backbone": self.backbone,
+            "estimates": solved,
+            "degrees_between_solvers": self.disagreement,
+        }
+
+
+def label_error(
+    estimate: PoseEstimate, reference_label: PoseLabel, reference: Frame, target_label: PoseLabel,
+    targets: Sequence[Frame],
+) -> float:  # fmt: skip
+    """Return the rotation error of an estimate in degrees, by the labels of both sequences."""
+    truth = relative_pose(reference_label, reference.camera, target_label, targets[estimate.view].camera)
+    return float(rotation_error(estimate.sim3.R, truth[:3, :3]))
 
 
 @runtime_checkable

@@ -12,14 +12,14 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
-from zsp_lite.data.frames import Frame, turn_frame
+from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match, similarities
 from zsp_lite.points import standard_deviation
-from zsp_lite.views import View, crop_size, extract_views, frame_defect, has_saliency, object_crop, usable_targets
+from zsp_lite.views import View, crop_size, extract_views, has_saliency, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
@@ -112,7 +112,7 @@ class ZeroShotPose:
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
 
-        A frame without a mask is not cropped. Target views with an empty mask, without known depth or without
+        A frame without a mask is not cropped. Target views with a `frame_defect`, such as an empty mask, or without
         foreground are left out, with a flag each. If the matches of the best view do not determine a pose (fewer than
         `sample_size`, collinear, or no plausible scale), the paper's solver returns `view_alignment` with a flag.
 
@@ -271,6 +271,28 @@ class ZeroShotPose:
             module, name = SOLVERS[self.solver].split(":")
             return getattr(importlib.import_module(module), name)()
         return self.solver
+
+
+def solve_pair(
+    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
+) -> dict[str, PoseEstimate]:
+    """Estimate the pose of a pair by each of several solvers; crops and features are computed once.
+
+    Args:
+        method: The method.
+        reference: Frame of the reference object.
+        targets: Frames of the target object.
+        solvers: Names of solvers; by default the method's own.
+
+    Raises:
+        InputError: The pose cannot be estimated (see `ZeroShotPose.estimate`).
+    """
+    if solvers is None:
+        name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
+        return {name: method.estimate(reference, targets)}
+    timings: dict[str, float] = {}
+    turns, views = method.pair_views(reference, targets, timings)
+    return {name: replace(method, solver=name).estimate_from_turns(turns, views, timings) for name in solvers}
 
 
 def align_best_view(

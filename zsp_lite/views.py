@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import patch_points
-from zsp_lite.data.frames import Frame, crop_to_object, resize_frame, turn_frame
+from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame, turn_frame
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
@@ -169,19 +169,6 @@ def turn_view(view: View, quarters: int) -> View:
     return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 
-def frame_defect(frame: Frame) -> str:
-    """Say why a frame cannot be used for pose estimation.
-
-    Returns:
-        "empty object mask", "no depth map" or "no known depth"; "" for a usable frame.
-    """
-    if frame.mask is not None and not frame.mask.any():
-        return "empty object mask"
-    if frame.depth is None:
-        return "no depth map"
-    return "" if (frame.depth > 0).any() else "no known depth"
-
-
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
     """Select the target views that a pose can be estimated in.
 
@@ -189,8 +176,8 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
         targets: Target views.
 
     Returns:
-        The indices of the views with a non-empty mask, known depth and a foreground patch, and for each other view a
-        flag that names it and the reason.
+        The indices of the views without a `frame_defect` and with a foreground patch, and for each other view a flag
+        that names it and the reason.
 
     Raises:
         InputError: No view is usable.

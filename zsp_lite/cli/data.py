@@ -85,6 +85,9 @@ def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool, show
             print(f"{check.category}: {check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
         if check.labelled > check.usable:
             print(f"{check.category}: {check.usable} of {check.labelled} labelled sequences can be evaluated")
+        if check.defects:
+            kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
+            print(f"{check.category}: {check.defects.total():,} frames cannot be used ({kinds})")
         for problem in check.problems[:show]:
             print(f"{check.category}: {problem}")
         if (more := len(check.problems) - show) > 0:
@@ -161,7 +164,7 @@ def transfer(source: Path, target: Path, category: str, max_residual: float, rep
 @click.option("--frames", type=COUNT, metavar="N", default=100, help="Maximum number of frames, evenly spaced.")
 @click.option(
     "--intrinsics", type=four_numbers, metavar="FX,FY,CX,CY", show_default="those of the TUM benchmark",
-    help="Camera intrinsics of a tum folder in pixels.",
+    help="Camera intrinsics of a tum folder in pixels, with pixel centres at half-integers.",
 )  # fmt: skip
 @click.option(
     "--depth-unit", type=positive, metavar="M", show_default="0.001",
@@ -184,14 +187,16 @@ def import_(
                                           or depth_unit_scale_factor; mask_path is used if present
       open3d      color/, depth/          images and 16-bit depth in mm, sorted by the numbers in
                                           their names
-                  camera_intrinsic.json   as Open3D writes it
+                  camera_intrinsic.json   as Open3D writes it, pixel centres at integers
                   trajectory.log          camera to world, one pose per image
       lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG or .npy
+                  masks/                  if present, mask files named like the images
                   poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
-                  intrinsics.txt          3 x 3 matrix in pixels
+                  intrinsics.txt          3 x 3 matrix in pixels, pixel centres at half-integers
                   --depth-unit            metres per stored depth value, 0.001 by default
 
-    The object is given by --box, by --masks, or by masks of the capture itself.
+    Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
+    --masks, or by masks of the capture itself; frames without it are left out.
     """
     from zsp_lite.importers import READERS, import_capture
 

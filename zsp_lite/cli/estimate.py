@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from zsp_lite.choices import MASKS, SOLVERS
 from zsp_lite.cli.common import (
     COUNT,
     PATH,
@@ -17,8 +18,6 @@ from zsp_lite.cli.common import (
     positive,
 )
 
-SOLVERS = ("paper", "verified", "both")
-MASKS = ("given", "box", "auto")
 _TWICE = "May be given twice: for REFERENCE, then for TARGET."
 
 
@@ -46,20 +45,21 @@ _TWICE = "May be given twice: for REFERENCE, then for TARGET."
 @click.option(
     "--box", type=four_integers, metavar="T,L,H,W", multiple=True,
     help="Bounding box of the object in the first image in pixels: top, left, height, width. Once for REFERENCE, "
-    "twice for both.",
+    "twice for both; for TARGET alone once, with --mask given --mask box (or auto, box).",
 )  # fmt: skip
 @click.option(
     "--intrinsics", type=four_numbers, metavar="FX,FY,CX,CY", multiple=True,
-    help="Camera intrinsics of an image, or of a capture in TUM's format, in pixels, with pixel centres at integers. "
-    f"Once for both. {_TWICE}",
+    help="Camera intrinsics of an image, or of a capture in TUM's format, in pixels, with pixel centres at "
+    f"half-integers (0.5 more than OpenCV's cx and cy). Once for both. {_TWICE}",
 )  # fmt: skip
 @click.option(
     "--depth", type=PATH, metavar="FILE", multiple=True, show_default="NAME_depth.png or NAME_depth.npy beside it",
-    help="Depth of the image NAME.jpg: a 16-bit PNG or .npy. With two images twice.",
+    help="Depth of the image NAME.jpg, registered to its colours: a 16-bit PNG or .npy. With two images twice.",
 )  # fmt: skip
 @click.option(
     "--depth-unit", type=positive, metavar="M", multiple=True, show_default="0.001",
-    help=f"World units per stored depth value of an image, or of a capture given as lists. Once for both. {_TWICE}",
+    help="Metres per stored depth value of an image, or of a capture given as lists: 0.001 for millimetres, 1 for "
+    f"metres. Once for both. {_TWICE}",
 )  # fmt: skip
 @click.option(
     "--not-upright", is_flag=True,
@@ -90,16 +90,15 @@ def estimate(
     import json
 
     from zsp_lite.backbones.load import load_backbone
-    from zsp_lite.estimation import estimate_pose
     from zsp_lite.io.locks import writing
-    from zsp_lite.sources import open_pair
+    from zsp_lite.own_objects import estimate_pose, open_pair, write_pair
 
     options = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
     with writing(out):
         sources = open_pair(reference, target, options)
         model = load_backbone(backbone_config(**backbone))
         found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model, upright=not not_upright)
-        files = found.write(out)
+        files = write_pair(found, out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
     else:
@@ -115,21 +114,20 @@ def _print_tables(found) -> None:
 
     from zsp_lite.viz.report import COLUMNS, legend, table_rows
 
-    console, result = Console(markup=False, highlight=False), found.result
-    labelled = bool(result.errors)
+    console, labelled = Console(markup=False, highlight=False), bool(found.errors)
     kept = [k for k, name in enumerate(COLUMNS) if k > 0 and (labelled or name != "error")]
-    table = Table(title=f"Pose from {result.title}, backbone {found.backbone}")
+    table = Table(title=f"Pose from {found.title}, backbone {found.backbone}")
     for column in [*(COLUMNS[k] for k in kept), "scale"]:
         table.add_column(column, justify="left" if column == "solver" else "right")
-    for row, one in zip(table_rows(result), found.estimates.values()):
+    for row, one in zip(table_rows(found), found.estimates.values()):
         table.add_row(*(row[k] for k in kept), f"{one.sim3.scale:.3f}")
-    console.print(f"Reference: {result.reference} (mask: {found.masks[0]})", soft_wrap=True)
-    console.print(f"Target: {result.target} (masks: {found.masks[1]})", soft_wrap=True)
+    console.print(f"Reference: {found.sources[0]} (mask: {found.masks[0]})", soft_wrap=True)
+    console.print(f"Target: {found.sources[1]} (masks: {found.masks[1]})", soft_wrap=True)
     console.print(table)
     console.print(legend([COLUMNS[k] for k in kept]))
     for solver, one in found.estimates.items():
-        view = found.targets[one.view].name
-        console.print(f"{solver}: reference-camera points to camera points of view {one.view + 1} ({view})")
+        view = f"view {one.view + 1} ({found.targets[one.view].name})"
+        console.print(f"{solver}: reference-camera points to camera points of {view}")
         for line in one.sim3.matrix:
             console.print("  " + " ".join(f"{value:10.5f}" for value in line))
         if one.reference_turn:
@@ -141,7 +139,7 @@ def _print_tables(found) -> None:
             )
         for flag in one.flags:
             console.print(f"  flag: {flag}", soft_wrap=True)
-    if result.disagreement is not None:
-        console.print(f"The rotations of both solvers differ by {result.disagreement:.0f}°.")
+    if found.disagreement is not None:
+        console.print(f"The rotations of both solvers differ by {found.disagreement:.0f}°.")
     if not labelled:
         console.print("No pose labels: the rotation error is unknown.")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+from zsp_lite.choices import SOLVERS
 from zsp_lite.cli.benchmark import benchmark, compare, tables
 from zsp_lite.cli.common import (
     COUNT,
@@ -23,7 +24,7 @@ from zsp_lite.cli.common import (
 )
 from zsp_lite.cli.data import data
 from zsp_lite.cli.download import download as data_download
-from zsp_lite.cli.estimate import SOLVERS, estimate
+from zsp_lite.cli.estimate import estimate
 from zsp_lite.errors import InputError
 
 SYNTHETIC_NOTE = (
@@ -114,7 +115,6 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
     from zsp_lite.data.samples import sample_data
     from zsp_lite.demo import run_demo, run_photograph
     from zsp_lite.io.locks import writing
-    from zsp_lite.pair_result import SOLVER_CHOICES
     from zsp_lite.synthetic.export import SETTINGS_FILE
     from zsp_lite.synthetic.model_export import RENDERED_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
@@ -130,7 +130,7 @@ def demo(data: Path | None, solver: str, out: Path, **backbone) -> None:
         with console.status("estimating the pose of the photographed motorcycle"):
             photograph = list(run_photograph(dataset, model))
         with console.status("estimating"):
-            results = list(run_demo(dataset, model, SOLVER_CHOICES[solver]))
+            results = list(run_demo(dataset, model, SOLVERS[solver]))
         with console.status("writing the report"):
             path = write_report(out / "report.html", results, str(folder), note, name, photograph)
             write_overview(out / "overview.jpg", results)

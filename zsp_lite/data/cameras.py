@@ -29,6 +29,8 @@ _FLOAT32_TOLERANCE = 1e-6
 _MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
 
+_STEEP = 0.4  # sine of the angle to the vertical of a camera that is above or below the object
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -235,3 +237,22 @@ def _image_size(size: Sequence[int]) -> tuple[int, int]:
     if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
         raise InputError(f"image size is {size!r}, expected (height, width), integers from 1 to {MOST_PIXELS}")
     return int(sides[0]), int(sides[1])
+
+
+def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
+    """Compute the angle that cameras span around a point: 360 degrees minus the largest gap; 0 for one camera.
+
+    It is measured about the cameras' mean vertical, which is the image axis that they agree on better, since images may
+    be turned by 90 degrees. Cameras that look along it do not count, unless fewer than two others are left; then the
+    span is the largest angle between any two directions.
+    """
+    axes = np.mean([camera.R[:2] for camera in cameras], axis=0)
+    vertical = axes[np.linalg.norm(axes, axis=1).argmax()]
+    directions = np.stack([camera.centre for camera in cameras]) - centre
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    around = directions @ np.linalg.svd(vertical[None])[2][1:].T
+    around = around[np.linalg.norm(around, axis=1) > _STEEP]
+    if len(around) < 2:
+        return float(np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min())))
+    angles = np.sort(np.degrees(np.arctan2(*around.T)))
+    return float(360 - np.diff(angles, append=angles[0] + 360).max())

@@ -1,5 +1,6 @@
 """Check of a data folder: missing and broken files, sequences that can be evaluated, size on disk."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
 from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import frame_defect
 from zsp_lite.data.labels import label_folder, read_label_files
 from zsp_lite.data.pairs import read_upstream_pairs
 from zsp_lite.errors import InputError
@@ -28,7 +30,8 @@ class CategoryCheck:
         absent: Number of annotated sequences without any file, in a folder that was downloaded in part.
         labelled: Number of sequences with a label.
         usable: Number of labelled sequences that can be evaluated: at least two frames have image, mask, depth and
-            camera.
+            camera, and in a deep check no defect.
+        defects: Number of frames with each `frames.frame_defect`, such as a black image; counted by a deep check alone.
         pairs: Number of valid files of evaluation pairs.
         size: Total size of the annotated files, bytes.
         problems: Messages, one line each.
@@ -42,6 +45,7 @@ class CategoryCheck:
     absent: int = 0
     labelled: int = 0
     usable: int = 0
+    defects: Counter[str] = field(default_factory=Counter)
     pairs: int = 0
     size: int = 0
     problems: list[str] = field(default_factory=list)
@@ -104,8 +108,9 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
             check.problems.append(str(error))
             continue
         for annotation in annotations:
-            found = _check_frame(dataset, annotation, deep, check)
-            complete_frames += not found and None not in (annotation.viewpoint, annotation.depth, annotation.mask)
+            found, defect = _check_frame(dataset, annotation, deep, check)
+            whole = None not in (annotation.viewpoint, annotation.depth, annotation.mask)
+            complete_frames += whole and not found and not defect
             problems += found
             if annotation.viewpoint is not None:
                 layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
@@ -113,9 +118,12 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
             problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
         elif (cloud := sequences[name].point_cloud) is not None:
             found = _check_file(dataset, cloud.path, check)
-            if not found and deep:
-                found = _check_call(lambda: dataset.point_cloud(category, name))
             problems += found
+            if not found and deep:
+                try:
+                    dataset.point_cloud(category, name)
+                except InputError as error:
+                    problems.append(str(error))
         check.complete += not problems
         check.problems += problems
         if complete_frames >= _MIN_FRAMES:
@@ -148,16 +156,22 @@ def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usab
             check.problems.append(str(error))
 
 
-def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> list[str]:
-    """Return the problems of a frame's files and camera."""
+def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> tuple[list[str], str]:
+    """Return the problems of a frame's files and camera, and in a deep check its defect, which is counted."""
     paths = [annotation.image.path]
     paths += [annotation.mask.path] if annotation.mask else []
     if annotation.depth:
         paths += [path for path in (annotation.depth.path, annotation.depth.mask_path) if path]
     problems = [problem for path in paths for problem in _check_file(dataset, path, check)]
     if problems or annotation.viewpoint is None:
-        return problems
-    return _check_call(lambda: dataset.load(annotation) if deep else dataset.camera(annotation))
+        return problems, ""
+    try:
+        defect = frame_defect(dataset.load(annotation)) if deep else ""
+        dataset.camera(annotation)
+    except InputError as error:
+        return [str(error)], ""
+    check.defects.update([defect] if defect else [])
+    return [], defect
 
 
 def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
@@ -171,12 +185,3 @@ def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]
     size = path.stat().st_size
     check.size += size
     return [] if size else [f"{relative} is empty"]
-
-
-def _check_call(read: Callable[[], object]) -> list[str]:
-    """Return the message of an InputError."""
-    try:
-        read()
-    except InputError as error:
-        return [str(error)]
-    return []

@@ -18,6 +18,7 @@ from zsp_lite.io.html import picture_html
 from zsp_lite.io.images import MAX_PIXELS, decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
+_BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,21 @@ class Frame:
     @property
     def _label(self) -> str:
         return f"frame {self.name}" if self.name else "frame"
+
+
+def frame_defect(frame: Frame) -> str:
+    """Say why a frame cannot be used for pose estimation.
+
+    Returns:
+        "black image", "empty object mask", "no depth map" or "no known depth"; "" for a usable frame.
+    """
+    if frame.rgb.max() < _BLACK:
+        return "black image"
+    if frame.mask is not None and not frame.mask.any():
+        return "empty object mask"
+    if frame.depth is None:
+        return "no depth map"
+    return "" if (frame.depth > 0).any() else "no known depth"
 
 
 def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:

@@ -100,11 +100,13 @@ def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
 
 def parse_label(data: bytes, where: str) -> PoseLabel:
     """Parse the JSON of the label file `where`; InputError if it lacks a field, or is not rigid."""
-    label = decode(data, _LabelFile, where)
     try:
+        label = decode(data, _LabelFile, where)
         return PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(
+            f'{where}: {error}; a label is {{"trans": 4x4, "seq": NAME, "reference_seq": NAME}}'
+        ) from error
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:

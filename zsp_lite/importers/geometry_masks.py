@@ -58,7 +58,10 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
         mask[chosen] = part(one[chosen])
         masked.append(replace(frame, mask=_filled(mask, depth_known)))
     if not any((frame.mask > 0).sum() >= _MIN_PIXELS for frame in masked):
-        raise InputError(f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks")
+        raise InputError(
+            f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks, expected "
+            "--box TOP,LEFT,HEIGHT,WIDTH around the object"
+        )
     return masked
 
 

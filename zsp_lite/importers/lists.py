@@ -4,6 +4,7 @@ rgb.txt, depth.txt: one file name per line; depth files are 16-bit PNGs or .npy
 poses.txt: one camera-to-world matrix per line, 12 or 16 numbers in row-major order, in OpenCV's axes (+x right,
     +y down, +z forward)
 intrinsics.txt: the 3 x 3 matrix K in pixels, with pixel centres at half-integers
+masks/: if it is there, a mask file for each image, of the image's name with any extension
 """
 
 from pathlib import Path
@@ -36,6 +37,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers, at least 1")
     matrix = _intrinsics(path_inside(folder, "intrinsics.txt"))
+    masks = {path.stem: f"masks/{path.name}" for path in sorted((folder / "masks").glob("*"))}
     size, frames = None, []
     for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
         where = f"{folder / 'poses.txt'}, line {pose_line}"
@@ -48,7 +50,8 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
         size = size or image_size(path)
         camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2], size, where)
         depth_path = listed_file(folder, depth[0], f"{folder / 'depth.txt'}, line {line}")
-        frames.append(CaptureFrame(path, depth_path, camera, float(len(frames)), depth_unit))
+        mask = listed_file(folder, masks[path.stem], f"capture {folder}") if path.stem in masks else None
+        frames.append(CaptureFrame(path, depth_path, camera, float(len(frames)), depth_unit, mask=mask))
     return frames
 
 

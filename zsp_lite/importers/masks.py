@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Box
-from zsp_lite.data.frames import Frame, read_mask
+from zsp_lite.data.frames import Frame, frame_defect, read_mask
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 from zsp_lite.points import object_pixels, object_points
@@ -25,14 +25,15 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
     every further frame is the projection of the object points of the previous frames and of a ball as wide as the first
-    box, which stands for the parts of the object that are not visible there.
+    box, which stands for the parts of the object that are not visible there. A mask is empty where a further frame does
+    not show the object.
 
     Args:
         frames: Frames with depth, in the order of the capture.
         box: (top, left, height, width) of the object in the first frame, pixels.
 
     Raises:
-        InputError: The box extends beyond the image, or the object is not found in a frame.
+        InputError: The box extends beyond the image, or the object is not found in the first frame.
     """
     height, width = frames[0].camera.size
     top, left, box_height, box_width = box
@@ -41,14 +42,16 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     masked, points, ball = [], np.zeros((0, 3)), np.zeros((0, 3))
     for frame in frames:
         if masked:
-            box = _project_box(frame, np.concatenate([points, ball]))
-        mask = grab_cut(frame.rgb, box)
+            box = None if frame_defect(frame) else _project_box(frame, np.concatenate([points, ball]))
+        mask = np.zeros(frame.camera.size, np.float32) if box is None else grab_cut(frame.rgb, box)
+        masked.append(replace(frame, mask=mask))
         if not mask.any():
+            if len(masked) > 1:
+                continue
             raise InputError(
                 f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected another --box or mask "
                 "files (--masks DIR)"
             )
-        masked.append(replace(frame, mask=mask))
         points = np.concatenate([points, _object_points(masked[-1])])
         if not len(points):
             raise InputError(f"frame {frame.name}: no known depth on the object, expected some to track it")
@@ -108,23 +111,19 @@ def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
     return centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
-    """Compute the padded bounding box of projected world points."""
+def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box | None:
+    """Compute the padded bounding box of projected world points; None if they are not in the image."""
     height, width = frame.camera.size
     pixels, depth = frame.camera.project(points)
     pixels = pixels[depth > 0]
     if not len(pixels):
-        raise InputError(
-            f"frame {frame.name}: the object is behind the camera, expected it to be visible in every frame"
-        )
+        return None
     low, high = np.percentile(pixels, [1, 99], axis=0)
     margin = _PADDING / 2 * (high - low).max()
     left, top = np.floor(low - margin).clip(0, (width - 1, height - 1)).astype(int)
     right, bottom = np.ceil(high + margin).clip(1, (width, height)).astype(int)
     if right - left < 4 or bottom - top < 4:
-        raise InputError(
-            f"frame {frame.name}: the object is outside the image, expected it to be visible in every frame"
-        )
+        return None
     if right - left == width and bottom - top == height:
         left, top, right, bottom = 2, 2, width - 2, height - 2
     return int(top), int(left), int(bottom - top), int(right - left)

@@ -1,6 +1,6 @@
 """Reader of nerfstudio's transforms.json with depth, which phone scanners export.
 
-Its cameras have OpenGL's axes (+y up, looking along -z).
+Its cameras have OpenGL's axes (+y up, looking along -z), and its pixel centres are at half-integers.
 """
 
 from pathlib import Path

@@ -20,7 +20,7 @@ from zsp_lite.importers.capture import (
 from zsp_lite.io.files import path_inside, read_bytes
 
 _COLOURS = "color", "image", "rgb"
-_INTRINSICS = "camera_intrinsic.json", "intrinsic.json", "camera_primesense.json"
+_INTRINSICS = "camera_intrinsic.json", "intrinsic.json", "camera.json", "camera_primesense.json"
 _TRAJECTORIES = "trajectory.log", "scene/trajectory.log", "odometry.log"
 
 
@@ -33,7 +33,8 @@ class _Intrinsic(msgspec.Struct):
 def read_open3d(folder: str | Path) -> list[CaptureFrame]:
     """Read a capture: image, depth map and camera-to-world pose number n form frame n.
 
-    Images and depth maps are sorted by the numbers in their names. Depth is in millimetres, Open3D's default.
+    Images and depth maps are sorted by the numbers in their names. Depth is in millimetres, Open3D's default. The
+    intrinsics file has pixel centres at integers, as Open3D writes it.
 
     Raises:
         InputError: A part is missing or invalid, or the numbers of images, depth maps and poses differ.

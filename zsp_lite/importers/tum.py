@@ -15,8 +15,8 @@ from zsp_lite.importers.capture import (
 )
 from zsp_lite.io.files import path_inside
 
-# The benchmark's default camera. Its pixel centres are at integers.
-DEFAULT_INTRINSICS, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (480, 640)
+# The benchmark's default camera, with pixel centres at half-integers; the benchmark counts them at integers.
+DEFAULT_INTRINSICS, DEFAULT_SIZE = (525.0, 525.0, 320.0, 240.0), (480, 640)
 _DEPTH_UNIT = 1 / 5000
 _MAX_GAP = 0.02  # largest time between an image and its depth or pose, seconds
 
@@ -28,8 +28,8 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
 
     Args:
         folder: The capture.
-        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at integers as the benchmark states them. The default
-            is the benchmark's default camera.
+        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at half-integers: 0.5 is added to the cx and cy that
+            the benchmark states. The default is the benchmark's default camera.
 
     Raises:
         InputError: A list is missing or invalid, no image has both depth and pose, or other intrinsics are needed.
@@ -63,7 +63,7 @@ def read_tum(folder: str | Path, intrinsics: tuple[float, float, float, float] |
             raise InputError(f"{where}: quaternion is {values[3:]}, expected a quaternion (x, y, z, w) of length 1")
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
-        camera = camera_from_pose(matrix, (fx, fy), (cx + 0.5, cy + 0.5), size, where)
+        camera = camera_from_pose(matrix, (fx, fy), (cx, cy), size, where)
         path = listed_file(folder, depth[1][1], f"{folder / 'depth.txt'}, line {depth[0]}")
         frames.append(CaptureFrame(image, path, camera, float(time), _DEPTH_UNIT))
     if not frames:

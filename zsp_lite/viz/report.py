@@ -24,15 +24,14 @@ from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.demo import PhotographResult
-from zsp_lite.estimates import PoseEstimate
+from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.pair_result import PairResult
 from zsp_lite.points import coloured_cloud, object_cloud
-from zsp_lite.views import View, frame_defect, object_crop
+from zsp_lite.views import View, object_crop
 from zsp_lite.viz import plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
@@ -101,22 +100,20 @@ def write_report(
     return path
 
 
-def write_pair_report(path: str | Path, result: PairResult, backbone: str, masks: tuple[str, str]) -> Path:
+def write_pair_report(path: str | Path, result: PairResult) -> Path:
     """Write the page of one pair of the user's own.
 
     Args:
         path: File to write; missing folders are created.
         result: The result.
-        backbone: Name of the backbone.
-        masks: Where the masks of the reference and of the targets come from: "given", "box" or "auto".
 
     Returns:
         The path.
     """
     path = Path(path)
     names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found from the depth"}
-    note = f"reference {names[masks[0]]}, target {names[masks[1]]}"
-    page = render_page([result], backbone, path.parent, data_note=note, own=True)
+    note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
+    page = render_page([result], result.backbone, path.parent, data_note=note, own=True)
     write_atomic(path, page.encode(errors="replace"))
     return path
 
@@ -137,8 +134,8 @@ def render_page(
         {
             "title": result.title,
             "rows": table_rows(result),
-            "reference": result.reference,
-            "target": result.target,
+            "reference": result.sources[0],
+            "target": result.sources[1],
             "answers": [_answer(solver, estimate, result) for solver, estimate in result.estimates.items()],
             "disagreement": result.disagreement,
             "stages": stage_figures(result, f"scene-{index}"),

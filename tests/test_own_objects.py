@@ -1,0 +1,464 @@
+"""One's own pair: sources opened by their path, masks, poses, report, point clouds, JSON, by command and by call."""
+
+import json
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, inside, look_at, render, true_pose
+from test_importers import write_lists, write_nerfstudio, write_tum
+
+import zsp_lite
+from zsp_lite.cli import main as cli
+from zsp_lite.data.frames import Frame, write_image, write_mask
+from zsp_lite.errors import InputError
+from zsp_lite.importers.fusion import scale_frame
+from zsp_lite.importers.geometry_masks import masks_from_depth
+from zsp_lite.io.ply import read_ply
+from zsp_lite.metrics import rotation_error
+from zsp_lite.own_objects import estimate_pose, open_pair, open_source, write_pair
+
+pytestmark = pytest.mark.slow
+
+RADIUS, INTRINSICS = 0.3, (190.0, 190.0, 90.0, 70.0)
+
+
+def ball_on_floor(direction, distance: float = 2.0) -> tuple[Frame, np.ndarray]:
+    """A frame of a ball on a floor in front of a wall, in metres, and the true mask; the depth has holes."""
+    camera = look_at(direction, distance)
+    height, width = camera.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R  # world directions
+    start = camera.centre
+    along, across = rays @ start, np.square(rays).sum(axis=-1)
+    root = along**2 - across * (start @ start - RADIUS**2)
+    on_ball = root > 0
+    ball = np.where(on_ball, (-along - np.sqrt(np.maximum(root, 0))) / across, np.inf)
+    with np.errstate(divide="ignore"):
+        surfaces = [(-RADIUS - start[2]) / rays[..., 2], (-1.2 - start[0]) / rays[..., 0]]
+    depth = np.minimum(ball, np.min([np.where(one > 0, one, np.inf) for one in surfaces], axis=0))
+    depth = np.where(np.isfinite(depth) & (depth < 8), depth, 0)
+    holes = np.random.default_rng(0).uniform(size=(height // 7, width // 9)) < 0.3
+    depth[cv2.resize(holes.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
+    return Frame(np.full((height, width, 3), 90, np.uint8), depth.astype(np.float32), None, camera), on_ball
+
+
+def overlap(mask, truth):
+    found = mask > 0.5
+    return (found & truth).sum() / (found | truth).sum()
+
+
+@pytest.mark.parametrize(("count", "unit"), [(1, 1), (4, 1), (1, 1000)])
+def test_the_object_on_a_floor_is_found_from_depth_alone_in_any_unit_of_length(count, unit):
+    directions = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
+    scenes = [ball_on_floor(direction) for direction in directions[:count]]
+    masked = masks_from_depth([scale_frame(frame, unit) for frame, _ in scenes])
+    assert min(overlap(frame.mask, truth) for frame, (_, truth) in zip(masked, scenes)) > 0.85
+
+
+def test_depth_without_an_object_is_refused():
+    frame, _ = ball_on_floor((1, 0.2, 0.6))
+    with pytest.raises(InputError, match="no depth is known"):
+        masks_from_depth([replace(frame, depth=np.zeros_like(frame.depth))])
+    with pytest.raises(InputError, match="no depth map"):
+        masks_from_depth([replace(frame, depth=None)])
+    wall = replace(frame, depth=np.full_like(frame.depth, 2))
+    with pytest.raises(InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"):
+        masks_from_depth([wall])
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Four views around an object, in metres."""
+    angles = np.linspace(0, 2 * np.pi, 4, endpoint=False)
+    return [render(look_at((np.cos(a), np.sin(a), 0.3)), AT_HOME, f"{k:04d}") for k, a in enumerate(angles)]
+
+
+@pytest.fixture
+def image(tmp_path, frames):
+    return write_picture(tmp_path / "cup.jpg", frames[0])
+
+
+def write_picture(path, frame, mask=True):
+    write_image(path, frame.rgb, 98)
+    cv2.imwrite(str(path.with_name(f"{path.stem}_depth.png")), np.rint(1000 * frame.depth).astype(np.uint16))
+    if mask:
+        write_mask(path.with_name(f"{path.stem}_mask.png"), frame.mask)
+    return path
+
+
+def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoids, monkeypatch):
+    source = open_source(ellipsoids.root / "ellipsoid/b")
+    assert (source.format, source.mask, source.numbers) == ("sequence", "given", (0, 1, 2, 3, 4, 5, 6))
+    assert source.spread(3) == [0, 2, 4] and source.spread(50) == [0, 1, 2, 3, 4, 5, 6]
+    position, frame = source.reference(5)
+    expected = ellipsoids.load(ellipsoids.frame("ellipsoid", "b", 5))
+    np.testing.assert_array_equal(frame.rgb, expected.rgb)
+    np.testing.assert_array_equal(frame.mask, expected.mask)
+    assert source.describe([0, 2]).endswith("ellipsoid/b, frames 0, 2")
+    assert position == 5 and source.reference(None)[0] == 0
+    with pytest.raises(InputError, match="no frame 7, expected one of 7 from 0 to 6"):
+        source.reference(7)
+    monkeypatch.chdir(source.path)
+    assert open_source(".").name == "b"
+
+
+def test_an_image_is_read_with_the_files_beside_it(image, frames):
+    source = open_source(image, INTRINSICS)
+    assert (source.format, source.mask, source.numbers) == ("image", "given", (0,))
+    (frame,) = source.load([0])
+    np.testing.assert_allclose(frame.depth, frames[0].depth, atol=6e-4)
+    np.testing.assert_allclose(frame.camera.K, frames[0].camera.K)
+    np.testing.assert_array_equal(frame.mask, frames[0].mask)
+
+
+WRITERS = {"nerfstudio": (write_nerfstudio, "given"), "lists": (write_lists, "auto"), "tum": (write_tum, "auto")}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_a_capture_is_recognised_by_its_files(tmp_path, frames, layout):
+    write, mask = WRITERS[layout]
+    write(tmp_path, frames)
+    source = open_source(tmp_path, INTRINSICS if layout == "tum" else None)
+    np.testing.assert_allclose(source.load([1])[0].camera.K, frames[1].camera.K)
+    assert (source.format, source.numbers, source.mask) == (layout, (0, 1, 2, 3), mask)
+    np.testing.assert_allclose(source.load([2])[0].camera.centre, frames[2].camera.centre, atol=1e-4)
+
+
+def test_a_box_gives_masks_to_every_frame(tmp_path, frames):
+    write_lists(tmp_path, frames)
+    inside = np.argwhere(frames[0].mask > 0)
+    (top, left), (bottom, right) = inside.min(axis=0) - 4, inside.max(axis=0) + 5
+    source = open_source(tmp_path, box=(int(top), int(left), int(bottom - top), int(right - left)))
+    assert source.mask == "box"
+    cv2.imwrite(str(tmp_path / "pictures/0002.jpg"), np.zeros_like(frames[2].rgb))
+    masked = source.load([3, 2, 1])
+    assert [frame.name for frame in masked] == ["0003.jpg", "0002.jpg", "0001.jpg"]
+    assert min(overlap(masked[k].mask, frames[n].mask > 0.5) for k, n in ((0, 3), (2, 1))) > 0.7
+    assert not masked[1].mask.any(), "nothing is found in a black frame"
+
+
+def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, frames):
+    other = write_picture(tmp_path / "mug.jpg", frames[1], mask=False)
+    sequence = ellipsoids.root / "ellipsoid/a"
+    first, second = open_pair(sequence, other, {"intrinsics": (INTRINSICS,), "mask": ()})
+    assert (first.format, second.format, second.mask) == ("sequence", "image", "auto")
+    wide = (100.0, 100.0, 90.0, 70.0)
+    pair = open_pair(image, other, {"intrinsics": (INTRINSICS, wide), "mask": ("auto",), "box": ()})
+    assert [one.load([0])[0].camera.focal_length[0] for one in pair] == [190, 100]
+    assert [one.mask for one in pair] == ["auto", "auto"]
+    pair = open_pair(image, other, {"intrinsics": (INTRINSICS,), "box": ((1, 2, 30, 40),)})
+    assert [one.box for one in pair] == [(1, 2, 30, 40), None]
+    ways = {"intrinsics": (INTRINSICS,), "mask": ("given", "box"), "box": ((1, 2, 30, 40),)}
+    assert [(one.mask, one.box) for one in open_pair(image, other, ways)] == [("given", None), ("box", (1, 2, 30, 40))]
+    pair = open_pair(image, sequence, {"intrinsics": (INTRINSICS,), "depth": (tmp_path / "mug_depth.png",)})
+    np.testing.assert_allclose(pair[0].load([0])[0].depth, frames[1].depth, atol=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "no intrinsics, expected --intrinsics FX,FY,CX,CY"),
+        ({"intrinsics": INTRINSICS, "mask": "box"}, "expected --box TOP,LEFT,HEIGHT,WIDTH"),
+        ({"intrinsics": INTRINSICS, "mask": "auto", "box": (1, 1, 9, 9)}, "--box goes with --mask box"),
+        ({"intrinsics": INTRINSICS, "mask": "sam"}, "mask is 'sam', expected one of given, box, auto"),
+        ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "focal_length"),
+        ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
+    ],
+)
+def test_what_an_image_lacks_is_named_with_the_option_that_gives_it(image, options, message):
+    with pytest.raises(InputError, match=message):
+        open_source(image, **options)
+
+
+def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures(tmp_path, frames):
+    bare = write_picture(tmp_path / "bare.jpg", frames[0], mask=False)
+    with pytest.raises(InputError, match="no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"):
+        open_source(bare, INTRINSICS, mask="given").load([0])
+    (tmp_path / "bare_depth.png").unlink()
+    with pytest.raises(InputError, match="bare_depth.png or bare_depth.npy beside it, expected .* --depth FILE"):
+        open_source(bare, INTRINSICS)
+
+
+def test_paths_that_are_no_source_are_refused(tmp_path, ellipsoids, frames):
+    (tmp_path / "notes.txt").write_text("x")
+    for path, message in (
+        (tmp_path / "nowhere", "nowhere does not exist, expected CATEGORY/SEQUENCE"),
+        (tmp_path / "notes.txt", "is neither a folder nor a JPEG or PNG file"),
+        (ellipsoids.root / "ellipsoid", "is a category, expected one of its sequences: a, b"),
+        (ellipsoids.root / "ellipsoid/c", "does not exist"),
+        (tmp_path, "nerfstudio: transforms.json"),
+    ):
+        with pytest.raises(InputError, match=message):
+            open_source(path)
+    write_lists(tmp_path, frames)
+    (tmp_path / "transforms.json").write_text("{}")
+    with pytest.raises(InputError, match="files of the formats nerfstudio, lists, expected one"):
+        open_source(tmp_path)
+
+
+def test_options_that_no_source_takes_are_refused(ellipsoids, image):
+    sequence = ellipsoids.root / "ellipsoid/a"
+    with pytest.raises(InputError, match="--depth-unit does not go with a sequence of a data folder"):
+        open_source(sequence, depth_unit=1.0)
+    with pytest.raises(InputError, match="--intrinsics does not go with a sequence of a data folder and a sequence"):
+        open_pair(sequence, sequence, {"intrinsics": (INTRINSICS,)})
+    with pytest.raises(InputError, match="--mask is given 3 times, expected at most two"):
+        open_pair(sequence, sequence, {"mask": ("auto",) * 3})
+    with pytest.raises(InputError, match="--depth is given 1 times, expected one for each image"):
+        open_pair(image, image, {"intrinsics": (INTRINSICS,), "depth": ("z.png",)})
+
+
+@pytest.fixture(scope="module")
+def own(ellipsoids, tmp_path_factory):
+    """Both solvers on two labelled sequences, and the folder of their files."""
+    out = tmp_path_factory.mktemp("own") / "deep" / "out"
+    folder = ellipsoids.root / "ellipsoid"
+    found = estimate_pose(
+        folder / "a", folder / "b", "both", reference_frame=2, targets=3, backbone=CoordinateBackbone(), out=out
+    )
+    return found, out
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Two pictures of one object, elsewhere in the second, and its true pose. The second has no mask."""
+    folder = tmp_path_factory.mktemp("pictures")
+    first, second = look_at((1, 0.3, 0.3)), look_at(ELSEWHERE.R @ (1, 0.6, 0.4))
+    write_picture(folder / "cup.jpg", render(first, AT_HOME))
+    write_picture(folder / "mug.jpg", render(second, ELSEWHERE), mask=False)
+    return folder / "cup.jpg", folder / "mug.jpg", true_pose(first, AT_HOME, second, ELSEWHERE)
+
+
+@pytest.fixture
+def backbone(monkeypatch):
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: CoordinateBackbone())
+    monkeypatch.setenv("COLUMNS", "160")
+
+
+def test_labelled_sequences_are_compared_with_their_labels(own):
+    found, _ = own
+    assert list(found.estimates) == ["paper", "verified"] and found.masks == ("given", "given")
+    assert list(found.errors) == ["paper", "verified"] and max(found.errors.values()) < 25
+    assert found.reference.name == "a/2" and [frame.name for frame in found.targets] == ["b/0", "b/2", "b/4"]
+    assert "paper: PoseEstimate(" in repr(found) and "verified: PoseEstimate(" in repr(found)
+
+
+def test_the_aligned_cloud_lies_on_the_target_object_in_its_world(own, ellipsoids):
+    found, out = own
+    assert sorted(path.name for path in out.iterdir()) == [
+        "aligned_paper.ply", "aligned_verified.ply", "report.html", "target.ply",
+    ]  # fmt: skip
+    # Sequence b is the object of the test's renderer, rotated and shifted.
+    label = zsp_lite.labels.read_labels(ellipsoids.root, "ellipsoid")["b"].trans
+    clouds = {path.stem: read_ply(path) for path in out.glob("*.ply")}
+    for name, (points, colours) in clouds.items():
+        at_home = (points - label[:3, 3]) @ label[:3, :3]
+        assert len(points) > 500 and np.abs(inside(at_home)).mean() < (0.05 if name == "target" else 0.15), name
+        assert len(np.unique(colours, axis=0)) > 100
+
+
+def test_the_report_has_the_answers_the_sources_and_the_errors(own):
+    found, out = own
+    text = (out / "report.html").read_text()
+    assert "<h1>a to b</h1>" in text and "ellipsoid/a, frame 2" in text and "ellipsoid/b, frames 0, 2, 4" in text
+    for solver, error in found.errors.items():
+        assert f"{solver} solver: rotation error {error:.1f}°" in text.replace("\n", "")
+    assert "reference given with the images, target given with the images" in text
+    assert "There is no label to compare with" not in text
+
+
+def test_a_path_that_is_not_utf8_is_written_and_the_clouds_come_before_the_report(own, tmp_path, monkeypatch):
+    found, _ = own
+    named = replace(found, sources=("capture \udcff", "b"))
+    paths = write_pair(named, tmp_path / "named")
+    assert [path.name for path in paths][:2] == ["report.html", "target.ply"]
+    assert "capture ?" in paths[0].read_text(encoding="utf-8")
+
+    def fail(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("zsp_lite.viz.report.write_pair_report", fail)
+    with pytest.raises(OSError, match="No space"):
+        write_pair(found, tmp_path / "full")
+    assert len(list((tmp_path / "full").glob("*.ply"))) == 3
+
+
+def test_json_has_every_number_of_the_estimates(own):
+    found, _ = own
+    content = json.loads(json.dumps(found.as_json(), allow_nan=False))
+    assert content["target"]["views"] == ["b/0", "b/2", "b/4"] and content["reference"]["masks"] == "given"
+    for solver, estimate in found.estimates.items():
+        one = content["estimates"][solver]
+        np.testing.assert_array_equal(one["matrix"], estimate.sim3.matrix)
+        np.testing.assert_allclose(one["scale"] * np.array(one["rotation"]), np.array(one["matrix"])[:3, :3])
+        assert one["view_name"] == found.targets[one["view"]].name and one["flags"] == list(estimate.flags)
+        assert one["error_degrees"] == found.errors[solver] and one["confidence"] == estimate.confidence
+        assert one["one_of_two"] == estimate.one_of_two
+        for other, alternative in zip(one["alternatives"], estimate.alternatives, strict=True):
+            assert other["probability"] == alternative.probability > 0
+            np.testing.assert_array_equal(other["matrix"], alternative.sim3.matrix)
+        assert len(one["alternatives"]) > 0 or solver == "paper"
+    assert content["degrees_between_solvers"] == found.disagreement < 20
+
+
+def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path):
+    found, out = own
+    doubtful = replace(found.estimates["verified"], one_of_two=True)
+    pair = replace(found, estimates={"verified": doubtful})
+    assert [path.name for path in write_pair(pair, tmp_path)] == [
+        "report.html", "target.ply", "aligned_verified.ply", "aligned_verified_2.ply",
+    ]  # fmt: skip
+    assert "One of two: both poses of the verified solver" in (tmp_path / "report.html").read_text()
+    (first, _), (second, _) = (read_ply(tmp_path / f"aligned_verified{name}.ply") for name in ("", "_2"))
+    np.testing.assert_array_equal(first, read_ply(out / "aligned_verified.ply")[0])
+    other = doubtful.alternatives[0]
+    points = found.targets[doubtful.view].camera.to_camera(first)
+    expected = found.targets[other.view].camera.to_world(other.sim3.apply(doubtful.sim3.inverse().apply(points)))
+    np.testing.assert_allclose(second, expected, atol=1e-3)
+    assert pair.as_json()["estimates"]["verified"]["one_of_two"] is True
+
+
+def test_two_pictures_without_labels_give_the_true_pose_and_no_error(pictures, tmp_path):
+    cup, mug, truth = pictures
+    found = zsp_lite.estimate_pose(
+        cup, mug, "paper", intrinsics=INTRINSICS, backbone=CoordinateBackbone(), out=tmp_path
+    )
+    assert found.masks == ("given", "auto") and len(found.targets) == 1
+    assert found.errors == {} and np.isnan(found.error)
+    assert rotation_error(found.estimates["paper"].sim3.R, truth.R) < 20
+    assert found.estimates["paper"].sim3.scale == pytest.approx(truth.scale, rel=0.2)
+    text = (tmp_path / "report.html").read_text()
+    assert "There is no label to compare with" in text and "rotation error" not in text
+    assert "target found from the depth" in text
+
+
+def test_the_pose_does_not_depend_on_the_unit_of_length_of_a_capture(pictures):
+    """Lengths are scaled to those of CO3D, and those of the result are the capture's."""
+    cup, mug, _ = pictures
+    metres, millimetres = (
+        estimate_pose(
+            cup, open_source(mug, INTRINSICS, depth_unit=unit, mask="auto"), "paper", intrinsics=INTRINSICS,
+            backbone=CoordinateBackbone(),
+        ).estimates["paper"]
+        for unit in (0.001, 1.0)
+    )  # fmt: skip
+    np.testing.assert_array_equal(metres.inliers, millimetres.inliers)
+    assert [any("from the camera" in flag for flag in one.flags) for one in (metres, millimetres)] == [False, True]
+    assert rotation_error(metres.sim3.R, millimetres.sim3.R) < 0.1
+    assert millimetres.sim3.scale == pytest.approx(1000 * metres.sim3.scale, rel=1e-3)
+    np.testing.assert_allclose(millimetres.sim3.t, 1000 * metres.sim3.t, rtol=1e-2)
+    for estimate, unit in ((metres, 1), (millimetres, 1000)):  # points are in the units of the capture
+        source, target = (points[estimate.inliers] for points in estimate.points)
+        assert np.linalg.norm(estimate.sim3.apply(source) - target, axis=1).max() < 0.3 * unit
+
+
+def around(count, arc=360):
+    """Views of the object elsewhere, evenly spaced in an arc of degrees."""
+    angles = np.radians(np.arange(count) * arc / count)
+    cameras = [look_at(ELSEWHERE.R @ (np.cos(a), np.sin(a), 0.3)) for a in angles]
+    return [render(camera, ELSEWHERE, f"{k:04d}") for k, camera in enumerate(cameras)]
+
+
+def test_a_capture_is_a_target_of_several_views_without_those_that_are_black_or_empty(pictures, tmp_path):
+    cup, _, _ = pictures
+    views = around(6)
+    views[2] = replace(views[2], rgb=np.zeros_like(views[2].rgb))
+    views[3] = replace(views[3], mask=np.zeros_like(views[3].mask))
+    write_lists(tmp_path, views)
+    for view in views:
+        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
+    found = estimate_pose(cup, tmp_path, targets=6, intrinsics=INTRINSICS, backbone=CoordinateBackbone())
+    estimate = found.estimates["verified"]
+    truth = true_pose(look_at((1, 0.3, 0.3)), AT_HOME, views[estimate.view].camera, ELSEWHERE)
+    assert found.masks[1] == "given" and rotation_error(estimate.sim3.R, truth.R) < 15
+    assert estimate.flags == ("0002.jpg left out: black image", "0003.jpg left out: empty object mask")
+
+
+def test_a_target_that_is_seen_from_one_side_is_flagged(pictures, tmp_path):
+    cup, mug, _ = pictures
+    write_lists(tmp_path, around(5, 90))
+    options = {"mask": "auto", "intrinsics": INTRINSICS, "backbone": CoordinateBackbone()}
+    for target, degrees in ((mug, "0"), (tmp_path, "7[0-5]")):
+        (flag,) = estimate_pose(cup, target, "paper", **options).estimates["paper"].flags
+        assert re.fullmatch(rf"the target was seen from one side only \({degrees} degrees\): if .* is wrong", flag)
+    found = estimate_pose(cup, tmp_path, "paper", targets=2, **options, out=tmp_path / "out")
+    assert "the target was seen from one side only" in (tmp_path / "out/report.html").read_text()
+    assert "one side only" in found.as_json()["estimates"]["paper"]["flags"][-1]
+
+
+def test_depth_in_another_unit_is_questioned(image, frames, tmp_path):
+    np.save(tmp_path / "z.npy", frames[0].depth)  # in metres
+    with pytest.raises(InputError, match=r"0.00\d+ m from the camera, expected 0.05 to 20 m; .* --depth-unit"):
+        open_source(image, INTRINSICS, depth=tmp_path / "z.npy").load([0])
+    chosen = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=30.0)
+    (flag,) = chosen.unit_flags(chosen.load([0]))
+    assert "m from the camera, expected 0.05 to 20 m" in flag
+    right = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=1.0)
+    (frame,) = right.load([0])
+    np.testing.assert_array_equal(frame.depth, frames[0].depth)
+    assert right.unit_flags([frame]) == ()
+
+
+def test_an_output_that_is_no_folder_is_refused_before_the_computation(pictures, tmp_path):
+    def fail(images):
+        raise AssertionError("computed")
+
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="expected a folder"):
+        estimate_pose(*pictures[:2], intrinsics=INTRINSICS, backbone=fail, out=tmp_path / "file")
+
+
+def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, tmp_path, capsys):
+    folder = ellipsoids.root / "ellipsoid"
+    words = [str(folder / "a"), str(folder / "b"), "--targets", "3", "--out", str(tmp_path)]
+    assert cli.main(["estimate", *words, "--solver", "both", "--reference-frame", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "Pose from a to b" in text and "confidence" in text
+    assert "error: angle to the labelled rotation" in " ".join(text.split())
+    assert "ellipsoid/a, frame 2 (mask: given)" in text
+    assert text.count("reference-camera points to camera points of view") == 2
+    assert "hypothesis 2: turned by" in text and "The rotations of both solvers differ by" in text
+    for name in ("report.html", "target.ply", "aligned_paper.ply", "aligned_verified.ply"):
+        assert f"Written: {tmp_path / name}" in text.replace("\n", "") and (tmp_path / name).is_file()
+
+
+def test_the_command_prints_json_alone_or_says_that_there_are_no_labels(backbone, pictures, tmp_path, capsys):
+    cup, mug, _ = pictures
+    words = ["--intrinsics", ",".join(map(str, INTRINSICS)), "--solver", "paper", "--out", str(tmp_path)]
+    assert cli.main(["estimate", str(cup), str(mug), *words, "--mask", "given", "--mask", "auto", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["estimates"]["paper"]["error_degrees"] is None
+    assert (content["reference"]["masks"], content["target"]["masks"]) == ("given", "auto")
+    assert content["files"] == [str(tmp_path / name) for name in ("report.html", "target.ply", "aligned_paper.ply")]
+    assert cli.main(["estimate", str(cup), str(mug), *words]) == 0
+    text = capsys.readouterr().out
+    assert "No pose labels: the rotation error is unknown." in text and "error:" not in text
+    assert "(masks: auto)" in text and "flag: the target was seen from one side only (0 degrees)" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{cup}"], "Missing argument 'TARGET'"),
+        (["{cup}", "{mug}"], "no intrinsics, expected --intrinsics FX,FY,CX,CY"),
+        (["{cup}", "nowhere"], "nowhere does not exist"),
+        (["{cup}", "{mug}", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
+        (["{cup}", "{mug}", "--intrinsics", "1,2"], "expected four numbers"),
+        (["{cup}", "{mug}", "--targets", "0"], "'--targets': 0 is not in the range"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--reference-frame", "3"], "has no frame 3"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--box", "0,0,500,500"], "expected one inside"),
+        (["{cup}", "{mug}", "--intrinsics", "190,190,90,70", "--mask", "given"], "expected --mask auto or --box"),
+    ],
+)
+def test_bad_input_is_one_line_with_the_cure_and_nothing_is_written(
+    backbone, pictures, tmp_path, monkeypatch, capsys, words, message
+):
+    monkeypatch.chdir(tmp_path)
+    names = {"cup": pictures[0], "mug": pictures[1]}
+    assert cli.main(["estimate", *(word.format(**names) for word in words)]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.err.count("\n") == 1 and captured.out == ""
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
