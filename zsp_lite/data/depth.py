@@ -131,12 +131,7 @@ def patch_points(
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split `length` pixels into `count` bands.
-
-    Returns:
-        Pixel indices (count, width of the widest band), whether each index belongs to its band (same shape), and the
-        central index of each band (count,).
-    """
+    """Split pixels into bands: their indices padded to the widest, which of these are in the band, and its centre."""
     edges = np.arange(count + 1) * length // count
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]
