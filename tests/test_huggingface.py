@@ -273,7 +273,7 @@ def refused(name, match: str, **options):
 
 def test_without_transformers_the_extra_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(f"hf:{folders['vit']}", r"pip install 'zsp-lite\[transformers\]'")
+    refused(f"hf:{folders['vit']}", r"pip install transformers")
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from zsp_lite.matching import cyclical_distances, match, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import correct_matches
 
-pytest.importorskip("ipywidgets", reason="widgets are an optional extra: pip install 'zsp-lite[notebooks]'")
+pytest.importorskip("ipywidgets", reason="widgets are optional: pip install ipywidgets anywidget")
 matplotlib.use("agg")
 
 from tools import widget_examples as examples  # noqa: E402

@@ -15,7 +15,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling
 from zsp_lite.metrics import rotation_error
 
-pytest.importorskip("anywidget", reason="the labelling widget needs anywidget: pip install 'zsp-lite[notebooks]'")
+pytest.importorskip("anywidget", reason="the labelling widget is optional: pip install anywidget")
 
 from zsp_lite.widgets.cloud_view import ViewBox, point_under, subsample  # noqa: E402
 from zsp_lite.widgets.labelling import label_poses  # noqa: E402

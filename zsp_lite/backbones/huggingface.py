@@ -2,7 +2,7 @@
 
 The code does not depend on the architecture: blocks are found by the names of their query, key and value projections,
 forward hooks record the outputs of these, and the attention of the CLS token is computed in transformers' attention
-interface, which all models call. Needs the package transformers (`pip install 'zsp-lite[transformers]'`), which is
+interface, which all models call. Needs the package transformers (the extra `transformers`), which is
 imported on first use.
 """
 
@@ -247,7 +247,7 @@ def _transformers(name: str):
         from transformers import AttentionInterface, AutoConfig, AutoModel
     except ImportError as error:
         raise InputError(
-            f"{name}: needs the package transformers: pip install 'zsp-lite[transformers]' ({_one_line(error)})"
+            f"{name}: needs the package transformers: pip install transformers huggingface-hub ({_one_line(error)})"
         ) from error
     AttentionInterface.register(_ATTENTION, _attend)
     return AutoConfig, AutoModel

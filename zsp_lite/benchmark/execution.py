@@ -271,7 +271,7 @@ def _dask(address: str) -> Iterator[Workers]:
         from distributed import Client
         from distributed.scheduler import KilledWorker
     except ImportError as error:
-        raise InputError("executor dask://: needs Dask; pip install 'zsp-lite[cluster]'") from error
+        raise InputError("executor dask://: needs Dask: pip install dask distributed") from error
     try:
         client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_DASK_TIMEOUT)
     except (OSError, ValueError) as error:

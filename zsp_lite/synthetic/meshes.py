@@ -105,7 +105,7 @@ def _require_pycollada(path: Path) -> None:
     try:
         import collada  # noqa: F401
     except ImportError as error:
-        raise InputError(f"model {path} needs the package pycollada: pip install 'zsp-lite[meshes]'") from error
+        raise InputError(f"model {path} needs the package pycollada: pip install pycollada") from error
 
 
 def _missing_textures(path: Path) -> list[str]:

@@ -46,9 +46,7 @@ def load_package(name: str = "ipywidgets") -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InputError(
-            f"this widget needs {name}, which is not installed; pip install {name} (or 'zsp-lite[notebooks]')"
-        ) from error
+        raise InputError(f"this widget needs {name}, which is not installed; pip install {name}") from error
 
 
 def slider(label: str, low: float, high: float, value: float, step: float = 1) -> "ValueWidget":
