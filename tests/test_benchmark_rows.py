@@ -79,8 +79,8 @@ def test_icp_starts_from_the_first_view_or_from_the_best(run):
 
 def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
     calls = []
-    match_pair = ZeroShotPose.match_pair
-    monkeypatch.setattr(ZeroShotPose, "match_pair", lambda *args: (calls.append(1), match_pair(*args))[1])
+    match_views = ZeroShotPose.match_views
+    monkeypatch.setattr(ZeroShotPose, "match_views", lambda *args: (calls.append(1), match_views(*args))[1])
     rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
     evaluate(small_folder(), BACKBONE, rows, 2, 3, out=tmp_path, categories=["pebble"])
     assert len(calls) == 2 * 3
@@ -88,13 +88,13 @@ def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
 
 def test_rows_whose_matches_differ_do_not_share_them(tmp_path, monkeypatch):
     """The verified solver takes the best matches, the paper's those that k-means selects."""
-    calls, match_pair = [], ZeroShotPose.match_pair
+    calls, match_views = [], ZeroShotPose.match_views
 
     def record(method, *args):
         calls.append(method.clusters)
-        return match_pair(method, *args)
+        return match_views(method, *args)
 
-    monkeypatch.setattr(ZeroShotPose, "match_pair", record)
+    monkeypatch.setattr(ZeroShotPose, "match_views", record)
     evaluate(small_folder(), BACKBONE, ["ours", "verified"], 1, 2, out=tmp_path, categories=["pebble"])
     assert sorted(calls) == [False, False, True, True]
 

@@ -42,7 +42,7 @@ from zsp_lite.benchmark.tables import (
 from zsp_lite.cli.terminal import as_rich
 from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import accuracy, bootstrap_ci, object_weights, paired_test
+from zsp_lite.metrics import accuracy, bootstrap_ci, object_draws, paired_test
 
 pytestmark = pytest.mark.slow
 
@@ -303,7 +303,7 @@ def test_the_names_of_objects_are_read_from_a_pairs_key():
 def test_intervals_of_a_run_come_from_resampled_objects(run):
     errors = read_once(run[0]).errors("ours")
     objects, categories = [objects_of(key) for key in errors], [category_of(key) for key in errors]
-    expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), object_weights(objects, categories))
+    expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), object_draws(objects, categories))
     assert run[1]["methods"]["ours"]["acc30_ci"] == pytest.approx(list(expected))
 
 
@@ -319,7 +319,7 @@ def test_runs_on_different_objects_are_pooled(tmp_path):
     assert row["n"] == len(errors) == 3 * 48
     assert row["acc30"] == pytest.approx(np.mean([run.summary["methods"]["ours"]["acc30"] for run in runs]))
     objects, categories = [objects_of(key) for key in errors], [category_of(key) for key in errors]
-    weights = object_weights(objects, categories)
+    weights = object_draws(objects, categories)
     expected = bootstrap_ci(list(errors.values()), lambda e, w: accuracy(e, 30, w), weights)
     assert row["acc30_ci"] == pytest.approx(list(expected))
     single = runs[0].summary["methods"]["ours"]["acc30_ci"]

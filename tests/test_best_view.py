@@ -6,7 +6,7 @@ import torch
 
 from zsp_lite.best_view import (
     VIEW_SELECTORS,
-    ViewPair,
+    ViewMatch,
     correspondence_score,
     cyclical_iou,
     global_score,
@@ -78,7 +78,7 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
 
 def test_all_selectors_take_the_same_comparison():
     grid = torch.ones(2, 2, dtype=torch.bool)
-    comparison = ViewPair(
+    comparison = ViewMatch(
         feature_map([1.0, 0.0]), feature_map([1.0, 0.0]), grid, grid, torch.eye(4), matches([1.0] * 4), 4
     )
     scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}

@@ -14,8 +14,8 @@ from zsp_lite.metrics import (
     bootstrap_ci,
     mean_category_median,
     median,
-    object_weights,
-    pair_weights,
+    object_draws,
+    pair_draws,
     paired_test,
     rotation_error,
     summarise,
@@ -111,7 +111,7 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
 
 
 def test_the_seed_of_the_bootstrap_decides_the_draws():
-    first, again, other = (object_weights(PAIRS, resamples=50, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (object_draws(PAIRS, resamples=50, seed=seed) for seed in (1, 1, 2))
     assert (first == again).all() and (first != other).any()
 
 
@@ -127,7 +127,7 @@ PAIRS = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
 
 
 def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
-    weights = object_weights(PAIRS, resamples=500)
+    weights = object_draws(PAIRS, resamples=500)
     np.testing.assert_allclose(weights.sum(axis=1), len(PAIRS))
     for row in weights:
         # Some multiplicities of a, b, c and d, which sum to 4, explain all six weights up to their common factor.
@@ -141,22 +141,22 @@ def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
 
 
 def test_the_order_of_pairs_and_other_categories_do_not_change_a_draw():
-    weights = object_weights(PAIRS, ["x"] * 6)
-    np.testing.assert_array_equal(object_weights(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
-    both = object_weights(PAIRS * 2, ["w"] * 6 + ["x"] * 6)
+    weights = object_draws(PAIRS, ["x"] * 6)
+    np.testing.assert_array_equal(object_draws(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
+    both = object_draws(PAIRS * 2, ["w"] * 6 + ["x"] * 6)
     np.testing.assert_array_equal(both[:, 6:], weights)
     assert (both[:, :6] != weights).any()
     np.testing.assert_allclose(both[:, :6].sum(axis=1), 6)
 
 
 def test_pairs_of_two_objects_are_resampled_one_by_one():
-    np.testing.assert_array_equal(np.unique(object_weights([("a", "b"), ("b", "a")])), [0, 1, 2])
+    np.testing.assert_array_equal(np.unique(object_draws([("a", "b"), ("b", "a")])), [0, 1, 2])
 
 
 def test_objects_and_categories_of_other_lengths_are_refused():
     for objects, categories in ((PAIRS, ["x"]), ([], None), (["a", "b"], None)):
-        with pytest.raises(InputError, match="object_weights"):
-            object_weights(objects, categories)
+        with pytest.raises(InputError, match="object_draws"):
+            object_draws(objects, categories)
 
 
 def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
@@ -171,7 +171,7 @@ def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
         total = np.take_along_axis(easiness, first, 1) + np.take_along_axis(easiness, second, 1)
         errors = np.where(0.3 + total + rng.normal(size=(2, n)) > 0, 10.0, 90.0).ravel()
         objects = np.stack([first.ravel(), second.ravel()], axis=-1)
-        for i, weights in enumerate((object_weights(objects, categories, 400), pair_weights(2 * n, 400))):
+        for i, weights in enumerate((object_draws(objects, categories, 400), pair_draws(2 * n, 400))):
             low, high = bootstrap_ci(errors, acc30, weights)
             hits[i] += low <= truth <= high
     by_objects, by_pairs = hits / worlds
@@ -180,7 +180,7 @@ def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
 
 def test_the_mean_of_category_medians_is_over_categories():
     errors, categories = np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)], ["x"] * 6 + ["y"] * 6
-    weights = object_weights(PAIRS * 2, categories)
+    weights = object_draws(PAIRS * 2, categories)
     found, interval = mean_category_median(errors, categories, weights)
     assert found == 20
     medians = [(10 + median(errors[6:], row)) / 2 for row in weights[:, 6:]]
@@ -216,7 +216,7 @@ def test_one_pair_proves_nothing():
 def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates():
     rng = np.random.default_rng(0)
     first, second = rng.uniform(0, 60, 6), rng.uniform(0, 40, 6)
-    weights = object_weights(PAIRS)
+    weights = object_draws(PAIRS)
     result = paired_test(first, second, weights=weights)
     gains = [100 * np.average((second < 30) * 1.0 - (first < 30), weights=row) for row in weights]
     assert result["accuracy_gain_ci"] == pytest.approx(list(np.percentile(gains, [2.5, 97.5])))

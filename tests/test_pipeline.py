@@ -293,7 +293,7 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
 def test_a_solver_says_whether_kmeans_selects_its_matches(views):
     def matches(**settings):
         method = replace(BASE, **settings)
-        return method.match_pair(*views[:2], method.similarities(views[0], views[1:2])[0]).matches.reference
+        return method.match_views(*views[:2], method.similarities(views[0], views[1:2])[0]).matches.reference
 
     clustered, best = matches(kmeans=True), matches(kmeans=False)
     assert not np.array_equal(clustered, best)

@@ -11,7 +11,7 @@ from zsp_lite.metrics import reliability
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_cloud
 from zsp_lite.verified.maps import Projection, ViewMaps
-from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreWeights
+from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreCoefficients
 from zsp_lite.viz import alignment_plots, feature_plots, plots, result_plots, scene3d, verified
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
@@ -148,7 +148,10 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
 
 def test_bars_of_the_score_add_up_to_it():
     rng = np.random.default_rng(0)
-    terms, weights = dict(zip(TERM_NAMES, rng.random(len(TERM_NAMES)))), ScoreWeights(*rng.normal(size=len(TERM_NAMES)))
+    terms, weights = (
+        dict(zip(TERM_NAMES, rng.random(len(TERM_NAMES)))),
+        ScoreCoefficients(*rng.normal(size=len(TERM_NAMES))),
+    )
     _, axis = plt.subplots()
     verified.draw_score_contributions(axis, {"first": terms}, weights)
     widths = [bar.get_width() for bar in axis.containers[0]]

@@ -13,7 +13,7 @@ from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.metrics import reliability
 from zsp_lite.verified.confidence import Calibration
-from zsp_lite.verified.verification import ScoreWeights
+from zsp_lite.verified.verification import ScoreCoefficients
 
 RUNS = {
     name: REPOSITORY / "notebooks" / "results" / "paper_run" / f"{name}.json.gz" for name in ("procedural", "artists")
@@ -82,7 +82,7 @@ def test_the_page_on_solvers_has_the_confidences(runs):
 
 
 def test_the_page_on_solvers_has_the_weights_and_the_calibration_of_the_code():
-    text, weights = page("docs/solvers.md"), asdict(ScoreWeights())
+    text, weights = page("docs/solvers.md"), asdict(ScoreCoefficients())
     stated = {}
     for line in rows(text, "| term |"):
         term, forward, reverse = re.match(r"\| `(\w+)` \|[^|]*\| (\S+) \| (\S*) ?\|", line).groups()

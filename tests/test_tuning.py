@@ -23,9 +23,9 @@ from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import reliability
 from zsp_lite.verified.confidence import Calibration
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 
-TRUE_WEIGHTS = ScoreWeights(6, 0, -4, -2, 0, 3, 0, -1, 2)
+TRUE_WEIGHTS = ScoreCoefficients(6, 0, -4, -2, 0, 3, 0, -1, 2)
 
 
 def sample_outcomes(n: int, rng: np.random.Generator, m: int = 6) -> list[Outcome]:
@@ -76,7 +76,7 @@ def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[O
     return outcomes
 
 
-FIRST_TERMS = ScoreWeights(*[1.0, 1.0, *[0.0] * (len(TERM_NAMES) - 2)])
+FIRST_TERMS = ScoreCoefficients(*[1.0, 1.0, *[0.0] * (len(TERM_NAMES) - 2)])
 TRUE_CALIBRATION = Calibration(-0.4, 0.2, 0.5, -0.4, -6.0, -0.6)
 
 
@@ -139,13 +139,13 @@ def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog, monkeypatch):
     for one in outcomes:
         m = len(one.errors)
         assert one.terms.shape == (m, len(TERM_NAMES)) and one.angles.shape == (m, m)
-        assert one.ranked(ScoreWeights())[1][0] == one.errors[0]  # the solver ranks by the default weights
+        assert one.ranked(ScoreCoefficients())[1][0] == one.errors[0]  # the solver ranks by the default weights
         np.testing.assert_allclose(np.diag(one.angles), 0, atol=1e-3)
         assert one.angles[~np.eye(m, dtype=bool)].min() > 14.9
 
 
 def test_the_reports_have_all_fits():
-    text = "\n".join(report_weights(sample_outcomes(60, np.random.default_rng(5)), ScoreWeights()))
+    text = "\n".join(report_weights(sample_outcomes(60, np.random.default_rng(5)), ScoreCoefficients()))
     assert "60 pairs of 4 categories" in text and "held-out category" in text and "best 2 different poses" in text
     assert all(name in text for name in TERM_NAMES)
     text = "\n".join(report_calibration(sample_ranked(200, TRUE_CALIBRATION, np.random.default_rng(5)), FIRST_TERMS))

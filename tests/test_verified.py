@@ -13,7 +13,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import extract_views, object_crop
 
 pytestmark = pytest.mark.slow
@@ -71,7 +71,7 @@ def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
     for one in found:
         assert one.terms.keys() == set(TERM_NAMES)
         assert one.score == pytest.approx(
-            sum(getattr(ScoreWeights(), name) * one.terms[name] for name in TERM_NAMES), abs=1e-2
+            sum(getattr(ScoreCoefficients(), name) * one.terms[name] for name in TERM_NAMES), abs=1e-2
         )
         assert 0 <= one.confidence <= 1
     assert max(one.confidence for one in found) == found[0].confidence

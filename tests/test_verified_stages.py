@@ -47,7 +47,7 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
     ScoreTerms,
-    ScoreWeights,
+    ScoreCoefficients,
     forward_terms,
     reverse_terms,
     score_terms,
@@ -409,7 +409,7 @@ def test_the_truth_scores_above_other_poses(scene, truth):
         torch.deg2rad(torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]]))
     )
     others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
-    score = ScoreWeights().score(score_terms(scene, concatenate([truth, others])))
+    score = ScoreCoefficients().score(score_terms(scene, concatenate([truth, others])))
     assert int(score.argmax()) == 0
     terms = first_terms(scene, truth)
     assert (
@@ -453,7 +453,7 @@ def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
 def test_the_score_is_the_weighted_sum_of_the_terms():
     rng = np.random.default_rng(4)
     terms = ScoreTerms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERM_NAMES))
-    weights = ScoreWeights(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
+    weights = ScoreCoefficients(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
     by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERM_NAMES)
     np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
 

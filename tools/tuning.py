@@ -39,7 +39,7 @@ from zsp_lite.metrics import reliability, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, different_poses, modes
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 
 CORRECT_ANGLE = 30.0  # degrees
@@ -83,14 +83,14 @@ class Outcome:
         """Whether there are several hypotheses, one of them correct enough to learn from."""
         return len(self.errors) > 1 and bool(self.correctness.max() > _MIN_CORRECTNESS)
 
-    def ranked(self, weights: ScoreWeights) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    def ranked(self, weights: ScoreCoefficients) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return by how many nats each different pose is below the best under the weights, and its error."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
         different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
         return scores[order[0]] - scores[different], self.errors[different]
 
-    def circumstances(self, weights: ScoreWeights) -> tuple[int, float, float]:
+    def circumstances(self, weights: ScoreCoefficients) -> tuple[int, float, float]:
         """Return what the probability of "none of these" depends on: number of views, view_std and shape fit."""
         best = self.terms[(self.terms @ np.array(astuple(weights))).argmax()]
         return self.n_views, self.view_std, float(best @ np.array(astuple(weights.of_shape())))
@@ -134,7 +134,7 @@ def solve_views(
     """Run a method's verified solver on the views of a pair and compute the errors of its hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
     similarities = method.similarities(reference, targets)
-    pairs = [method.match_pair(reference, target, sim) for target, sim in zip(targets, similarities)]
+    pairs = [method.match_views(reference, target, sim) for target, sim in zip(targets, similarities)]
     solution = method.solver.solve(reference, targets, pairs, method.seed)
 
     cameras = [target.frame.camera for target in targets]
@@ -152,7 +152,7 @@ def solve_views(
     )
 
 
-def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreWeights:
+def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreCoefficients:
     r"""Fit the weights of a conditional logit with soft labels.
 
     Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2 with c_i = \exp(-(error_i / 12 degrees)^2) and w
@@ -166,7 +166,7 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
         raise InputError(f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some")
     std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
     columns, correctness = [one.terms / std for one in used], [one.correctness for one in used]
-    return ScoreWeights(*(conditional_logit(columns, correctness, ridge) / std).tolist())
+    return ScoreCoefficients(*(conditional_logit(columns, correctness, ridge) / std).tolist())
 
 
 def conditional_logit(
@@ -208,7 +208,7 @@ def conditional_logit(
 
 
 def fit_calibration(
-    outcomes: Sequence[Outcome], weights: ScoreWeights, ridge: float = _CALIBRATION_RIDGE
+    outcomes: Sequence[Outcome], weights: ScoreCoefficients, ridge: float = _CALIBRATION_RIDGE
 ) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
@@ -267,7 +267,7 @@ def leave_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _F
     return [fitted[one.category] for one in outcomes]
 
 
-def report_weights(outcomes: Sequence[Outcome], present: ScoreWeights) -> list[str]:
+def report_weights(outcomes: Sequence[Outcome], present: ScoreCoefficients) -> list[str]:
     """Format the fit of the weights and its accuracy on categories that the fit has not seen."""
     fitted = fit_weights(outcomes)
     held_out = leave_out(outcomes, fit_weights)
@@ -284,7 +284,7 @@ def report_weights(outcomes: Sequence[Outcome], present: ScoreWeights) -> list[s
     ]
 
 
-def report_calibration(outcomes: Sequence[Outcome], weights: ScoreWeights) -> list[str]:
+def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> list[str]:
     """Format the fit of the calibration, and how well it holds on categories that the fit has not seen."""
     fitted = fit_calibration(outcomes, weights)
     held_out = leave_out(outcomes, lambda some: fit_calibration(some, weights))
@@ -316,7 +316,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreWeights) -> li
     return lines
 
 
-def _share(outcomes: Sequence[Outcome], weights: ScoreWeights, k: int) -> float:
+def _share(outcomes: Sequence[Outcome], weights: ScoreCoefficients, k: int) -> float:
     return 100 * float(np.mean([(one.ranked(weights)[1][:k] < CORRECT_ANGLE).any() for one in outcomes]))
 
 
@@ -345,7 +345,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parts = pool.map(collect_outcomes, *zip(*jobs), [_VIEWS[fit]] * len(jobs))
             outcomes = [one for part in parts for one in part]
         report = report_weights if fit == "weights" else report_calibration
-        print("\n".join(report(outcomes, ScoreWeights())))
+        print("\n".join(report(outcomes, ScoreCoefficients())))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -197,4 +197,4 @@ def _matched(dataset: Co3D, pair: Pair, solver: str = "paper"):
     method, (reference, targets) = ZeroShotPose(_backbone(), solver=solver), dataset.load_pair(pair)
     reference, *targets = method.views([reference, *targets])
     sims = method.similarities(reference, targets)
-    return reference, targets, [method.match_pair(reference, *one) for one in zip(targets, sims)]
+    return reference, targets, [method.match_views(reference, *one) for one in zip(targets, sims)]

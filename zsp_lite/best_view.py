@@ -1,6 +1,6 @@
 """Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
 
-Each score is a function of features or matches. The entries of `VIEW_SELECTORS` have one argument, a `ViewPair`. The
+Each score is a function of features or matches. The entries of `VIEW_SELECTORS` have one argument, a `ViewMatch`. The
 view of highest score is selected.
 """
 
@@ -22,7 +22,7 @@ _ORTHOGONAL = 2**0.5
 
 
 @dataclass(frozen=True, eq=False)
-class ViewPair:
+class ViewMatch:
     """The reference and one target view, with their matches: the input of a view selector.
 
     Attributes:
@@ -45,7 +45,7 @@ class ViewPair:
 
     def __repr__(self) -> str:
         foregrounds = int(self.reference_foreground.sum()), int(self.target_foreground.sum())
-        return f"ViewPair({foregrounds[0]} and {foregrounds[1]} foreground patches, k={self.k},\n  {self.matches!r})"
+        return f"ViewMatch({foregrounds[0]} and {foregrounds[1]} foreground patches, k={self.k},\n  {self.matches!r})"
 
 
 @runtime_checkable
@@ -60,7 +60,7 @@ class ViewSelector(Protocol):
         ZeroShotPose(backbone, view_selector=close_matches)
     """
 
-    def __call__(self, pair: ViewPair, /) -> float:
+    def __call__(self, pair: ViewMatch, /) -> float:
         """Score a target view; the view of highest score is selected."""
         ...
 

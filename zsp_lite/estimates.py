@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.best_view import ViewPair
+from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, relative_pose
@@ -296,7 +296,7 @@ class Solver(Protocol):
     """
 
     def __call__(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
         """Estimate the pose of the reference object.
 

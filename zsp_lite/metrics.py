@@ -1,7 +1,7 @@
 """Pose errors, and statistics of many of them (paper sec. 5.1, supplement, "Choice of evaluation metrics").
 
 Statistics take optional weights per pair, so that a bootstrap replicate is a row of weights. Pairs that share an
-object are not independent: `object_weights` resamples objects, and its weights give the intervals of this project.
+object are not independent: `object_draws` resamples objects, and its weights give the intervals of this project.
 """
 
 import hashlib
@@ -105,7 +105,7 @@ def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | 
     return ((ordered[lower] + ordered[upper]) / 2)[()]
 
 
-def object_weights(
+def object_draws(
     objects: Sequence[tuple[str, str]] | np.ndarray,
     categories: Sequence[str] | np.ndarray | None = None,
     resamples: int = RESAMPLES,
@@ -137,7 +137,7 @@ def object_weights(
     categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
     if objects.ndim != 2 or objects.shape[1] != 2 or len(objects) != len(categories) or not len(objects):
         raise InputError(
-            f"object_weights: objects of shape {objects.shape} and {len(categories)} categories, expected (n, 2) and n"
+            f"object_draws: objects of shape {objects.shape} and {len(categories)} categories, expected (n, 2) and n"
         )
     weights = np.empty((resamples, len(objects)))
     for category in np.unique(categories):
@@ -158,7 +158,7 @@ def object_weights(
     return weights
 
 
-def pair_weights(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
+def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
     """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
     return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
 
@@ -175,14 +175,14 @@ def bootstrap_ci(
         errors: (n,).
         statistic: Maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
             `lambda errors, weights: accuracy(errors, 30, weights)` do.
-        weights: From `object_weights`; None for `pair_weights(n)`, which treats pairs as independent.
+        weights: From `object_draws`; None for `pair_draws(n)`, which treats pairs as independent.
         level: Confidence level.
 
     Returns:
         The lower and the upper end of the interval.
     """
     errors = _errors(errors, -np.inf, np.inf)
-    return _interval(statistic(errors, pair_weights(len(errors)) if weights is None else weights), level)
+    return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights), level)
 
 
 def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
@@ -190,7 +190,7 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
 
     Args:
         errors: (n,) in degrees.
-        weights: From `object_weights`; None treats pairs as independent.
+        weights: From `object_draws`; None treats pairs as independent.
 
     Returns:
         {"n", "median" (degrees), "acc30", "acc15" (percent), for each of the three NAME_ci: [low, high], and
@@ -200,7 +200,7 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
         InputError: If there are no errors.
     """
     errors = _errors(errors)
-    weights = pair_weights(len(errors)) if weights is None else weights
+    weights = pair_draws(len(errors)) if weights is None else weights
     figures = {
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
@@ -220,7 +220,7 @@ def mean_category_median(
     Args:
         errors: (n,) in degrees.
         categories: The category of each pair.
-        weights: From `object_weights` with these categories.
+        weights: From `object_draws` with these categories.
     """
     errors, categories = _errors(errors), np.asarray(categories, dtype=str)
     members = [categories == category for category in np.unique(categories)]
@@ -240,7 +240,7 @@ def paired_difference(
         first: (n,) errors in degrees.
         second: (n,) errors of the same pairs in the same order.
         threshold: A pair is solved if its error is below it, in degrees.
-        weights: From `object_weights`; None treats pairs as independent.
+        weights: From `object_draws`; None treats pairs as independent.
 
     Returns:
         {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, and for
@@ -252,7 +252,7 @@ def paired_difference(
     first, second = _errors(first), _errors(second)
     if first.shape != second.shape or first.ndim != 1:
         raise InputError(f"paired_difference: shapes {first.shape} and {second.shape}, expected equal (n,)")
-    weights = pair_weights(len(first)) if weights is None else weights
+    weights = pair_draws(len(first)) if weights is None else weights
     differences = {
         "accuracy_gain": 100.0 * (second < threshold) - 100.0 * (first < threshold),
         "error_drop": first - second,
@@ -279,7 +279,7 @@ def paired_test(
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
     The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
-    small; the interval and the p value of `paired_difference` with `object_weights` are the ones to report.
+    small; the interval and the p value of `paired_difference` with `object_draws` are the ones to report.
 
     Args:
         first, second, threshold, weights: As in `paired_difference`.

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
-from zsp_lite.best_view import VIEW_SELECTORS, ViewPair, ViewSelector
+from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
@@ -210,7 +210,7 @@ class ZeroShotPose:
         timings: dict[str, float] = {}
         with timed(timings, "matching"):
             sims = self.similarities(reference, targets)
-            pairs = [self.match_pair(reference, target, sim) for target, sim in zip(targets, sims)]
+            pairs = [self.match_views(reference, target, sim) for target, sim in zip(targets, sims)]
         return self.estimate_from_pairs(reference, targets, pairs, timings)
 
     def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
@@ -218,14 +218,14 @@ class ZeroShotPose:
         function = similarities if self.binning else key_similarities
         return function(reference.features, [target.features for target in targets])
 
-    def match_pair(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewPair:
+    def match_views(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewMatch:
         """Match the reference with one target view (sec. 4.1), from their similarities."""
         matches = match(
             reference.features, target.features, self.k, self.clusters, self.seed, self.cycle_from,
             ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
             binning=self.binning,
         )  # fmt: skip
-        return ViewPair(
+        return ViewMatch(
             reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
         )
 
@@ -233,7 +233,7 @@ class ZeroShotPose:
         self,
         reference: View,
         targets: Sequence[View],
-        pairs: Sequence[ViewPair],
+        pairs: Sequence[ViewMatch],
         timings: dict[str, float] | None = None,
     ) -> PoseEstimate:
         """Run the solver on the usable target views (see `estimate`), for the reference view as it is.
@@ -241,7 +241,7 @@ class ZeroShotPose:
         Args:
             reference: Reference view.
             targets: Target views.
-            pairs: For each target view, its similarities to the reference and their matches (see `match_pair`).
+            pairs: For each target view, its similarities to the reference and their matches (see `match_views`).
             timings: Seconds of earlier stages, to include in the estimate's.
         """
         if not targets:
@@ -298,7 +298,7 @@ def solve_pair(
 def align_best_view(
     reference: View,
     targets: Sequence[View],
-    pairs: Sequence[ViewPair],
+    pairs: Sequence[ViewMatch],
     *,
     seed: int = 0,
     threshold: float = 0.2,

@@ -208,7 +208,7 @@ class Problem:
             if name not in self._shared:
                 sim = self.store.similarity(features, self.keys[0], key, solver, reference, view)
                 start = time.perf_counter()
-                matched = solver.match_pair(reference, view, sim)
+                matched = solver.match_views(reference, view, sim)
                 self._shared[name] = matched, time.perf_counter() - start
             matched, matching_seconds = self._shared[name]
             pairs.append(matched)

@@ -10,7 +10,7 @@ from zsp_lite.metrics import (
     accuracy,
     bootstrap_ci,
     mean_category_median,
-    object_weights,
+    object_draws,
     paired_difference,
     sign_test,
     summarise,
@@ -161,7 +161,7 @@ def frames_of(key: str) -> list[tuple[str, str]]:
 def weights_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
     """Draw bootstrap weights of the pairs with these keys, from resampled objects."""
     keys = list(keys)
-    return object_weights([objects_of(key) for key in keys], [category_of(key) for key in keys])
+    return object_draws([objects_of(key) for key in keys], [category_of(key) for key in keys])
 
 
 def _ordered(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
 from zsp_lite.verified.scene import Scene
-from zsp_lite.verified.verification import ScoreWeights, score_terms
+from zsp_lite.verified.verification import ScoreCoefficients, score_terms
 
 # Hypotheses kept from round to round, and the smallest angle between them in degrees.
 MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
@@ -44,7 +44,7 @@ POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, s
 
 
 def refine_coarse_to_fine(
-    scene: Scene, poses: Poses, weights: ScoreWeights, seed: int | np.random.Generator = 0
+    scene: Scene, poses: Poses, weights: ScoreCoefficients, seed: int | np.random.Generator = 0
 ) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
     rng = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
 
 
-def _score_function(scene: Scene, weights: ScoreWeights, counts: tuple[int, int]) -> Score:
+def _score_function(scene: Scene, weights: ScoreCoefficients, counts: tuple[int, int]) -> Score:
     """Return a function that scores poses by about `counts` points of the reference and of the targets."""
     totals = len(scene.reference_points), len(scene.target_points)
     stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))

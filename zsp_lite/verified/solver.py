@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from zsp_lite.best_view import ViewPair
+from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.verified.confidence import Calibration, hypothesis_probabilities, is_one_of_two, modes, nearly_as_probable
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
@@ -17,7 +17,7 @@ from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import TERM_NAMES, ScoreTerms, ScoreWeights, score_terms
+from zsp_lite.verified.verification import TERM_NAMES, ScoreTerms, ScoreCoefficients, score_terms
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
@@ -52,11 +52,11 @@ class VerifiedSolver:
     """A `estimates.Solver` that scores many poses against all target views."""
 
     kmeans: ClassVar[bool] = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
-    weights: ScoreWeights = ScoreWeights()
+    weights: ScoreCoefficients = ScoreCoefficients()
     calibration: Calibration = Calibration()
 
     def __call__(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], *, seed: int, threshold: float
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
         """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`.
 
@@ -76,7 +76,7 @@ class VerifiedSolver:
         )  # fmt: skip
 
     def solve(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewPair], seed: int | np.random.Generator = 0
+        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], seed: int | np.random.Generator = 0
     ) -> Solution:
         """Run all stages on usable target views and their matches with the reference.
 

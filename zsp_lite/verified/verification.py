@@ -82,7 +82,7 @@ FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 
 
 @dataclass(frozen=True)
-class ScoreWeights:
+class ScoreCoefficients:
     """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
 
     forward_similarity: float = 13.3
@@ -99,7 +99,7 @@ class ScoreWeights:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
         return terms.matrix() @ torch.tensor(astuple(self), dtype=torch.float32)
 
-    def of_shape(self) -> "ScoreWeights":
+    def of_shape(self) -> "ScoreCoefficients":
         """Return the weights of the terms that compare shapes; those of `FEATURE_TERMS` are 0."""
         return replace(self, **dict.fromkeys(FEATURE_TERMS, 0.0))
 

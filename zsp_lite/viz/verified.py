@@ -21,7 +21,7 @@ from zsp_lite.points import object_cloud
 from zsp_lite.verified.confidence import MODE_ANGLE
 from zsp_lite.verified.maps import ViewMaps
 from zsp_lite.verified.poses import Poses
-from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreWeights
+from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreCoefficients
 from zsp_lite.views import View
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_axes, draw_points, mark, show_images
 
@@ -140,12 +140,14 @@ def draw_point_term(
     bar.ax.tick_params(labelsize=8)
 
 
-def score_contributions(terms: Mapping[str, float], weights: ScoreWeights) -> dict[str, float]:
+def score_contributions(terms: Mapping[str, float], weights: ScoreCoefficients) -> dict[str, float]:
     """Return what each term adds to the score, weight times term in nats, by name."""
     return {name: getattr(weights, name) * terms[name] for name in TERM_NAMES}
 
 
-def draw_score_contributions(axis: Axes, hypotheses: Mapping[str, Mapping[str, float]], weights: ScoreWeights) -> None:
+def draw_score_contributions(
+    axis: Axes, hypotheses: Mapping[str, Mapping[str, float]], weights: ScoreCoefficients
+) -> None:
     """Draw what each term adds to the scores of one to four hypotheses. Terms of weight 0 are left out."""
     names = [name for name in TERM_NAMES if getattr(weights, name)]
     height = 0.8 / len(hypotheses)

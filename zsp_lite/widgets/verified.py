@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from zsp_lite.verified import Solution
 from zsp_lite.verified.poses import rotation_angles
-from zsp_lite.verified.verification import TERM_NAMES, ScoreWeights, forward_terms
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, forward_terms
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.viz.verified import POINT_CLASSES, classify_points, score_contributions
 from zsp_lite.widgets.common import interactive_figure, slider
@@ -24,7 +24,9 @@ _MAX_POINTS = 350  # per point cloud in 3D
 _LIMIT = 2.2  # of the 3D axes, in standard deviations of the object
 
 
-def ranked_hypotheses(solution: Solution, targets: Sequence["View"], weights: ScoreWeights = ScoreWeights()) -> "VBox":
+def ranked_hypotheses(
+    solution: Solution, targets: Sequence["View"], weights: ScoreCoefficients = ScoreCoefficients()
+) -> "VBox":
     """Show one hypothesis: point clouds in 3D, points in a target view, and the terms of the score.
 
     The controls are the rank of the hypothesis, the target view, and the azimuth of the 3D plot.

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 
-from zsp_lite.best_view import VIEW_SELECTORS, ViewPair
+from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.views import View
@@ -106,7 +106,7 @@ def evenly_spaced(n: int, count: int, first: int) -> np.ndarray:
 def best_view(
     reference: View,
     targets: Sequence[View],
-    pairs: Sequence[ViewPair],
+    pairs: Sequence[ViewMatch],
     positions: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
     angles: Float[np.ndarray, " n"],
 ) -> "VBox":
@@ -177,7 +177,7 @@ def best_view(
     return interactive_figure(figure, controls, update, alt)
 
 
-def _match_pixels(reference: View, target: View, pair: ViewPair) -> tuple[np.ndarray, np.ndarray]:
+def _match_pixels(reference: View, target: View, pair: ViewMatch) -> tuple[np.ndarray, np.ndarray]:
     matches = pair.matches
     return tuple(
         patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
