@@ -30,6 +30,7 @@ _MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
 
 _STEEP = 0.4  # sine of the angle to the vertical of a camera that is above or below the object
+_NEAR = 45.0  # degrees: within it, two views show about the same side
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,20 +240,41 @@ def _image_size(size: Sequence[int]) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
-def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Compute the angle that cameras span around a point: 360 degrees minus the largest gap; 0 for one camera.
+def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+    """Return the directions of cameras around a point in degrees, seen from above.
 
-    It is measured about the cameras' mean vertical, which is the image axis that they agree on better, since images may
-    be turned by 90 degrees. Cameras that look along it do not count, unless fewer than two others are left; then the
-    span is the largest angle between any two directions.
+    They are measured about the cameras' mean vertical, which is the image axis that they agree on better, since images
+    may be turned by 90 degrees. Cameras that look along it have no direction (NaN).
     """
     axes = np.mean([camera.R[:2] for camera in cameras], axis=0)
     vertical = axes[np.linalg.norm(axes, axis=1).argmax()]
     directions = np.stack([camera.centre for camera in cameras]) - centre
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     around = directions @ np.linalg.svd(vertical[None])[2][1:].T
-    around = around[np.linalg.norm(around, axis=1) > _STEEP]
-    if len(around) < 2:
-        return float(np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min())))
-    angles = np.sort(np.degrees(np.arctan2(*around.T)))
-    return float(360 - np.diff(angles, append=angles[0] + 360).max())
+    steep = np.linalg.norm(around, axis=1) <= _STEEP * np.linalg.norm(directions, axis=1)
+    return np.where(steep, np.nan, np.degrees(np.arctan2(*around.T)))
+
+
+def view_gaps(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+    """Return the angles between neighbouring cameras around a point in degrees; their sum is 360.
+
+    Cameras that look along the vertical do not count (see `azimuths`), unless fewer than two others are left: then the
+    cameras span the largest angle between any two of them.
+    """
+    angles = azimuths(cameras, centre)
+    angles = np.sort(angles[~np.isnan(angles)])
+    if len(angles) > 1:
+        return np.diff(angles, append=angles[0] + 360)
+    directions = np.stack([camera.centre for camera in cameras]) - centre
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))
+    return np.array([span, 360 - span])
+
+
+def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
+    """Return the angle that cameras span around a point: 360 degrees minus the largest gap; 0 for one camera."""
+    return float(360 - view_gaps(cameras, centre).max())
+
+
+def view_coverage(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
+    """Return the share of all directions around a point that are within 45 degrees of a camera's, in [0.25, 1]."""
+    return float(np.minimum(view_gaps(cameras, centre), 2 * _NEAR).sum() / 360)
