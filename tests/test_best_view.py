@@ -14,6 +14,7 @@ from zsp_lite.best_view import (
 )
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
+from zsp_lite.views import View
 
 
 def matches(similarities) -> Matches:
@@ -78,8 +79,7 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
 
 def test_all_selectors_take_the_same_comparison():
     grid = torch.ones(2, 2, dtype=torch.bool)
-    comparison = ViewMatch(
-        feature_map([1.0, 0.0]), feature_map([1.0, 0.0]), grid, grid, torch.eye(4), matches([1.0] * 4), 4
-    )
+    view = View(None, feature_map([1.0, 0.0]), grid)
+    comparison = ViewMatch(view, view, torch.eye(4), matches([1.0] * 4), 4)
     scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}
     assert scores == {"correspond": 0, "global": 1, "saliency": 1, "cyclical": 1}

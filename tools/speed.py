@@ -88,7 +88,7 @@ def main() -> None:
         for stage in stages:
             report(f"{solver} solver: {stage}", stages[stage])
         report(f"{solver} solver: all but features", sum(stages.values()) - stages["features"])
-        solving = sum(stages.values()) - sum(stages[name] for name in ("crop", "features", "matching"))
+        solving = sum(stages.values()) - sum(stages[name] for name in ("features", "matching"))
         report(f"{solver} solver without crop, features and matching", solving)
     frame = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[0])
     report("reading and features, per frame", 1000 * seconds(lambda: method.views([dataset.load(frame)])))

@@ -133,9 +133,7 @@ def solve_views(
 ) -> Outcome:
     """Run a method's verified solver on the views of a pair and compute the errors of its hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
-    similarities = method.similarities(reference, targets)
-    pairs = [method.match_views(reference, target, sim) for target, sim in zip(targets, similarities)]
-    solution = method.solver.solve(reference, targets, pairs, method.seed)
+    solution = method.solver.solve(reference, targets, method.match_views(reference, targets), method.seed)
 
     cameras = [target.frame.camera for target in targets]
     true = [relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3] for camera in cameras]

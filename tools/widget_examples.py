@@ -196,5 +196,4 @@ def _matched(dataset: Co3D, pair: Pair, solver: str = "paper"):
     """Load a pair and match its reference with every target view, as a solver needs it."""
     method, (reference, targets) = ZeroShotPose(_backbone(), solver=solver), dataset.load_pair(pair)
     reference, *targets = method.views([reference, *targets])
-    sims = method.similarities(reference, targets)
-    return reference, targets, [method.match_views(reference, *one) for one in zip(targets, sims)]
+    return reference, targets, method.match_views(reference, targets)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches, cyclical_distances
+from zsp_lite.views import View
 
 Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
@@ -26,25 +27,21 @@ class ViewMatch:
     """The reference and one target view, with their matches: the input of a view selector.
 
     Attributes:
-        reference: Features of the reference.
-        target: Features of the target view.
-        reference_foreground: Foreground patches of the reference.
-        target_foreground: Foreground patches of the target view.
+        reference: The reference.
+        target: The target view.
         similarity: Cosines between the descriptors of the reference's patches and the target's.
         matches: At most k matches.
         k: Requested number of matches.
     """
 
-    reference: FeatureMap
-    target: FeatureMap
-    reference_foreground: Bool[torch.Tensor, "rows cols"]
-    target_foreground: Bool[torch.Tensor, "rows cols"]
+    reference: View
+    target: View
     similarity: Float[torch.Tensor, "reference target"]
     matches: Matches
     k: int
 
     def __repr__(self) -> str:
-        foregrounds = int(self.reference_foreground.sum()), int(self.target_foreground.sum())
+        foregrounds = int(self.reference.foreground.sum()), int(self.target.foreground.sum())
         return f"ViewMatch({foregrounds[0]} and {foregrounds[1]} foreground patches, k={self.k},\n  {self.matches!r})"
 
 
@@ -54,13 +51,13 @@ class ViewSelector(Protocol):
 
     A selector that counts the matches whose descriptors are close:
 
-        def close_matches(pair):
-            return float((pair.matches.similarity > 0.8).sum())
+        def close_matches(one):
+            return float((one.matches.similarity > 0.8).sum())
 
         ZeroShotPose(backbone, view_selector=close_matches)
     """
 
-    def __call__(self, pair: ViewMatch, /) -> float:
+    def __call__(self, one: ViewMatch, /) -> float:
         """Score a target view; the view of highest score is selected."""
         ...
 
@@ -70,10 +67,6 @@ def correspondence_score(matches: Matches, k: int) -> float:
 
     d is the L2 distance of normalised descriptors. A missing match counts as orthogonal, d = sqrt(2). Otherwise a view
     with few matches would win by having few terms to sum.
-
-    Args:
-        matches: At most k matches.
-        k: Requested number of matches.
     """
     return score_from_cosines(torch.as_tensor(matches.similarity), k)
 
@@ -104,12 +97,8 @@ def cyclical_iou(
 ) -> float:
     """Compute "CyclicalDistIoU": the IoU of the target's foreground and its patches of small cyclical distance.
 
-    Args:
-        similarity: Cosines between the reference's and the target's descriptors.
-        reference_foreground: Foreground patches of the reference.
-        target_foreground: Foreground patches of the target.
-        threshold: Largest cyclical distance, in patches, of a target patch through the reference back to the target.
-            The paper gives none; 1.5 takes a return to the patch itself or to one of its eight neighbours.
+    The distance is that of a cycle from a target patch through the reference back to the target. The paper gives no
+    threshold; 1.5 patches take a return to the patch itself or to one of its eight neighbours.
     """
     distances = cyclical_distances(
         similarity.T,
@@ -122,8 +111,8 @@ def cyclical_iou(
 
 
 VIEW_SELECTORS: dict[str, ViewSelector] = {
-    "correspond": lambda pair: correspondence_score(pair.matches, pair.k),
-    "global": lambda pair: global_score(pair.reference, pair.target),
-    "saliency": lambda pair: mask_iou(pair.reference_foreground, pair.target_foreground),
-    "cyclical": lambda pair: cyclical_iou(pair.similarity, pair.reference_foreground, pair.target_foreground),
+    "correspond": lambda one: correspondence_score(one.matches, one.k),
+    "global": lambda one: global_score(one.reference.features, one.target.features),
+    "saliency": lambda one: mask_iou(one.reference.foreground, one.target.foreground),
+    "cyclical": lambda one: cyclical_iou(one.similarity, one.reference.foreground, one.target.foreground),
 }

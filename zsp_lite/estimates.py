@@ -283,11 +283,11 @@ class Solver(Protocol):
 
     A solver that fits the pose in the first target view:
 
-        def first_view(reference, targets, pairs, *, seed, threshold):
-            points = match_points(reference, targets[0], pairs[0].matches)
+        def first_view(reference, targets, matched, *, seed, threshold):
+            points = match_points(reference, targets[0], matched[0].matches)
             sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
             scores = np.zeros(len(targets))
-            return PoseEstimate(sim3, 0, pairs[0].matches, inliers, scores, reference, tuple(targets))
+            return PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
 
@@ -296,22 +296,21 @@ class Solver(Protocol):
     """
 
     def __call__(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], *, seed: int, threshold: float
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
         """Estimate the pose of the reference object.
 
-        `ZeroShotPose` checks the views before the call and leaves out unusable targets (see `views.usable_targets`).
-        It maps `view`, `view_scores`, `target_views` and the hypotheses' views of the result back to all targets,
-        and adds its own flags and timings.
+        `ZeroShotPose` leaves out unusable targets before the call (see `views.usable_targets`). It maps the views of
+        the result back to all targets, and adds its own flags and timings.
 
         Args:
             reference: Reference view, with known depth in at least one pixel.
             targets: N >= 1 target views, each with known depth in at least one pixel and a foreground patch.
-            pairs: For each target view, its similarities to the reference and their matches.
+            matched: For each target view, its similarities to the reference and their matches.
             seed: Seed of everything that is drawn; the same seed gives the same pose.
             threshold: Largest residual of an inlier for an object of unit standard deviation, as the scenes of CO3D
-                are scaled. (The paper's solver takes it in scene units unless `adaptive_threshold` is set; the
-                verified solver multiplies it by the target object's standard deviation.)
+                are scaled. (The paper's solver takes it in scene units; the verified solver multiplies it by the
+                target object's standard deviation.)
 
         Returns:
             The estimate, in terms of the views given.
@@ -333,13 +332,9 @@ def match_points(
 def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) -> PoseEstimate:
     """Express an estimate for a turned reference in the camera of the reference as it is.
 
-    With Q the rotation from its camera points to those of the turned camera (see `Camera.turn`), the pose T of the
-    turned reference becomes T Q. Feature maps and matches are turned back.
-
-    Args:
-        estimate: Estimate for the reference view turned by `quarters`.
-        reference: Reference view before the turn, for its frame.
-        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
+    `quarters` counts turns by 90 degrees, counterclockwise as in `numpy.rot90`. With Q the rotation from the camera
+    points of `reference` to those of the turned camera (see `Camera.turn`), the pose T of the turned reference becomes
+    T Q. Feature maps and matches are turned back.
     """
     camera = reference.frame.camera
     turn = Sim3(1.0, camera.turn(quarters).R @ camera.R.T, np.zeros(3))

@@ -1,6 +1,7 @@
 """Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
 import importlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +18,8 @@ from zsp_lite.errors import InputError, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import key_similarities, match, similarities
+from zsp_lite.matching import key_similarities, match
+from zsp_lite.matching import similarities as cosine_similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import View, crop_size, extract_views, has_saliency, object_crop, usable_targets
 
@@ -39,8 +41,6 @@ class ZeroShotPose:
         trials: Number of RANSAC trials.
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
             deviation.)
-        adaptive_threshold: Multiply the threshold by the standard deviation of the object points in the chosen view,
-            for scenes in other units (supplement, "RANSAC parameters").
         sample_size: Points per RANSAC trial.
         saliency_threshold: A patch is foreground if its saliency is above this. The default is the published code's.
         foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency
@@ -50,7 +50,7 @@ class ZeroShotPose:
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
         solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
-            or a `Solver`. The settings view_selector, trials, sample_size and adaptive_threshold are for "paper" only.
+            or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
         upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
             degrees, because the features of a turned image are others and phones may store images turned. The estimate
@@ -68,7 +68,6 @@ class ZeroShotPose:
     view_selector: str | ViewSelector = "correspond"
     trials: int = 1000
     threshold: float = 0.2
-    adaptive_threshold: bool = False
     sample_size: int = 4
     saliency_threshold: float = SALIENCY_THRESHOLD
     foreground: Literal["saliency", "mask"] = "saliency"
@@ -80,22 +79,18 @@ class ZeroShotPose:
     upright: bool = True
 
     def __post_init__(self):
-        for name, allowed in (
-            ("matcher", ("cyclical", *MATCHERS)),
-            ("view_selector", tuple(VIEW_SELECTORS)),
-            ("foreground", ("saliency", "mask")),
-            ("cycle_from", ("reference", "target")),
-            ("solver", ("paper", *SOLVERS)),
-            ("kmeans", (True, False, None)),
-            ("adaptive_threshold", (True, False)),
-            ("binning", (True, False)),
-            ("upright", (True, False)),
-        ):
+        names = {
+            "matcher": ("cyclical", *MATCHERS),
+            "view_selector": tuple(VIEW_SELECTORS),
+            "solver": ("paper", *SOLVERS),
+            "foreground": ("saliency", "mask"),
+            "cycle_from": ("reference", "target"),
+        }
+        for name, allowed in names.items():
             value = getattr(self, name)
-            if name in ("matcher", "view_selector", "solver") and callable(value):
-                continue
-            if value not in allowed:
-                raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
+            plugged_in = name in ("matcher", "view_selector", "solver") and callable(value)
+            if not plugged_in and value not in allowed:
+                raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
         for name, minimum in (("k", 1), ("trials", 1), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), minimum)
         if self.foreground == "saliency" and not has_saliency(self.backbone):
@@ -114,7 +109,7 @@ class ZeroShotPose:
 
         A frame without a mask is not cropped. Target views with a `frame_defect`, such as an empty mask, or without
         foreground are left out, with a flag each. If the matches of the best view do not determine a pose (fewer than
-        `sample_size`, collinear, or no plausible scale), the paper's solver returns `view_alignment` with a flag.
+        `sample_size`, or collinear), the pose is that of the best view itself, with a flag (see `view_alignment`).
 
         Args:
             reference: Frame of the reference object.
@@ -125,38 +120,45 @@ class ZeroShotPose:
                 depth.
         """
         timings: dict[str, float] = {}
-        turns, views = self.pair_views(reference, targets, timings)
-        return self.estimate_from_turns(turns, views, timings)
-
-    def pair_views(
-        self, reference: Frame, targets: Sequence[Frame], timings: dict[str, float] | None = None
-    ) -> tuple[list[View], list[View]]:
-        """Crop frames and extract features and foregrounds, all in one batch.
-
-        Args:
-            reference: Frame of the reference object.
-            targets: Frames of the target object.
-            timings: Gets the seconds of both stages.
-
-        Returns:
-            The view of the reference, or the views of its four turns if it is not `upright`; and the target views.
-        """
-        timings = {} if timings is None else timings
-        with timed(timings, "crop"):
-            size = crop_size(self.backbone)
-            crop, *crops = [object_crop(frame, size) for frame in (reference, *targets)]
-            turns = [turn_frame(crop, quarters) for quarters in range(1 if self.upright else 4)]
         with timed(timings, "features"):
-            views = extract_views(self.backbone, [*turns, *crops], self.foreground, self.saliency_threshold)
-        return views[: len(turns)], views[len(turns) :]
+            first, *others = self.views([reference, *targets])
+        found = self.estimate_from_views(first, others)
+        return replace(found, timings=timings | found.timings)
 
     def views(self, frames: Iterable[Frame]) -> list[View]:
-        """Crop frames to their objects and extract features and foregrounds, as `estimate` does."""
-        crops = [object_crop(frame, crop_size(self.backbone)) for frame in frames]
-        return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
+        """Crop frames to their objects and extract features and foregrounds, all in one batch."""
+        size = crop_size(self.backbone)
+        return self._views([object_crop(frame, size) for frame in frames])
+
+    def match_views(
+        self,
+        reference: View,
+        targets: Sequence[View],
+        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
+    ) -> list[ViewMatch]:
+        """Match the reference with each target view (sec. 4.1).
+
+        Args:
+            reference: Reference view.
+            targets: Target views.
+            similarities: For each target view, the cosines between the reference's patches and its own, if they are
+                known already.
+        """
+        if similarities is None:
+            compare = cosine_similarities if self.binning else key_similarities
+            similarities = compare(reference.features, [target.features for target in targets])
+        matched = []
+        for target, similarity in zip(targets, similarities, strict=True):
+            matches = match(
+                reference.features, target.features, self.k, self.clusters, self.seed, self.cycle_from,
+                ref_foreground=reference.foreground, target_foreground=target.foreground, sim=similarity,
+                matcher=self.matcher, binning=self.binning,
+            )  # fmt: skip
+            matched.append(ViewMatch(reference, target, similarity, matches, self.k))
+        return matched
 
     def estimate_from_views(
-        self, reference: View, targets: Sequence[View], timings: dict[str, float] | None = None
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None
     ) -> PoseEstimate:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
@@ -165,108 +167,58 @@ class ZeroShotPose:
         Args:
             reference: Reference view (see `views`).
             targets: Target views.
-            timings: Seconds of earlier stages, to include in the estimate's.
-        """
-        timings, turns = dict(timings or {}), [reference]
-        if not self.upright:
-            with timed(timings, "turns"):
-                crops = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
-                turns += extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
-        return self.estimate_from_turns(turns, targets, timings)
-
-    def estimate_from_turns(
-        self, turns: Sequence[View], targets: Sequence[View], timings: dict[str, float] | None = None
-    ) -> PoseEstimate:
-        """Run the stages after feature extraction for every turn of the reference, and keep the best estimate.
-
-        Turns that do not determine a pose are left out. Timings are the sums over all turns.
-
-        Args:
-            turns: The reference view, or several turned by 0, 1, ... quarter turns (see `pair_views`).
-            targets: Target views.
-            timings: Seconds of earlier stages, to include in the estimate's.
-
-        Raises:
-            InputError: No turn determines a pose; the error is that of the first.
-        """
-        found, failures, total = [], [], dict(timings or {})
-        for quarters, view in enumerate(turns):
-            try:
-                one = self._estimate_matched(view, targets)
-            except InputError as error:
-                failures.append(error)
-                continue
-            for stage, seconds in one.timings.items():
-                total[stage] = total.get(stage, 0.0) + seconds
-            score = one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
-            found.append((score, quarters, one))
-        if not found:
-            raise failures[0]
-        _, quarters, best = max(found, key=lambda one: one[0])
-        return replace(turn_reference_back(best, turns[0], quarters) if quarters else best, timings=total)
-
-    def _estimate_matched(self, reference: View, targets: Sequence[View]) -> PoseEstimate:
-        """Match a reference view with the targets and run the solver."""
-        timings: dict[str, float] = {}
-        with timed(timings, "matching"):
-            sims = self.similarities(reference, targets)
-            pairs = [self.match_views(reference, target, sim) for target, sim in zip(targets, sims)]
-        return self.estimate_from_pairs(reference, targets, pairs, timings)
-
-    def similarities(self, reference: View, targets: Sequence[View]) -> list[Float[torch.Tensor, "n1 n2"]]:
-        """Compute the cosine similarities between the reference's and each target's patch descriptors."""
-        function = similarities if self.binning else key_similarities
-        return function(reference.features, [target.features for target in targets])
-
-    def match_views(self, reference: View, target: View, sim: Float[torch.Tensor, "n1 n2"]) -> ViewMatch:
-        """Match the reference with one target view (sec. 4.1), from their similarities."""
-        matches = match(
-            reference.features, target.features, self.k, self.clusters, self.seed, self.cycle_from,
-            ref_foreground=reference.foreground, target_foreground=target.foreground, sim=sim, matcher=self.matcher,
-            binning=self.binning,
-        )  # fmt: skip
-        return ViewMatch(
-            reference.features, target.features, reference.foreground, target.foreground, sim, matches, self.k
-        )
-
-    def estimate_from_pairs(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        pairs: Sequence[ViewMatch],
-        timings: dict[str, float] | None = None,
-    ) -> PoseEstimate:
-        """Run the solver on the usable target views (see `estimate`), for the reference view as it is.
-
-        Args:
-            reference: Reference view.
-            targets: Target views.
-            pairs: For each target view, its similarities to the reference and their matches (see `match_views`).
-            timings: Seconds of earlier stages, to include in the estimate's.
+            matched: The result of `match_views`, for the reference as it is, if it is known already.
         """
         if not targets:
             raise InputError("no target views, expected at least one")
         if defect := frame_defect(reference.frame):
             raise InputError(f"reference {reference.frame.name or 'view'}: {defect}")
+        if self.upright or matched is not None:
+            return self._solve(reference, targets, matched)
+        turns = [reference, *self._views([turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)])]
+        found, failures, timings = [], [], Counter()
+        for quarters, view in enumerate(turns):
+            try:
+                one = self._solve(view, targets)
+            except InputError as error:  # this turn does not determine a pose, another one may
+                failures.append(error)
+                continue
+            timings.update(one.timings)
+            score = one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
+            found.append((score, quarters, one))
+        if not found:
+            raise failures[0]
+        _, quarters, best = max(found, key=lambda one: one[0])
+        return replace(turn_reference_back(best, reference, quarters), timings=dict(timings))
+
+    def _views(self, crops: Sequence[Frame]) -> list[View]:
+        return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
+
+    def _solve(
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None
+    ) -> PoseEstimate:
+        """Match the reference view as it is and run the solver on the usable target views."""
+        timings: dict[str, float] = {}
+        if matched is None:
+            with timed(timings, "matching"):
+                matched = self.match_views(reference, targets)
         usable, flags = usable_targets(targets)
         found = self._solver()(
-            reference, [targets[i] for i in usable], [pairs[i] for i in usable],
+            reference, [targets[i] for i in usable], [matched[i] for i in usable],
             seed=self.seed, threshold=self.threshold,
         )  # fmt: skip
         scores = np.full(len(targets), -np.inf)
         scores[usable] = found.view_scores
         return replace(
             found, view=usable[found.view], view_scores=scores, target_views=tuple(targets),
-            timings=(timings or {}) | found.timings, flags=(*flags, *found.flags),
+            timings=timings | found.timings, flags=(*flags, *found.flags),
             hypotheses=tuple(replace(one, view=usable[one.view]) for one in found.hypotheses),
         )  # fmt: skip
 
     def _solver(self) -> Solver:
         if self.solver == "paper":
-            return partial(
-                align_best_view, view_selector=self.view_selector, trials=self.trials, sample_size=self.sample_size,
-                adaptive_threshold=self.adaptive_threshold,
-            )  # fmt: skip
+            settings = {"view_selector": self.view_selector, "trials": self.trials, "sample_size": self.sample_size}
+            return partial(align_best_view, **settings)
         if isinstance(self.solver, str):
             module, name = SOLVERS[self.solver].split(":")
             return getattr(importlib.import_module(module), name)()
@@ -274,38 +226,23 @@ class ZeroShotPose:
 
 
 def solve_pair(
-    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
+    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str]
 ) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers; crops and features are computed once.
-
-    Args:
-        method: The method.
-        reference: Frame of the reference object.
-        targets: Frames of the target object.
-        solvers: Names of solvers; by default the method's own.
-
-    Raises:
-        InputError: The pose cannot be estimated (see `ZeroShotPose.estimate`).
-    """
-    if solvers is None:
-        name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
-        return {name: method.estimate(reference, targets)}
-    timings: dict[str, float] = {}
-    turns, views = method.pair_views(reference, targets, timings)
-    return {name: replace(method, solver=name).estimate_from_turns(turns, views, timings) for name in solvers}
+    """Estimate the pose of a pair by each of several solvers, by name; crops and features are computed once."""
+    first, *others = method.views([reference, *targets])
+    return {name: replace(method, solver=name).estimate_from_views(first, others) for name in solvers}
 
 
 def align_best_view(
     reference: View,
     targets: Sequence[View],
-    pairs: Sequence[ViewMatch],
+    matched: Sequence[ViewMatch],
     *,
     seed: int = 0,
     threshold: float = 0.2,
     view_selector: str | ViewSelector = "correspond",
     trials: int = 1000,
     sample_size: int = 4,
-    adaptive_threshold: bool = False,
 ) -> PoseEstimate:
     """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by RANSAC (sec. 4.3).
 
@@ -314,16 +251,15 @@ def align_best_view(
     timings: dict[str, float] = {}
     with timed(timings, "view"):
         select = VIEW_SELECTORS[view_selector] if isinstance(view_selector, str) else view_selector
-        scores = np.array([select(pair) for pair in pairs], dtype=np.float64)
+        scores = np.array([select(one) for one in matched], dtype=np.float64)
         best = int(scores.argmax())
-        matches = pairs[best].matches
+        matches = matched[best].matches
     with timed(timings, "alignment"):
         points = match_points(reference, targets[best], matches)
-        unit = (standard_deviation(_foreground_points(targets[best])) or 1.0) if adaptive_threshold else 1.0
         flags: tuple[str, ...] = ()
         try:
             sim3, inliers = ransac(
-                *points, threshold=unit * threshold, trials=trials, sample_size=sample_size, seed=seed,
+                *points, threshold=threshold, trials=trials, sample_size=sample_size, seed=seed,
                 scale_range=SCALE_RANGE,
             )  # fmt: skip
             if (agreeing := int(inliers.sum())) < sample_size:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
@@ -14,7 +13,7 @@ from zsp_lite.benchmark.store import FrameKey, FrameStore
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.pairs import Pair
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, real_array
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
@@ -83,49 +82,34 @@ class Row(Protocol):
 
 
 def as_answer(found: Any) -> Answer:
-    """Convert what a row returns to an Answer."""
-    if isinstance(found, Answer):
-        return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
+    """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
         details = {"matches": len(found.matches), "inliers": int(found.inliers.sum()), "timings": found.timings}
         if found.confidence is not None:
             details["confidence"] = round(found.confidence, 4)
         sim3 = found.sim3
-        return Answer(
-            sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses, found.one_of_two
-        )  # fmt: skip
+        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses, found.one_of_two)
+    if isinstance(found, Answer):
+        return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
     return Answer(_rotation(pose), int(view))
 
 
-def _rotation(found: Any) -> Float[np.ndarray, "3 3"]:
-    matrix = np.asarray(found, dtype=np.float64) if isinstance(found, np.ndarray | torch.Tensor | list) else np.empty(0)
-    if matrix.shape != (3, 3):
-        raise InputError(
-            f"method returned a {type(found).__name__}, expected a Sim3 or 3x3 rotation, alone or with the view's "
-            "index, a PoseEstimate or an Answer"
-        )
-    return Sim3(1.0, matrix, np.zeros(3)).R
+def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
+    return Sim3(1.0, real_array("pose of the row", pose), np.zeros(3)).R
 
 
 def _details(details: Mapping[str, Any]) -> dict[str, Any]:
-    if reserved := sorted({*RESERVED} & details.keys()):
-        raise InputError(
-            f"method's details have reserved names: {', '.join(reserved)}, expected none of {', '.join(RESERVED)}"
-        )
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in details.items()}
     for name, value in plain.items():
-        if name != "timings" and not isinstance(value, bool | int | float | str | None):
-            raise InputError(f"method's detail {name} is a {type(value).__name__}, expected a number or a text")
+        if name in RESERVED or (name != "timings" and not isinstance(value, bool | int | float | str | None)):
+            raise InputError(
+                f"detail {name} of the row is a {type(value).__name__}, expected a number or a text with another name "
+                f"than {', '.join(RESERVED)}"
+            )
     return plain
-
-
-def frame_keys(pair: Pair) -> list[FrameKey]:
-    """Return the frames of a pair, the reference first."""
-    targets = [(pair.target_sequence, number) for number in pair.target_frames]
-    return [(pair.reference_sequence, pair.reference_frame), *targets]
 
 
 class Problem:
@@ -142,7 +126,9 @@ class Problem:
     """
 
     def __init__(self, pair: Pair, store: FrameStore):
-        self.pair, self.seed, self.store, self.keys = pair, pair.seed, store, frame_keys(pair)
+        self.pair, self.seed, self.store = pair, pair.seed, store
+        targets = [(pair.target_sequence, number) for number in pair.target_frames]
+        self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
         self._shared: dict[tuple, Any] = {}
 
     @property
@@ -175,7 +161,7 @@ class Problem:
 
     def first_cameras(self) -> tuple[Camera, Camera]:
         """Return the cameras of the first frame of the reference's and the target's sequence."""
-        return self.store.first_camera(self.keys[0][0]), self.store.first_camera(self.keys[1][0])
+        return self.store.first_camera(self.pair.reference_sequence), self.store.first_camera(self.pair.target_sequence)
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
@@ -187,30 +173,28 @@ class Problem:
             settings: Settings of `ZeroShotPose` that differ from the defaults.
             target: Index of the only target view to use; None uses all.
         """
-        settings = dict(settings or {})
-        name = (features, target, tuple(sorted(settings.items(), key=lambda item: item[0])))
+        name = (features, target, tuple(sorted((settings or {}).items(), key=lambda item: item[0])))
         if name not in self._shared:
-            solver = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
-            self._shared[name] = self._estimate(features, solver, target)
+            method = ZeroShotPose(self.store.extractors[features], **(settings or {}), seed=self.seed)
+            self._shared[name] = self._estimate(features, method, target)
         return self._shared[name]
 
-    def _estimate(self, features: str, solver: ZeroShotPose, target: int | None) -> PoseEstimate:
-        reference, *views = self.views(features, solver.foreground, solver.saliency_threshold)
+    def _estimate(self, features: str, method: ZeroShotPose, target: int | None) -> PoseEstimate:
+        reference, *views = self.views(features, method.foreground, method.saliency_threshold)
         targets = list(zip(self.keys[1:], views))
         if target is not None:
             targets = [targets[target]]
-        if not solver.upright:
-            return solver.estimate_from_views(reference, [view for _, view in targets])
-        settings = tuple(getattr(solver, name) for name in _MATCH_SETTINGS)
-        pairs, seconds = [], 0.0
+        if not method.upright:
+            return method.estimate_from_views(reference, [view for _, view in targets])
+        settings = tuple(getattr(method, name) for name in _MATCH_SETTINGS)
+        matches, seconds = [], 0.0
         for key, view in targets:
-            name = ("pair", features, key, settings)
+            name = ("matches", features, key, settings)
             if name not in self._shared:
-                sim = self.store.similarity(features, self.keys[0], key, solver, reference, view)
+                similarity = self.store.similarity(features, self.keys[0], key, method, reference, view)
                 start = time.perf_counter()
-                matched = solver.match_views(reference, view, sim)
-                self._shared[name] = matched, time.perf_counter() - start
-            matched, matching_seconds = self._shared[name]
-            pairs.append(matched)
+                self._shared[name] = method.match_views(reference, view, similarity), time.perf_counter() - start
+            match, matching_seconds = self._shared[name]
+            matches.append(match)
             seconds += matching_seconds
-        return solver.estimate_from_pairs(reference, [view for _, view in targets], pairs, {"matching": seconds})
+        return method.estimate_from_pairs(reference, [view for _, view in targets], matches, {"matching": seconds})

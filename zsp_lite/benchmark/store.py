@@ -13,6 +13,7 @@ from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
+from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, crop_size, frame_view, object_crop
 
@@ -108,7 +109,8 @@ class FrameStore:
         name = (*problem, features, solver.binning, target)
         if name not in self._similarities:
             with self._timed("similarity"):
-                (self._similarities[name],) = solver.similarities(first, [second])
+                compare = similarities if solver.binning else key_similarities
+                (self._similarities[name],) = compare(first.features, [second.features])
         return self._similarities[name]
 
     def _entry(self, key: FrameKey) -> _Entry:

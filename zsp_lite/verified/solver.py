@@ -56,16 +56,16 @@ class VerifiedSolver:
     calibration: Calibration = Calibration()
 
     def __call__(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], *, seed: int, threshold: float
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
         """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`.
 
         Inliers are matches with measured depth on both sides.
         """
-        solution = self.solve(reference, targets, pairs, seed)
+        solution = self.solve(reference, targets, matched, seed)
         rotation, best = solution.poses.rotation, solution.hypotheses[0]
         flags, one_of_two = reliability_flags(solution.hypotheses, rotation_angles(rotation, rotation).numpy())
-        matches = pairs[best.view].matches
+        matches = matched[best.view].matches
         (source, known), (target, seen) = (view.measured_points for view in (reference, targets[best.view]))
         u, v = tuple(matches.reference.T), tuple(matches.target.T)
         residual = np.linalg.norm(best.sim3.apply(source[u]) - target[v], axis=1)
@@ -76,7 +76,11 @@ class VerifiedSolver:
         )  # fmt: skip
 
     def solve(
-        self, reference: View, targets: Sequence[View], pairs: Sequence[ViewMatch], seed: int | np.random.Generator = 0
+        self,
+        reference: View,
+        targets: Sequence[View],
+        matched: Sequence[ViewMatch],
+        seed: int | np.random.Generator = 0,
     ) -> Solution:
         """Run all stages on usable target views and their matches with the reference.
 
@@ -90,8 +94,8 @@ class VerifiedSolver:
             with timed(timings, "scene"):
                 order = _content_order(targets)
                 scene = build_scene(
-                    reference, [targets[k] for k in order], [pairs[k].similarity for k in order],
-                    [pairs[k].matches for k in order],
+                    reference, [targets[k] for k in order], [matched[k].similarity for k in order],
+                    [matched[k].matches for k in order],
                 )  # fmt: skip
             with timed(timings, "proposals"):
                 poses = propose_poses(scene, rng)
