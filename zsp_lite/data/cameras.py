@@ -240,18 +240,27 @@ def _image_size(size: Sequence[int]) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
-def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions of cameras around a point in degrees, seen from above.
+def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
+    """Return two axes of the world, to the right and up in a drawing of the scene as seen from above.
 
-    They are measured about the cameras' mean vertical, which is the image axis that they agree on better, since images
-    may be turned by 90 degrees. Cameras that look along it have no direction (NaN).
+    They are normal to the cameras' mean vertical, which is the image axis that they agree on better, since images may
+    be turned by 90 degrees.
     """
-    axes = np.mean([camera.R[:2] for camera in cameras], axis=0)
-    vertical = axes[np.linalg.norm(axes, axis=1).argmax()]
+    axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
+    down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
+    right, up = np.linalg.svd(down[None])[2][1:]
+    return np.stack([right, up if np.cross(right, up) @ down < 0 else -up])
+
+
+def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+    """Return the directions of cameras around a point in degrees, seen from above (see `ground_axes`).
+
+    Cameras that look along the vertical have no direction (NaN).
+    """
     directions = np.stack([camera.centre for camera in cameras]) - centre
-    around = directions @ np.linalg.svd(vertical[None])[2][1:].T
-    steep = np.linalg.norm(around, axis=1) <= _STEEP * np.linalg.norm(directions, axis=1)
-    return np.where(steep, np.nan, np.degrees(np.arctan2(*around.T)))
+    x, y = ground_axes(cameras) @ directions.T
+    steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
+    return np.where(steep, np.nan, np.degrees(np.arctan2(y, x)))
 
 
 def view_gaps(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
