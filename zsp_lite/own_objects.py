@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
@@ -19,8 +19,7 @@ from zsp_lite.choices import MASKS, SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
@@ -33,7 +32,7 @@ from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
-from zsp_lite.points import near_median, object_pixels
+from zsp_lite.points import object_pixels, world_cloud
 from zsp_lite.views import View, has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
@@ -52,7 +51,6 @@ _UNITS = {
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
-_FAR = 4.0  # points farther from the median than this multiple of the median distance are not written
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +184,7 @@ def estimate_pose(
         frames = [loaded[k] for k in positions]
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
-        clouds = _object_cloud([frame])[0], _object_cloud(frames)[0]
+        clouds = world_cloud([frame])[0], world_cloud(frames)[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
         scales = [
             1.0 if source.format == "sequence" or len(cloud) < 2 else unit_scale(cloud)
@@ -226,8 +224,8 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
 
     out = Path(out)
     paths = [out / "target.ply"]
-    write_ply(paths[0], *_object_cloud(result.targets))
-    points, colours = _object_cloud([result.reference])
+    write_ply(paths[0], *world_cloud(result.targets))
+    points, colours = world_cloud([result.reference])
     points = result.reference.camera.to_camera(points)
     for solver, estimate in result.estimates.items():
         poses = {f"aligned_{solver}.ply": estimate}
@@ -420,15 +418,3 @@ def _in_units(estimate: PoseEstimate, reference_scale: float, target_scale: floa
         reference_view=view(estimate.reference_view, reference_scale),
         target_views=tuple(view(one, target_scale) for one in estimate.target_views),
     )
-
-
-def _object_cloud(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Gather the world points and colours of the object in the usable frames, without each frame's outliers."""
-    clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
-    for frame in frames:
-        if not frame_defect(frame) and (inside := (frame.depth > 0) & (frame.mask > ON_OBJECT)).any():
-            points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[inside])
-            kept = near_median(points, _FAR)
-            clouds.append(points[kept])
-            colours.append(frame.rgb[inside][kept])
-    return np.concatenate(clouds), np.concatenate(colours)

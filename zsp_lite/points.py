@@ -3,14 +3,17 @@
 Patches on the object are `View.foreground`; the functions here work on pixels and points.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import ON_OBJECT, Frame
+from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 from zsp_lite.errors import InputError
 from zsp_lite.views import View
 
+_FAR = 4.0  # points of a frame farther from their median than this multiple of the median distance are outliers
 _INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
@@ -97,3 +100,15 @@ def coloured_cloud(
     if len(kept) > most:
         kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), most, replace=False))]
     return points[kept], colours[kept]
+
+
+def world_cloud(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Gather the world points and colours of the object in the usable frames, without each frame's outliers."""
+    clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    for frame in frames:
+        if not frame_defect(frame) and (inside := (frame.depth > 0) & (frame.mask > ON_OBJECT)).any():
+            points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[inside])
+            kept = near_median(points, _FAR)
+            clouds.append(points[kept])
+            colours.append(frame.rgb[inside][kept])
+    return np.concatenate(clouds), np.concatenate(colours)
