@@ -8,19 +8,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsp_lite.errors import InputError
-from zsp_lite.metrics import (
-    accuracy,
+from zsp_lite.benchmark.statistics import (
     bootstrap_ci,
     mean_category_median,
-    median,
     object_draws,
     pair_draws,
     paired_test,
-    rotation_error,
     summarise,
-    translation_error,
 )
+from zsp_lite.errors import InputError
+from zsp_lite.metrics import accuracy, median, rotation_error, translation_error
 
 
 def about(axis, degrees: float) -> np.ndarray:
@@ -74,11 +71,6 @@ def test_batches_broadcast_and_tensors_are_taken():
 def test_what_is_no_rotation_is_refused(bad):
     with pytest.raises(InputError):
         rotation_error(np.eye(3), bad)
-
-
-def test_a_translation_of_another_shape_is_refused():
-    with pytest.raises(InputError):
-        translation_error([0, 0], [0, 0])
 
 
 def test_accuracy_counts_errors_strictly_below_the_threshold():
@@ -153,12 +145,6 @@ def test_pairs_of_two_objects_are_resampled_one_by_one():
     np.testing.assert_array_equal(np.unique(object_draws([("a", "b"), ("b", "a")])), [0, 1, 2])
 
 
-def test_objects_and_categories_of_other_lengths_are_refused():
-    for objects, categories in ((PAIRS, ["x"]), ([], None), (["a", "b"], None)):
-        with pytest.raises(InputError, match="object_draws"):
-            object_draws(objects, categories)
-
-
 def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
     """A simulated world: a pair is solved if its two objects and chance together are easy enough."""
     rng, n, m, worlds = np.random.default_rng(0), 50, 10, 200
@@ -185,12 +171,6 @@ def test_the_mean_of_category_medians_is_over_categories():
     assert found == 20
     medians = [(10 + median(errors[6:], row)) / 2 for row in weights[:, 6:]]
     assert interval == pytest.approx(tuple(np.percentile(medians, [2.5, 97.5])))
-
-
-@pytest.mark.parametrize("errors", [[], 3.0, [1.0, np.nan]])
-def test_nothing_or_nan_is_not_summarised(errors):
-    with pytest.raises(InputError):
-        summarise(errors)
 
 
 def test_half_turns_are_counted():
@@ -231,5 +211,3 @@ def test_a_method_does_not_differ_from_itself():
     result = paired_test(errors, errors)
     assert {result[f"{name}_p"] for name in ("accuracy_gain", "error_drop", "sign_test", "permutation_test")} == {1}
     assert result["error_drop"] == 0
-    with pytest.raises(InputError):
-        paired_test(errors, errors[:-1])

@@ -46,8 +46,8 @@ from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
-    ScoreTerms,
     ScoreCoefficients,
+    ScoreTerms,
     forward_terms,
     reverse_terms,
     score_terms,

@@ -1,0 +1,217 @@
+"""Intervals and tests of pose errors.
+
+Pairs that share an object are not independent: `object_draws` resamples objects, and its draws give the intervals of
+this project. Draws are weights: a row for each bootstrap replicate, a column for each pair.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from zsp_lite.io.files import stable_hash
+from zsp_lite.metrics import accuracy, median, weighted_mean
+
+RESAMPLES = 2000
+_FEWEST_OBJECTS = 3
+
+
+def object_draws(
+    objects: Sequence[tuple[str, str]] | np.ndarray,
+    categories: Sequence[str] | np.ndarray | None = None,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Float[np.ndarray, "resamples n"]:
+    """Draw bootstrap weights of pairs by resampling the objects that the pairs are made of.
+
+    In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
+    its two objects' multiplicities: the pigeonhole bootstrap (Owen, "The pigeonhole bootstrap", 2007) with one set of
+    objects on both sides, as in the vertex bootstrap of a network (Snijders & Borgatti, 1999). It accounts for pairs
+    that share an object. If the errors depend little on the objects, the intervals are too wide: the estimated
+    variance is then up to three times the true one. Every category keeps its total weight. Pairs of a category with
+    fewer than three objects are resampled as if they were independent: the spread between objects cannot be estimated
+    from two.
+
+    Args:
+        objects: The two objects (reference, target) of each of the n pairs.
+        categories: The category of each pair; the draws of one do not depend on the others. None for one category.
+        resamples: Number of replicates.
+        seed: Seed of the draws; equal pairs and seeds give equal weights.
+
+    Returns:
+        Weights of the pairs, a row for each replicate; for `bootstrap_ci`, `summarise` and `paired_test`.
+    """
+    objects = np.asarray(objects, dtype=str)
+    categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
+    weights = np.empty((resamples, len(objects)))
+    for category in np.unique(categories):
+        rng = np.random.default_rng([seed, stable_hash(category)])
+        members = np.nonzero(categories == category)[0]
+        names, sides = np.unique(objects[members], return_inverse=True)
+        first, second = sides.reshape(-1, 2).T
+        drawn = np.zeros((resamples, len(members)))
+        # A draw without both objects of any pair has no weight at all and is repeated.
+        while len(empty := np.nonzero(drawn.sum(axis=1) == 0)[0]):
+            if len(names) < _FEWEST_OBJECTS:
+                drawn[empty] = _multiplicities(len(members), len(empty), rng)
+            else:
+                counts = _multiplicities(len(names), len(empty), rng)
+                drawn[empty] = counts[:, first] * counts[:, second]
+        weights[:, members] = drawn * (len(members) / drawn.sum(axis=1, keepdims=True))
+    return weights
+
+
+def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
+    """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
+    return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
+
+
+def bootstrap_ci(
+    errors: ArrayLike,
+    statistic: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    weights: Float[np.ndarray, "resamples n"] | None = None,
+    level: float = 0.95,
+) -> tuple[float, float]:
+    """Compute the percentile bootstrap interval of a statistic.
+
+    Args:
+        errors: (n,).
+        statistic: Maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
+            `lambda errors, weights: accuracy(errors, 30, weights)` do.
+        weights: From `object_draws`; None for `pair_draws(n)`, which treats pairs as independent.
+        level: Confidence level.
+
+    Returns:
+        The lower and the upper end of the interval.
+    """
+    errors = np.asarray(errors, np.float64)
+    return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights), level)
+
+
+def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
+    """Compute the paper's figures of rotation errors, with 95 % bootstrap intervals.
+
+    Args:
+        errors: (n,) in degrees.
+        weights: From `object_draws`; None treats pairs as independent.
+
+    Returns:
+        {"n", "median" (degrees), "acc30", "acc15" (percent), for each of the three NAME_ci: [low, high], and
+        "above150": the percentage of errors above 150 degrees, mostly confusions of front and back}.
+    """
+    errors = np.asarray(errors, np.float64)
+    weights = pair_draws(len(errors)) if weights is None else weights
+    figures = {
+        "median": median,
+        "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
+        "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
+    }
+    summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
+    for name, figure in figures.items():
+        summary[f"{name}_ci"] = list(bootstrap_ci(errors, figure, weights))
+    return summary | {"above150": float(100 * np.mean(errors > 150))}
+
+
+def mean_category_median(
+    errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Float[np.ndarray, "resamples n"]
+) -> tuple[float, tuple[float, float]]:
+    """Compute the mean of the categories' medians, the paper's average of medians, with its 95 % interval."""
+    errors, categories = np.asarray(errors, np.float64), np.asarray(categories, dtype=str)
+    members = [categories == category for category in np.unique(categories)]
+    replicates = np.mean([median(errors[one], weights[:, one]) for one in members], axis=0)
+    return float(np.mean([median(errors[one]) for one in members])), _interval(replicates)
+
+
+def paired_difference(
+    first: ArrayLike,
+    second: ArrayLike,
+    threshold: float = 30.0,
+    weights: Float[np.ndarray, "resamples n"] | None = None,
+) -> dict:
+    """Measure by how much the second method is better than the first on the same pairs.
+
+    Args:
+        first: (n,) errors in degrees.
+        second: (n,) errors of the same pairs in the same order.
+        threshold: A pair is solved if its error is below it, in degrees.
+        weights: From `object_draws`; None treats pairs as independent.
+
+    Returns:
+        {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, and for
+        both NAME_ci: the 95 % bootstrap interval, and NAME_p: the two-sided p value that the same bootstrap gives}.
+    """
+    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    weights = pair_draws(len(first)) if weights is None else weights
+    differences = {
+        "accuracy_gain": 100.0 * (second < threshold) - 100.0 * (first < threshold),
+        "error_drop": first - second,
+    }
+    result = {}
+    for name, values in differences.items():
+        replicates = weighted_mean(values, weights).round(9)  # rounding errors must not hide a difference of 0
+        p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
+        result |= {
+            name: float(values.mean()),
+            f"{name}_ci": list(_interval(replicates)),
+            f"{name}_p": min(1.0, float(p)),
+        }
+    return result
+
+
+def paired_test(
+    first: ArrayLike,
+    second: ArrayLike,
+    threshold: float = 30.0,
+    weights: Float[np.ndarray, "resamples n"] | None = None,
+    seed: int = 0,
+) -> dict:
+    """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
+
+    The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
+    small; the interval and the p value of `paired_difference` with `object_draws` are the ones to report.
+
+    Args:
+        first, second, threshold, weights: As in `paired_difference`.
+        seed: Seed of the permutation test, which is exact for up to 13 pairs.
+
+    Returns:
+        The entries of `paired_difference`, and {"sign_test_p": McNemar's exact test over the pairs that only one of the
+        two solves, "permutation_test_p": of the mean difference, by 10,000 flips of the differences' signs}.
+    """
+    from scipy.stats import permutation_test
+
+    result = paired_difference(first, second, threshold, weights)
+    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    p = 1.0  # of one pair: both signs give the same absolute difference, and scipy refuses one pair
+    if len(first) > 1:
+        p = permutation_test(
+            (first - second,), np.mean, permutation_type="samples", n_resamples=10_000, batch=500, vectorized=True,
+            rng=seed,
+        ).pvalue  # fmt: skip
+    return result | {
+        "sign_test_p": sign_test(first < threshold, second < threshold),
+        "permutation_test_p": float(p),
+    }
+
+
+def sign_test(first: ArrayLike, second: ArrayLike) -> float:
+    """Compute the exact two-sided p value of McNemar's test of which pairs each of two methods solves."""
+    from scipy.stats import binomtest
+
+    first, second = np.asarray(first), np.asarray(second)
+    only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
+    return float(binomtest(only_first, only_first + only_second).pvalue) if only_first + only_second else 1.0
+
+
+def _interval(replicates: np.ndarray, level: float = 0.95) -> tuple[float, float]:
+    """Compute the percentile interval of bootstrap replicates (resamples,)."""
+    tail = 50 * (1 - level)
+    low, high = np.percentile(replicates, [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def _multiplicities(n: int, resamples: int, rng: np.random.Generator) -> Int[np.ndarray, "resamples n"]:
+    """Count how often each of n items is drawn if n are drawn with replacement."""
+    draws = rng.integers(n, size=(resamples, n)) + n * np.arange(resamples)[:, None]
+    return np.bincount(draws.ravel(), minlength=resamples * n).reshape(resamples, n)
