@@ -13,15 +13,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 from torch import Tensor
 
-from zsp_lite.errors import FatalError, InputError, real_array
+from zsp_lite.errors import FatalError, InputError, check_integer
 from zsp_lite.io.html import picture_html
 
 Grid = tuple[int, int]  # (rows, columns) of patches
 # A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
 SALIENCY_THRESHOLD = 0.05
+MOST_PIXELS = 2048  # of an image's side; the time of attention grows with the fourth power of the side
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class FeatureMap:
 
     Raises:
         InputError: Shapes do not fit together.
-        FatalError: Values are not finite.
+        FatalError: Values are not finite. (Both come from a backbone that a user plugs in.)
     """
 
     keys: Float[Tensor, "h w d"]
@@ -43,16 +43,10 @@ class FeatureMap:
     global_feature: Float[Tensor, " e"]
 
     def __post_init__(self):
-        for name in ("keys", "saliency", "global_feature"):
-            value = getattr(self, name)
-            if not isinstance(value, Tensor) or not value.is_floating_point():
-                kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
-                raise InputError(f"FeatureMap: {name} is {kind}, expected a tensor of floats")
-        if self.keys.ndim != 3 or 0 in self.keys.shape:
-            raise InputError(f"FeatureMap: keys have shape {tuple(self.keys.shape)}, expected (H, W, D)")
-        if self.saliency.shape != self.keys.shape[:2]:
+        keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
+        if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
-                f"FeatureMap: saliency has shape {tuple(self.saliency.shape)}, expected the grid {self.grid}"
+                f"FeatureMap: keys and saliency have shapes {keys} and {saliency}, expected (H, W, D), (H, W)"
             )
         if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
             raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
@@ -101,30 +95,14 @@ class FeatureExtractor(Protocol):
     """
 
     def __call__(self, images: Sequence[np.ndarray]) -> list[FeatureMap]:
-        """Extract the features of images.
-
-        Args:
-            images: (H, W, 3) arrays, uint8 or float in [0, 1].
-
-        Returns:
-            One feature map per image, all on one grid.
-        """
+        """Extract the feature maps, all on one grid, of images (H, W, 3), uint8 or float in [0, 1]."""
         ...
 
 
-def finite_tensor(name: str, values: ArrayLike | Tensor) -> Tensor:
-    """Convert real numbers to a tensor.
-
-    Raises:
-        InputError: The values are of another type or not finite.
-    """
-    if not isinstance(values, Tensor):
-        real_array(name, values)  # a check; the type is kept
-    tensor = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
-    # The extremes are not finite if a value is not; to find them is faster than to look at each value.
-    if tensor.is_complex() or (tensor.numel() and not torch.stack(torch.aminmax(tensor)).isfinite().all()):
-        raise InputError(f"{name} holds values that are no finite real numbers")
-    return tensor
+def nearest_multiple(size: int, patch_size: int) -> int:
+    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_PIXELS`."""
+    check_integer("image_size", size, 1, MOST_PIXELS)
+    return max(1, round(size / patch_size)) * patch_size
 
 
 @lru_cache(maxsize=32)
@@ -133,9 +111,6 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
 
     Bins 0 to 8 read the keys (offsets -1, 0, 1 in rows and columns, row-major), bins 9 to 16 the pooled keys (offsets
     -3, 0, 3, row-major, without the centre). Offsets beyond the border are clamped to it.
-
-    Returns:
-        (17, rows * columns) row-major patch indices.
     """
     near = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
@@ -169,14 +144,8 @@ def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float
 
     Args:
         x: (B, H, W, D) keys.
-
-    Raises:
-        InputError: x has another shape, or an empty one, or is not finite.
     """
-    x = finite_tensor("log_bin: x", x)
-    x = x if x.is_floating_point() else x.to(torch.float32)
-    if x.ndim != 4 or 0 in x.shape:
-        raise InputError(f"log_bin: x has shape {tuple(x.shape)}, expected (B, H, W, D), none of them 0")
+    x = torch.as_tensor(x)
     b, h, w, d = x.shape
     pooled = average_pool(average_pool(x, 1), 2)
     index = bin_indices((h, w)).to(x.device)

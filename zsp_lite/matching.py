@@ -25,8 +25,7 @@ from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from zsp_lite.errors import InputError, check_integer, check_seed
-from zsp_lite.features import SALIENCY_THRESHOLD, FeatureMap, Grid, average_pool, bin_indices, finite_tensor
+from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
 from zsp_lite.matchers import MATCHERS, Matcher
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
@@ -70,25 +69,16 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
 
     Returns:
         (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have similarity 0.
-
-    Raises:
-        InputError: Keys have another shape, are not finite, or have unequal channels.
     """
     return similarities(ref, [target])[0]
 
 
 def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute `similarity` of one reference with several targets."""
-    keys1 = _keys(ref, "ref")
+    keys1 = _keys(ref)
     inverse_norm1 = _inverse_norm(keys1)
     results = []
-    for index, target in enumerate(targets):
-        keys2 = _keys(target, f"target {index}")
-        if keys1.shape[-1] != keys2.shape[-1]:
-            raise InputError(
-                f"similarity: ref has {keys1.shape[-1]} channels, target {index} has {keys2.shape[-1]}, "
-                f"expected equal numbers"
-            )
+    for keys2 in map(_keys, targets):
         products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
         summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
         cosine = summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
@@ -98,11 +88,8 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
 
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see `similarities`)."""
-    first = F.normalize(_keys(ref, "ref").flatten(0, 1), dim=1)
-    return [
-        first @ F.normalize(_keys(target, f"target {index}").flatten(0, 1), dim=1).T
-        for index, target in enumerate(targets)
-    ]
+    first, *others = (F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets))
+    return [first @ other.T for other in others]
 
 
 def nearest_neighbours(
@@ -134,20 +121,9 @@ def cyclical_distances(
 
     Returns:
         (H1, W1) negative distances in patches; -inf where u, v or u' is not foreground.
-
-    Raises:
-        InputError: Shapes do not fit together, or a similarity is not finite.
     """
-    sim, grid1, grid2 = finite_tensor("cyclical_distances: sim", sim), tuple(grid1), tuple(grid2)
-    if min(*grid1, *grid2) < 1:
-        raise InputError(f"cyclical_distances: grids are {grid1} and {grid2}, expected positive sizes")
-    n1, n2 = grid1[0] * grid1[1], grid2[0] * grid2[1]
-    if tuple(sim.shape) != (n1, n2):
-        raise InputError(f"cyclical_distances: sim has shape {tuple(sim.shape)}, grids expect {(n1, n2)}")
-    on1, on2 = (
-        _mask(mask, grid, f"cyclical_distances: {name}", sim.device)
-        for mask, grid, name in ((fg1, grid1, "fg1"), (fg2, grid2, "fg2"))
-    )
+    sim = torch.as_tensor(sim)
+    on1, on2 = _foreground(fg1, grid1, sim.device), _foreground(fg2, grid2, sim.device)
     return _cycles(sim, grid1, on1, on2, published)[0].view(grid1)
 
 
@@ -158,7 +134,6 @@ def match(
     kmeans: bool = True,
     seed: int | np.random.Generator = 0,
     cycle_from: Literal["reference", "target"] = "reference",
-    saliency_threshold: float = SALIENCY_THRESHOLD,
     ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,
@@ -180,40 +155,22 @@ def match(
         cycle_from: Image in which cycles start and whose patches are clustered and compared in saliency. "reference"
             is the paper's; "target" follows the cycle step of the published code, with its masking (see
             `cyclical_distances`). docs/published_code.md lists all differences.
-        saliency_threshold: A patch is foreground if its saliency is above this, unless a foreground is given.
-        ref_foreground: (H1, W1) foreground of the reference.
+        ref_foreground: (H1, W1) foreground of the reference; by default `ref.foreground()`.
         target_foreground: (H2, W2) foreground of the target.
         sim: (H1 * W1, H2 * W2) similarities, if they are computed already.
         matcher: "cyclical" ranks by cyclical distance; or a name in `MATCHERS`, or a `Matcher`.
         binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
-
-    Raises:
-        InputError: k is below 1, a name is unknown, or a foreground or `sim` does not fit the maps.
     """
-    check_integer("match: k", k, 1)
-    check_seed("match: seed", seed)
-    if isinstance(matcher, str) and matcher not in ("cyclical", *MATCHERS):
-        raise InputError(f"match: matcher is {matcher!r}, expected one of cyclical, {', '.join(MATCHERS)}")
-    if cycle_from not in ("reference", "target"):
-        raise InputError(f"match: cycle_from is {cycle_from!r}, expected 'reference' or 'target'")
     if sim is None:
         (sim,) = (similarities if binning else key_similarities)(ref, [target])
-    sim = torch.as_tensor(sim)
-    if sim.shape != (ref.grid[0] * ref.grid[1], target.grid[0] * target.grid[1]):
-        raise InputError(
-            f"match: sim has shape {tuple(sim.shape)}, expected one row and column per patch of "
-            f"{ref.grid} and {target.grid}"
-        )
-    on_ref = ref.foreground(saliency_threshold) if ref_foreground is None else ref_foreground
-    on_target = target.foreground(saliency_threshold) if target_foreground is None else target_foreground
-    on_ref = _mask(on_ref, ref.grid, "match: ref_foreground", sim.device).reshape(ref.grid)
-    on_target = _mask(on_target, target.grid, "match: target_foreground", sim.device).reshape(target.grid)
+    on_ref = ref.foreground() if ref_foreground is None else ref_foreground
+    on_target = target.foreground() if target_foreground is None else target_foreground
+    on_ref, on_target = (torch.as_tensor(mask, device=sim.device) for mask in (on_ref, on_target))
     if cycle_from == "reference":
         start, end, on_start, on_end = ref, target, on_ref, on_target
     else:
         start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
     if matcher == "cyclical":
-        sim = finite_tensor("match: sim", sim)
         published = cycle_from == "target"
         score, neighbour = _cycles(sim, start.grid, on_start.flatten(), on_end.flatten(), published)
     else:
@@ -255,23 +212,16 @@ def _cycles(
     return score, torch.zeros_like(on1, dtype=torch.long).index_copy(0, u, forth)
 
 
-def _keys(features: Keys, name: str) -> Float[Tensor, "h w d"]:
-    """Get the keys as a float32 tensor and check their shape."""
-    keys = features.keys if isinstance(features, FeatureMap) else finite_tensor(f"similarity: {name}", features)
-    keys = keys.to(torch.float32)
-    if keys.ndim != 3 or 0 in keys.shape:
-        raise InputError(f"similarity: {name} has shape {tuple(keys.shape)}, expected (H, W, D)")
-    return keys
+def _keys(features: Keys) -> Float[Tensor, "h w d"]:
+    """Get the keys as a float32 tensor."""
+    return torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
 
 
-def _mask(mask, grid: Grid, name: str, device: torch.device) -> Bool[Tensor, " n"]:
-    """Flatten a foreground mask after a check of its shape; None selects all patches."""
+def _foreground(mask, grid: Grid, device: torch.device) -> Bool[Tensor, " n"]:
+    """Flatten a foreground mask; None selects all patches."""
     if mask is None:
         return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
-    mask = torch.as_tensor(mask, device=device)
-    if tuple(mask.shape) != grid:
-        raise InputError(f"{name} has shape {tuple(mask.shape)}, expected {grid}")
-    return mask.flatten().bool()
+    return torch.as_tensor(mask, device=device).flatten()
 
 
 def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
