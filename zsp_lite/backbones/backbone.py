@@ -1,6 +1,6 @@
 """A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -8,11 +8,11 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from zsp_lite.backbones.facets import Facet, block_index, check_facet
-from zsp_lite.backbones.huggingface import HuggingFaceViT, nearest_multiple
+from zsp_lite.backbones.facets import FACETS, Facet, block_index
+from zsp_lite.backbones.huggingface import HuggingFaceViT
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.errors import InputError, check_integer
-from zsp_lite.features import FeatureMap
+from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureMap, nearest_multiple
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 
@@ -60,19 +60,17 @@ class Backbone:
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
     ):
-        check_integer("batch_size", batch_size, 1)
+        heads = range(model.num_heads)
         if saliency_heads is None:
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
-            saliency_heads = (0, 2, 4, 5) if dino_small else range(model.num_heads)
-        saliency_heads = tuple(int(head) for head in saliency_heads)
-        if not saliency_heads or not set(saliency_heads) <= set(range(model.num_heads)):
-            raise InputError(
-                f"{name}: saliency_heads are {saliency_heads}, expected some of 0 to {model.num_heads - 1}"
-            )
-        self.name, self.saliency_heads = name, saliency_heads
+            saliency_heads = (0, 2, 4, 5) if dino_small else heads
+        if not saliency_heads or not set(saliency_heads) <= set(heads):
+            raise InputError(f"{name}: saliency_heads are {tuple(saliency_heads)}, expected some of 0 to {heads[-1]}")
+        if facet not in FACETS:
+            raise InputError(f"{name}: facet is {facet!r}, expected one of {', '.join(FACETS)}")
+        self.name, self.facet, self.saliency_heads = name, facet, tuple(saliency_heads)
         self.layer = block_index(min(9, model.depth - 1) if layer is None else layer, model.depth, name)
-        self.facet, self.mean, self.std = check_facet(facet, name), tuple(mean), tuple(std)
-        self.batch_size = batch_size
+        self.mean, self.std, self.batch_size = tuple(mean), tuple(std), batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
         self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
         self.device = choose_device(device)
@@ -93,8 +91,11 @@ class Backbone:
         Raises:
             InputError: For other image types, shapes or values.
         """
-        batches = image_batches(images, self.image_size, self.batch_size, self.device)
-        return [features for batch in batches for features in self._extract(batch)]
+        features = []
+        for first in range(0, len(images), self.batch_size):
+            batch = prepare_images(images[first : first + self.batch_size], self.image_size, first)
+            features += self._extract(batch.to(self.device))
+        return features
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         with torch.inference_mode():
@@ -110,45 +111,24 @@ class Backbone:
         ]
 
 
-def image_batches(
-    images: Sequence[Image], size: int, batch_size: int, device: torch.device
-) -> Iterator[Float[Tensor, "b 3 s s"]]:
-    """Yield images in batches on a device (see `prepare_images`)."""
-    if not isinstance(images, Sequence | np.ndarray | Tensor) or isinstance(images, str | bytes):
-        raise InputError(f"images is a {type(images).__name__}, expected a list of (H, W, 3) arrays")
-    for first in range(0, len(images), batch_size):
-        yield prepare_images(images[first : first + batch_size], size, first).to(device)
-
-
 def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:
-    """Stack images into a batch of squares with values in [0, 1].
+    """Stack RGB images (H, W, 3), uint8 or float in [0, 1], into a batch of squares with values in [0, 1].
 
-    Args:
-        images: RGB images (H, W, 3), uint8 or float in [0, 1].
-        size: Side of the squares in pixels; images are resized bilinearly with anti-aliasing.
-        first: Index of the first image in error messages.
-
-    Raises:
-        InputError: For other image types, shapes or values.
+    Images are resized bilinearly with anti-aliasing. Errors count the images from `first`.
     """
     prepared = []
     for index, image in enumerate(images, first):
-        try:
-            # Copied, because torch does not accept read-only arrays and negative strides.
-            image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
-        except (TypeError, ValueError) as error:
-            raise InputError(f"image {index}: not an array of numbers ({type(image).__name__})") from error
+        # Copied, because torch does not accept read-only arrays and negative strides.
+        image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
         if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
             raise InputError(f"image {index}: expected shape (H, W, 3), got {tuple(image.shape)}")
-        if image.dtype == torch.uint8:
-            image = image.to(torch.float32) / 255
-        elif image.is_floating_point():
-            image = image.to(torch.float32)
-            if not bool(((image >= 0) & (image <= 1)).all()):  # false for NaN too
-                low, high = image.min().item(), image.max().item()
-                raise InputError(f"image {index}: expected floats in [0, 1], got {low:g} to {high:g}")
-        else:
-            raise InputError(f"image {index}: expected uint8 or float in [0, 1], got {image.dtype}")
+        is_bytes, is_float = image.dtype == torch.uint8, image.is_floating_point()
+        if not is_bytes and not (is_float and bool(((image >= 0) & (image <= 1)).all())):  # false for NaN too
+            low, high = image.min().item(), image.max().item()
+            raise InputError(
+                f"image {index}: expected uint8 or floats in [0, 1], got {image.dtype} from {low:g} to {high:g}"
+            )
+        image = image.to(torch.float32) / (255 if is_bytes else 1)
         image = image.permute(2, 0, 1)[None]
         if image.shape[2:] != (size, size):
             image = F.interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=True)
@@ -165,7 +145,7 @@ def normalize(
 
 
 def choose_device(device: str | torch.device | None) -> torch.device:
-    """Return a device: by default the GPU if there is one, else the CPU. Raises InputError if it is not available."""
+    """Return a device that can be used: by default the GPU if there is one, else the CPU."""
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:

@@ -1,7 +1,6 @@
 """Checkpoint files of vision transformers in the DINO layout."""
 
 import math
-import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +10,8 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.io.tensors import check_weights_size, load_torch
+from zsp_lite.io.files import file_size
+from zsp_lite.io.tensors import MAX_WEIGHTS, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -25,7 +25,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        check_weights_size(path, "checkpoint")
+        file_size(path, "checkpoint", MAX_WEIGHTS)
         try:
             with safe_open(path, framework="pt") as file:
                 return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
@@ -44,73 +44,42 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
 
 
 def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[int] | None:
-    """Parse integers separated by commas; None if the metadata does not contain `key`. Raises InputError."""
-    if key not in metadata:
-        return None
+    """Parse integers separated by commas; None if the metadata does not contain `key`."""
     try:
-        return [int(x) for x in metadata[key].strip("()[] ").split(",") if x.strip()]
+        return [int(word) for word in metadata[key].split(",")] if key in metadata else None
     except ValueError as error:
-        raise InputError(f"checkpoint {path}: metadata {key} {metadata[key]!r} is not integers") from error
+        raise InputError(f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected integers") from error
 
 
-def metadata_integer(metadata: dict[str, str], key: str, path: Path) -> int | None:
-    """Parse one integer; None if the metadata does not contain `key`. Raises InputError."""
-    values = metadata_integers(metadata, key, path)
-    if values is None:
-        return None
-    if len(values) != 1:
-        raise InputError(f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected one integer")
-    return values[0]
-
-
-def build_vit(weights: dict[str, Tensor], num_heads: int | None = None, name: str = "checkpoint") -> VisionTransformer:
-    """Build a transformer from weights in the DINO layout; its sizes are read from their shapes.
-
-    Args:
-        weights: State dict of finite floats.
-        num_heads: Default: one head per 64 channels.
-        name: Name for error messages.
-
-    Raises:
-        InputError: If keys or shapes are not in the DINO layout, or a weight is not finite.
-    """
+def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> VisionTransformer:
+    """Build a transformer from weights in the DINO layout, whose shapes give its sizes; heads have 64 channels."""
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
-        blocks = {int(key.split(".")[1]) for key in weights if key.startswith("blocks.")}
-        if (depth := len(blocks)) == 0 or blocks != set(range(depth)):
-            raise ValueError(f"{depth} blocks, not numbered from 0 to {depth - 1}")
+        depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
     except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"{name}: not a vision transformer in the DINO layout ({error})") from error
-    if num_heads is None:
-        if dim % 64:
-            raise InputError(
-                f"{name}: the number of heads is unknown, {dim} channels are not a multiple of 64; pass num_heads"
-            )
-        num_heads = dim // 64
+        raise InputError(f"{path.name}: not a vision transformer in the DINO layout ({error})") from error
+    if num_heads is None and dim % 64:
+        raise InputError(
+            f"{path.name}: {dim} channels are not heads of 64, expected num_heads in the metadata of the .safetensors"
+        )
     with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
-        model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
-    load_weights(model, weights, name)
+        model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads or dim // 64)
+    load_weights(model, weights, path.name)
     return model
 
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ignored: Sequence[str] = ()) -> None:
-    """Load a state dict into a module, as float32.
+    """Load a state dict into a module, as float32, without the keys of the prefixes `ignored`.
 
-    Args:
-        model: The module.
-        weights: The state dict.
-        name: Name for error messages.
-        ignored: Prefixes of keys that are not loaded.
-
-    Raises:
-        InputError: A key is missing, unknown or of another shape, or a weight is not of finite floats.
+    `name` stands in errors: a key is missing, unknown or of another shape, or a weight is not of finite floats.
     """
-    if strange := [key for key, x in weights.items() if not (isinstance(key, str) and torch.is_tensor(x))]:
-        raise InputError(f"{name}: entry {reprlib.repr(strange[0])} is no named tensor, expected weights")
     state = model.state_dict()
     weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
-    expected, found = ({key: tuple(x.shape) for key, x in tensors.items()} for tensors in (state, weights))
+    expected, found = (
+        {key: tuple(x.shape) if torch.is_tensor(x) else f"a {type(x).__name__}" for key, x in tensors.items()}
+        for tensors in (state, weights)
+    )
     # Older checkpoints have no counter of the batches in batch normalisation, which inference does not use.
     counters = {key for key in expected.keys() - found.keys() if key.endswith("num_batches_tracked")}
     wrong = sorted(key for key in (expected.keys() | found.keys()) - counters if expected.get(key) != found.get(key))

@@ -14,31 +14,12 @@ FACETS: tuple[str, ...] = get_args(Facet)
 
 
 def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:
-    """Return the index of a block, counted from 0.
-
-    Args:
-        layer: "last", "block9", or an integer from 0; negative integers count from the end.
-        depth: Number of blocks.
-        name: Model name for the error message.
-
-    Raises:
-        InputError: If there is no such block.
-    """
-    text = str(layer).strip()
-    if text == "last":
-        return depth - 1
-    if found := re.fullmatch(r"block(\d+)|(-?\d+)", text):
-        index = int(found[1] or found[2])
-        if -depth <= index < depth:
-            return index % depth
-    raise InputError(
-        f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or a number from {-depth} to "
-        f"{depth - 1}"
-    )
-
-
-def check_facet(facet: str, name: str = "backbone") -> str:
-    """Return `facet`, or raise InputError if it is not in `FACETS`."""
-    if facet not in FACETS:
-        raise InputError(f"{name}: facet is {facet!r}, expected one of {', '.join(FACETS)}")
-    return facet
+    """Return the index from 0 of a block given as "last", "block9" or an integer; negative ones count from the end."""
+    text = "-1" if layer == "last" else str(layer).strip()
+    found = re.fullmatch(r"(?:block(?=\d))?(-?\d+)", text)
+    if not found or not -depth <= int(found[1]) < depth:
+        raise InputError(
+            f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or a number from {-depth} "
+            f"to {depth - 1}"
+        )
+    return int(found[1]) % depth

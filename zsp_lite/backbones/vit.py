@@ -85,10 +85,7 @@ class Attention(nn.Module):
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
     def forward(
-        self,
-        q: Float[Tensor, "batch m dim"],
-        k: Float[Tensor, "batch n dim"],
-        v: Float[Tensor, "batch n dim"],
+        self, q: Float[Tensor, "batch m dim"], k: Float[Tensor, "batch n dim"], v: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch m dim"]:
         """Attend from each query to all keys and apply the output projection; heads are slices of the last axis."""
         q, k, v = self.split_heads(q), self.split_heads(k), self.split_heads(v)
@@ -124,11 +121,6 @@ class Block(nn.Module):
         self.norm2 = nn.LayerNorm(dim, eps=1e-6)
         self.mlp = Mlp(dim, 4 * dim)
 
-    def project(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return normalised input, queries, keys and values, each (batch, n, dim) with heads concatenated."""
-        normed = self.norm1(x)
-        return normed, *self.attn.qkv(normed).chunk(3, dim=-1)
-
     def finish(
         self, x: Float[Tensor, "batch n dim"], attended: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch n dim"]:
@@ -137,15 +129,12 @@ class Block(nn.Module):
         return x + self.mlp(self.norm2(x))
 
     def forward(self, x: Float[Tensor, "batch n dim"]) -> BlockActivations:
-        normed, q, k, v = self.project(x)
+        normed = self.norm1(x)
+        q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
         return BlockActivations(normed, q, k, v, self.finish(x, self.attn(q, k, v)))
 
     def forward_cls(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the block's output for the CLS token only, without the patches' queries, attention and MLP.
-
-        Returns:
-            CLS token (batch, 1, dim), keys (batch, n, dim) and CLS attention logits (batch, heads, n).
-        """
+        """Compute the output for the CLS token only, all keys (batch, n, dim) and the CLS token's attention logits."""
         dim = x.shape[-1]
         weight, bias = self.attn.qkv.weight, self.attn.qkv.bias
         normed = self.norm1(x)
@@ -172,35 +161,19 @@ class PatchEmbed(nn.Module):
 class VisionTransformer(nn.Module):
     """ViT with the state-dict keys and shapes of a DINO checkpoint (loads one with strict=True).
 
-    Args:
-        image_size: Side in pixels of the square images for which the position embedding is stored; it is interpolated
-            for other sizes.
-        patch_size: Side of a patch in pixels.
-        embed_dim: Number of channels of a token.
-        depth: Number of blocks.
-        num_heads: Number of attention heads.
-
-    Raises:
-        InputError: If a size is below 1, `image_size` is not a multiple of `patch_size`, or `embed_dim` not one of
-            `num_heads`.
+    The position embedding is stored for square images of `image_size` pixels and interpolated for other sizes.
     """
 
     def __init__(
-        self,
-        image_size: int = 224,
-        patch_size: int = 8,
-        embed_dim: int = 384,
-        depth: int = 12,
-        num_heads: int = 6,
+        self, image_size: int = 224, patch_size: int = 8, embed_dim: int = 384, depth: int = 12, num_heads: int = 6
     ):
         super().__init__()
-        if min(image_size, patch_size, embed_dim, depth, num_heads) < 1 or image_size % patch_size:
+        sizes = image_size, patch_size, embed_dim, depth, num_heads
+        if min(sizes) < 1 or image_size % patch_size or embed_dim % num_heads:
             raise InputError(
-                f"VisionTransformer: sizes must be positive and image_size a multiple of patch_size, got "
-                f"image_size {image_size}, patch_size {patch_size}, depth {depth}"
+                f"VisionTransformer: image_size, patch_size, embed_dim, depth and num_heads are {sizes}, expected "
+                "positive numbers, image_size a multiple of patch_size and embed_dim one of num_heads"
             )
-        if embed_dim % num_heads:
-            raise InputError(f"VisionTransformer: embed_dim {embed_dim} is not a multiple of num_heads {num_heads}")
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))
@@ -229,10 +202,7 @@ class VisionTransformer(nn.Module):
 
     def embed(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[Tensor, tuple[int, int]]:
         """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows, columns)."""
-        p = self.patch_size
-        if images.ndim != 4 or images.shape[1] != 3 or any(side < p or side % p for side in images.shape[2:]):
-            raise InputError(f"images: expected (B, 3, H, W), H and W multiples of {p}, got {tuple(images.shape)}")
-        grid = (images.shape[2] // p, images.shape[3] // p)
+        grid = (images.shape[2] // self.patch_size, images.shape[3] // self.patch_size)
         patches = self.patch_embed(images)
         x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
         return x + self.position_embedding(grid), grid
@@ -251,24 +221,11 @@ class VisionTransformer(nn.Module):
             x = activations.token
             yield activations
 
-    def extract(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        layer: int = 9,
-        facet: Facet = "key",
-    ) -> Tokens:
-        """Compute patch descriptors, CLS attention and CLS output in one forward pass.
+    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
+        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS output token.
 
-        Args:
-            images: Normalised RGB images; height and width are multiples of the patch size.
-            layer: Block that describes the patches, counted from 0. The paper writes "the 9th ViT layer"; its published
-                code uses block 9 counted from 0.
-            facet: Activation of that block used as descriptor (`Facet`).
-
-        Raises:
-            InputError: If the block does not exist or the image size does not fit.
+        The images are normalised; their height and width are multiples of the patch size.
         """
-        self._check_layer(layer)
         x, grid = self.embed(images)
         for index, activations in enumerate(self.run_blocks(x, self.depth - 1)):
             x = activations.token
@@ -285,19 +242,10 @@ class VisionTransformer(nn.Module):
             descriptors = last_descriptors
         return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
 
-    def forward_training(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        layer: int = 9,
-    ) -> TrainingTokens:
+    def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
-        self._check_layer(layer)
         x, grid = self.embed(images)
         activations = list(self.run_blocks(x))
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
         return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits, grid)
-
-    def _check_layer(self, layer: int) -> None:
-        if not 0 <= layer < self.depth:
-            raise InputError(f"layer: expected 0 to {self.depth - 1}, got {layer}")
