@@ -14,12 +14,12 @@ from tools import same_shape
 from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from tools.same_shape import CATALOGUE, copy_same_shape
+from tools.training_categories import TRAINING
+from tools.validation_categories import VALIDATION
 from zsp_lite.backbones.pretrained import WEIGHTS
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.models import list_models
-from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.synthetic.validation_categories import VALIDATION
 
 TOOLS = Path(__file__).parents[1] / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
@@ -107,7 +107,7 @@ def test_no_file_is_in_two_catalogues():
 
 def test_no_evaluated_category_is_trained_on_or_used_for_model_selection():
     assert not set(read_catalogue(ARTISTS).models) & {*TRAINING, *VALIDATION}
-    assert set(read_catalogue(SAMPLES).models) <= set(EVALUATION)
+    assert set(read_catalogue(SAMPLES).models) <= set(CATEGORIES)
 
 
 def test_models_of_one_shape_are_of_the_catalogue_of_their_side(tmp_path):

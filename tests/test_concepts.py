@@ -5,11 +5,11 @@ import json
 
 import pytest
 
-from zsp_lite.data.samples import REPOSITORY
-from zsp_lite.synthetic.evaluation_categories import EVALUATION
-from zsp_lite.synthetic.export import PRESETS, SPLITS
-from zsp_lite.synthetic.training_categories import TRAINING, random_assembly
-from zsp_lite.synthetic.validation_categories import VALIDATION
+from tools.training_categories import TRAINING
+from tools.validation_categories import VALIDATION
+from zsp_lite.samples import REPOSITORY
+from zsp_lite.synthetic.categories import CATEGORIES
+from zsp_lite.synthetic.export import PRESETS
 
 TOOLS = REPOSITORY / "tools"
 with (TOOLS / "concepts.csv").open(newline="") as _file:
@@ -43,13 +43,11 @@ def test_no_concept_is_on_two_sides():
     assert sides_of_concepts([*ROWS, planted])["motor vehicle"] == {"training", "evaluation"}
 
 
-@pytest.mark.parametrize("split", SPLITS)
-def test_every_generator_is_listed_on_its_side(split):
-    assert {SIDE_OF.get(name) for name in SPLITS[split]} == {split}
-
-
-def test_the_random_assemblies_are_listed_for_training():
-    assert SIDE_OF[random_assembly.__name__] == "training"
+@pytest.mark.parametrize(
+    ("side", "builders"), [("training", TRAINING), ("validation", VALIDATION), ("evaluation", CATEGORIES)]
+)
+def test_every_procedural_category_is_listed_on_its_side(side, builders):
+    assert {SIDE_OF.get(name) for name in builders} == {side}
 
 
 def test_every_category_of_a_preset_and_of_the_sample_data_is_listed_for_evaluation():
@@ -104,4 +102,4 @@ def test_concepts_that_are_kept_for_evaluation_are_not_trained_on_under_another_
     reserved = "armchair bench bicycle bus car chair motorcycle scooter sofa stool toilet truck van washbasin aircraft"
     assert {SIDE_OF[name] for name in reserved.split()} == {"evaluation"}
     assert not (TRAINING | VALIDATION).keys() & {name for name, side in SIDE_OF.items() if side == "evaluation"}
-    assert EVALUATION.keys() <= SIDE_OF.keys()
+    assert CATEGORIES.keys() <= SIDE_OF.keys()

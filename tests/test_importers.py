@@ -24,8 +24,8 @@ METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 @pytest.fixture(scope="module")
 def views():
-    """Eight views around a teapot, in metres."""
-    shape = make_object("teapot", 0, 4)
+    """Eight views around a hairdryer, in metres."""
+    shape = make_object("hairdryer", 0, 4)
     rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
     frames = []
     for view in rendered.views:

@@ -7,27 +7,26 @@ import cv2
 import numpy as np
 import pytest
 
+from tools.synthetic import SPLITS, main
 from zsp_lite.alignment import umeyama
-from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import crop_to_object
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import export
 from zsp_lite.synthetic.assembly import N_MATERIALS, make_shape, surface_spread
-from zsp_lite.synthetic.evaluation_categories import EVALUATION
-from zsp_lite.synthetic.export import GENERATORS, PRESETS, SPLITS, export_categories, make_sequence
+from zsp_lite.synthetic.categories import CATEGORIES
+from zsp_lite.synthetic.export import PRESETS, export_categories, make_sequence
 from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.sensor import soft_mask
 from zsp_lite.synthetic.sequences import handheld_sweep
-from zsp_lite.synthetic.validation_categories import VALIDATION
 
-# The paper's categories.
-CATEGORIES = tuple(
+PAPER = tuple(
     "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse "
     "remote teddybear toaster toilet toybus toyplane toytrain toytruck".split()
 )
 
+ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
 SEED, FRAMES, SIZE = 5, 6, 72
 pytestmark = pytest.mark.usefixtures("coarse_rooms")
 
@@ -52,31 +51,28 @@ def files(folder: Path) -> dict[str, bytes]:
 # Categories
 
 
-def test_evaluation_categories_have_the_names_of_the_paper():
-    assert tuple(EVALUATION) == PRESETS["paper"].categories == CATEGORIES
-    assert set(PRESETS["demo"].categories) <= set(EVALUATION)
+def test_the_categories_have_the_names_of_the_paper():
+    assert tuple(CATEGORIES) == PRESETS["paper"].categories == PAPER
+    assert set(PRESETS["demo"].categories) <= set(CATEGORIES)
 
 
-@pytest.mark.parametrize(("one", "other"), list(itertools.permutations(SPLITS, 2)))
+@pytest.mark.parametrize(("one", "other"), itertools.combinations([*SPLITS.values(), CATEGORIES], 2))
 def test_two_splits_share_no_category_and_no_code(one, other):
-    assert not set(SPLITS[one]) & set(SPLITS[other])
-    assert not set(SPLITS[one].values()) & set(SPLITS[other].values())
-    modules = list(Path(export.__file__).parent.glob(f"{one}_*.py"))
-    assert modules and not [path for path in modules if f"synthetic.{other}_" in path.read_text()]
+    assert not one.keys() & other.keys() and not {*one.values()} & {*other.values()}
 
 
-def test_the_name_of_a_split_stands_for_its_categories(tmp_path, monkeypatch):
-    some = dict(list(VALIDATION.items())[:2])
+def test_the_tool_renders_the_categories_of_a_split(tmp_path, monkeypatch):
+    some = dict(list(SPLITS["validation"].items())[:2])
     monkeypatch.setitem(SPLITS, "validation", some)
-    main(["synth", "--category", "validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
+    main(["validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
     made = Co3D(tmp_path)
     assert sorted(made.categories()) == sorted(some)
     assert all(len(made.sequences(category)) == 1 for category in some)
 
 
-@pytest.mark.parametrize("category", sorted(GENERATORS))
+@pytest.mark.parametrize("category", sorted(ALL))
 def test_objects_of_a_category_are_unit_sized_and_vary(category):
-    shapes = [make_shape(GENERATORS[category], seed) for seed in range(4)]
+    shapes = [make_shape(ALL[category], seed) for seed in range(4)]
     for shape in shapes:
         assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
         assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
@@ -85,10 +81,10 @@ def test_objects_of_a_category_are_unit_sized_and_vary(category):
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
 
 
-@pytest.mark.parametrize("category", sorted(GENERATORS))
+@pytest.mark.parametrize("category", sorted(ALL))
 def test_front_and_back_of_an_object_differ(category):
     """No object coincides with itself after half a turn about z, otherwise its pose would be ambiguous."""
-    shape = make_shape(GENERATORS[category], 3)
+    shape = make_shape(ALL[category], 3)
     turned = shape.vertices * [-1, -1, 1]
     nearest = np.linalg.norm(shape.vertices[:, None] - turned[None, ::3], axis=-1).min(0)
     assert nearest.max() > 0.2
@@ -116,7 +112,7 @@ def test_the_object_is_inside_the_image_and_fills_it():
     size = (120, 160)
     extents = []
     for seed in range(8):
-        vertices = make_shape(EVALUATION["bicycle"], seed).vertices
+        vertices = make_shape(CATEGORIES["bicycle"], seed).vertices
         for camera in handheld_sweep(vertices, seed, 12, size):
             pixels, depth = camera.project(vertices)
             assert depth.min() > 1
@@ -126,7 +122,7 @@ def test_the_object_is_inside_the_image_and_fills_it():
 
 
 def test_the_camera_moves_once_around_at_10_to_35_degrees_of_elevation():
-    vertices = make_shape(EVALUATION["car"], 0).vertices
+    vertices = make_shape(CATEGORIES["car"], 0).vertices
     cameras = handheld_sweep(vertices, 1, 40, (100, 100))
     x, y, z = np.transpose([camera.centre - (vertices.max(0) + vertices.min(0)) / 2 for camera in cameras])
     turned = np.degrees(np.unwrap(np.arctan2(y, x)))
@@ -151,7 +147,7 @@ def test_canonical_coordinates_project_onto_their_own_pixels_and_depth(chairs):
 @pytest.mark.slow
 def test_a_third_to_a_half_of_the_depth_is_missing_in_connected_regions():
     unknown, on_object, isolated = [], [], []
-    for index, category in enumerate(sorted(EVALUATION)[::2]):
+    for index, category in enumerate(sorted(CATEGORIES)[::2]):
         data, exact = make_sequence(category, index, 2, SEED, SIZE)
         for frame, view in zip(data.frames, exact.views, strict=True):
             hole = frame.depth == 0

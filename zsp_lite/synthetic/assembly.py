@@ -26,15 +26,14 @@ class Shape:
 
 
 class Assembly:
-    """Collects the parts of one object, and draws the random numbers that its generator asks for.
+    """Collects the parts of one object, and draws the random numbers that its builder asks for.
 
     With `variation`, every proportion (`u`) is perturbed by normal noise from that source, with a standard deviation of
-    `amount` of its range, while the choices between parts (`chance`, `choice`) stay.
+    30 % of its range, while the choices between parts (`chance`, `choice`) stay.
     """
 
-    def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None, amount: float = 0.3):
-        self.rng = rng
-        self._variation, self._amount = variation, amount
+    def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
+        self.rng, self._variation = rng, variation
         self._meshes: list[Mesh] = []
         self._materials: list[int] = []
 
@@ -42,8 +41,7 @@ class Assembly:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
-            low, high = min(low, high), max(low, high)
-            value = float(np.clip(value + self._variation.normal(0, self._amount) * (high - low), low, high))
+            value = float(np.clip(value + self._variation.normal(0, 0.3) * (high - low), low, high))
         return value
 
     def chance(self, probability: float) -> bool:
@@ -74,6 +72,9 @@ class Assembly:
         return Shape(vertices / surface_spread(vertices, faces), faces, part, material)
 
 
+Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
+
+
 def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
     """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -83,37 +84,12 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
 
 
-def make_shape(generator: Callable[[Assembly], None], seed: int | list[int]) -> Shape:
-    """Return the object that `generator` builds; the same seed gives the same object."""
-    assembly = Assembly(np.random.default_rng(seed))
-    generator(assembly)
-    return assembly.shape()
+def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> Shape:
+    """Return the object that `build` composes; the same seed gives the same object.
 
-
-def make_variant(
-    generator: Callable[[Assembly], None], seed: int | list[int], variation: np.random.Generator, amount: float = 0.3
-) -> Shape:
-    """Return the object of `make_shape(generator, seed)` with other proportions, see `Assembly`.
-
-    Vertex i is the same point of the same part on all variants, if the parts depend on the generator's choices only.
+    With `variation`, it has other proportions (see `Assembly`), but vertex i stays the same point of the same part, if
+    the parts depend on the builder's choices only.
     """
-    assembly = Assembly(np.random.default_rng(seed), variation, amount)
-    generator(assembly)
+    assembly = Assembly(np.random.default_rng(seed), variation)
+    build(assembly)
     return assembly.shape()
-
-
-def deform(shape: Shape, seed: int | np.random.Generator, amount: float = 1.0) -> Float[np.ndarray, "v 3"]:
-    """Return the vertices of a deformed copy of an object: its parts scaled, the whole warped and scaled.
-
-    A vertex keeps its index, so the correspondence with the original is known. With the amount 0, nothing changes.
-    """
-    rng = np.random.default_rng(seed)
-    n_parts = shape.part.max() + 1
-    size = np.bincount(shape.part, minlength=n_parts)
-    centre = np.stack([np.bincount(shape.part, axis, n_parts) for axis in shape.vertices.T], 1) / size[:, None]
-    stretch = np.exp(rng.normal(0, 0.12 * amount, (n_parts, 3)))
-    vertices = (shape.vertices - centre[shape.part]) * stretch[shape.part] + centre[shape.part]
-    for axis in range(3):
-        wave = rng.normal(0, 0.7, 3)
-        vertices[:, axis] += 0.12 * amount * np.sin(shape.vertices @ wave + rng.uniform(0, 2 * np.pi))
-    return vertices * np.exp(rng.normal(0, 0.13 * amount, 3))

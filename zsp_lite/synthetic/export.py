@@ -1,16 +1,15 @@
 """Export of procedural categories as a folder in CO3D's layout, with pose labels and evaluation pairs."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsp_lite.data.annotations import decode
 from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.io.files import read_bytes, write_atomic
-from zsp_lite.synthetic.assembly import make_shape
-from zsp_lite.synthetic.evaluation_categories import EVALUATION
+from zsp_lite.io.files import read_json, write_atomic
+from zsp_lite.synthetic.assembly import Builder, make_shape
+from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.recording import (
@@ -24,11 +23,7 @@ from zsp_lite.synthetic.recording import (
     write_sequence,
 )
 from zsp_lite.synthetic.sequences import RenderedSequence
-from zsp_lite.synthetic.training_categories import TRAINING
-from zsp_lite.synthetic.validation_categories import VALIDATION
 
-SPLITS = {"training": TRAINING, "validation": VALIDATION, "evaluation": EVALUATION}
-GENERATORS = TRAINING | VALIDATION | EVALUATION
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
 _MOST_SEQUENCES = 900  # of a category: their names have three digits
 
@@ -56,8 +51,8 @@ PRESETS = {
     "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
     "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
     # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
-    "paper": Preset(tuple(EVALUATION), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
-    "paper-small": Preset(tuple(EVALUATION), 5, 24, 256, pairs=25, targets=(1, 3, 5, 10, 20)),
+    "paper": Preset(tuple(CATEGORIES), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
+    "paper-small": Preset(tuple(CATEGORIES), 5, 24, 256, pairs=25, targets=(1, 3, 5, 10, 20)),
 }
 
 
@@ -83,19 +78,18 @@ def export_categories(
     seed: int,
     image_size: int = 256,
     progress: Callable[[Iterable], Iterable] | None = None,
+    builders: Mapping[str, Builder] = CATEGORIES,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
-    The name of a split ("training", "validation", "evaluation") stands for its categories. A sequence depends only on
-    the seed, its category and its index. An incomplete export is completed; complete sequences are not rendered again.
-    The first sequence of a category is the reference of its labels. `image_size` is the shorter image side in pixels,
-    `progress` wraps the loop over sequences, as tqdm does. Raises InputError if a category is unknown, or the folder
-    was written with other settings.
+    A sequence depends only on the seed, its category and its index. An incomplete export is completed; complete
+    sequences are not rendered again. The first sequence of a category is the reference of its labels. `image_size` is
+    the shorter image side in pixels, `progress` wraps the loop over sequences, as tqdm does, and `builders` has the
+    builder of each category. Raises InputError if a category is unknown, or the folder was written with other settings.
     """
-    categories = list(dict.fromkeys(name for given in categories for name in SPLITS.get(given, [given])))
     for category in categories:
-        if category not in GENERATORS:
-            raise InputError(f"category is {category!r}, expected one of {', '.join([*SPLITS, *sorted(GENERATORS)])}")
+        if category not in builders:
+            raise InputError(f"category is {category!r}, expected one of {', '.join(builders)}")
     check_integer("sequences", sequences, 1, _MOST_SEQUENCES)
     check_integer("frames", frames, 1, MOST_FRAMES)
     check_integer("image_size", image_size, 32, MOST_PIXELS)
@@ -106,25 +100,25 @@ def export_categories(
     for category, index in progress(jobs) if progress else jobs:
         name = sequence_name(seed, category, index)
         if name not in read_poses(out, category) or name not in _complete_sequences(out, category):
-            recorded = make_sequence(category, index, frames, seed, image_size)
-            write_sequence(out, category, make_object(category, index, seed), recorded)
+            recorded = make_sequence(category, index, frames, seed, image_size, builders)
+            write_sequence(out, category, make_object(category, index, seed, builders), recorded)
     for category in categories:
         write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 
 
 def make_sequence(
-    category: str, index: int, frames: int, seed: int, image_size: int
+    category: str, index: int, frames: int, seed: int, image_size: int, builders: Mapping[str, Builder] = CATEGORIES
 ) -> tuple[SequenceData, RenderedSequence]:
     """Make sequence number `index` of a category, with simulated sensor errors, and its exact rendering."""
     name = sequence_name(seed, category, index)
     key = stable_hash(seed, category, index)
-    return record_sequence(make_object(category, index, seed), name, key, frames, image_size)
+    return record_sequence(make_object(category, index, seed, builders), name, key, frames, image_size)
 
 
-def make_object(category: str, index: int, seed: int) -> TexturedMesh:
+def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = stable_hash(seed, category, index)
-    return with_materials(make_shape(GENERATORS[category], [key, 0]), random_materials([key, 3]))
+    return with_materials(make_shape(builders[category], [key, 0]), random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
@@ -137,7 +131,7 @@ def _write_settings(out: Path, settings: dict) -> None:
     """Write the settings of the export, or raise InputError if the folder has others."""
     path = out / SETTINGS_FILE
     if path.is_file():
-        found = decode(read_bytes(path, "settings"), dict, path)
+        found = read_json(path, dict, "settings")
         if not settings.items() <= found.items():
             raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())

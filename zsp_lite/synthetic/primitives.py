@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 TAU = 2 * np.pi
-_PLANES = {"xz": (0, 2, 1), "xy": (0, 1, 2), "yz": (1, 2, 0)}
+_PLANES = {"xz": (0, 2, 1), "xy": (0, 1, 2), "yz": (1, 2, 0)}  # axes of the outline, and that of the thickness
 
 
 @dataclass(frozen=True)
@@ -33,35 +33,38 @@ class Mesh:
         R[j, k], R[k, j] = -np.sin(angle), np.sin(angle)
         return Mesh(self.vertices @ R.T, self.faces)
 
+    def pointing(self, direction) -> "Mesh":
+        """Return the mesh rotated so that its z axis points along `direction` (3,)."""
+        z = np.asarray(direction, float) / np.linalg.norm(direction)
+        x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
+        x /= np.linalg.norm(x)
+        return Mesh(self.vertices @ np.stack([x, np.cross(z, x), z]), self.faces)
+
     def mirrored(self) -> "Mesh":
         """Return the mirror image in the plane y = 0; faces are reversed so that normals still point outwards."""
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
-def _align_z(vertices: np.ndarray, direction) -> np.ndarray:
-    """Rotate vertices so that their z axis points along `direction`."""
-    z = np.asarray(direction, float)
-    z = z / np.linalg.norm(z)
-    x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
-    x /= np.linalg.norm(x)
-    return vertices @ np.stack([x, np.cross(z, x), z])
-
-
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    return Mesh(corners * np.asarray(size, float) + np.asarray(centre, float), np.array(faces))
+    sides = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    faces = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    return Mesh(corners, faces).scaled(size).translated(centre)
 
 
-def lathe(profile, sides: int = 20) -> Mesh:
-    """Return the surface of revolution about z of a profile of (radius, height) points (n, 2)."""
+def lathe(profile, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
+    """Return the surface of revolution about z of a profile of (radius, height) points (n, 2).
+
+    Normals point outwards if the profile goes up. With `start` and `stop`, it is the sector between two angles.
+    """
     profile = np.asarray(profile, float)
-    angle = np.linspace(0, TAU, sides, endpoint=False)
+    closed = np.isclose(stop - start, TAU)
+    angle = np.linspace(start, stop, sides, endpoint=not closed)
     x, y = np.outer(profile[:, 0], np.cos(angle)), np.outer(profile[:, 0], np.sin(angle))
     vertices = np.stack([x, y, np.repeat(profile[:, 1:], sides, 1)], -1).reshape(-1, 3)
-    ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, np.arange(sides), indexing="ij")
+    columns = np.arange(sides if closed else sides - 1)
+    ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, columns, indexing="ij")
     a, b = (ring + j).ravel(), (ring + (j + 1) % sides).ravel()
     faces = np.stack([np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)], 1)
     return Mesh(vertices, faces.reshape(-1, 3))
@@ -82,37 +85,26 @@ def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18) -> Mesh:
 def rod(start, end, radius: float, end_radius: float | None = None, sides: int = 12) -> Mesh:
     """Return a closed cone frustum from point `start` (3,) to point `end` (3,)."""
     start, end = np.asarray(start, float), np.asarray(end, float)
-    end_radius = radius if end_radius is None else end_radius
-    mesh = cylinder(radius, end_radius, np.linalg.norm(end - start) + 1e-9, sides)
-    return Mesh(_align_z(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+    mesh = cylinder(radius, end_radius or radius, np.linalg.norm(end - start), sides)
+    return mesh.pointing(end - start).translated((start + end) / 2)
 
 
 def capsule(start, end, radius: float, end_radius: float | None = None, sides: int = 14) -> Mesh:
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     start, end = np.asarray(start, float), np.asarray(end, float)
-    end_radius = radius if end_radius is None else end_radius
-    half = np.linalg.norm(end - start) / 2 + 1e-9
-    t = np.linspace(-np.pi / 2, 0, 5)
-    tail = [[radius * np.cos(a) + 1e-5, -half + radius * np.sin(a)] for a in t]
-    head = [[end_radius * np.cos(a) + 1e-5, half + end_radius * np.sin(a)] for a in -t[::-1]]
-    mesh = lathe(tail + head, sides)
-    return Mesh(_align_z(mesh.vertices, end - start) + (start + end) / 2, mesh.faces)
+    half = np.linalg.norm(end - start) / 2
+    t = np.linspace(0, np.pi / 2, 5)
+    round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
+    tail, head = round_end[::-1] * [radius, -radius], round_end * (end_radius or radius)
+    mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides)
+    return mesh.pointing(end - start).translated((start + end) / 2)
 
 
-def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start: float = 0.0, stop: float = TAU,
-          sides: int = 24) -> Mesh:  # fmt: skip
+def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.0, stop=TAU, sides=24) -> Mesh:
     """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
-    tube_sides = 10
-    closed = abs(stop - start - TAU) < 1e-6
-    p, q = np.meshgrid(np.linspace(start, stop, sides, endpoint=not closed),
-                       np.linspace(0, TAU, tube_sides, endpoint=False), indexing="ij")  # fmt: skip
-    reach = major + minor * np.cos(q)
-    vertices = np.stack([reach * np.cos(p), reach * np.sin(p), minor * np.sin(q)], -1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(sides if closed else sides - 1), np.arange(tube_sides), indexing="ij")
-    i, j, i1, j1 = i.ravel(), j.ravel(), (i.ravel() + 1) % sides, (j.ravel() + 1) % tube_sides
-    a, b, c, d = (r * tube_sides + s for r, s in ((i, j), (i, j1), (i1, j1), (i1, j)))
-    faces = np.stack([np.stack([a, c, b], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
-    return Mesh(_align_z(vertices, axis) + np.asarray(centre, float), faces)
+    t = np.linspace(-np.pi, np.pi, 11)
+    tube = np.stack([major + minor * np.cos(t), minor * np.sin(t)], 1)
+    return lathe(tube, sides, start, stop).pointing(axis).translated(centre)
 
 
 def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
-from zsp_lite.training.instances import Build, render_instance
+from zsp_lite.training.instances import make_instance, render_instance
 
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels
@@ -44,18 +44,16 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     The views are four pairs, a quarter turn apart. The two views of a pair differ by 5 to 45 degrees of azimuth, about
     as much as a reference and the nearest of a few target views, and never more than two views of different pairs.
-    Each view shows another instance of the same build: with other proportions, deformed, sometimes without one of its
-    parts, with its own materials and room.
+    Each view shows another instance of the object, with its own proportions, materials and room.
     """
     rng = np.random.default_rng([number, 0])
-    build = Build(number, rng)
     start = rng.uniform(0, 2 * np.pi)
     views, step = [], SIZE // GRID
     for view in range(VIEWS):
         if view % 2 == 0:
             azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(0, 0.9)
-        mesh, coordinates = build.instance()
+        mesh, coordinates = make_instance(number, rng)
         vertices = mesh.vertices
         R, t = orbit_pose(
             azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1), rng.normal(0, 0.1),

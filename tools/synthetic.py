@@ -1,0 +1,35 @@
+"""Render the training or the validation categories into a CO3D folder.
+
+python -m tools.synthetic validation --sequences 5 --frames 16 --seed 11 --out outputs/validation
+"""
+
+from argparse import ArgumentParser
+from pathlib import Path
+
+from tqdm import tqdm
+
+from tools.training_categories import TRAINING
+from tools.validation_categories import VALIDATION
+from zsp_lite.io.locks import writing
+from zsp_lite.synthetic.export import export_categories
+
+SPLITS = {"training": TRAINING, "validation": VALIDATION}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Render the sequences of all categories of a split; an existing folder is completed."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("split", choices=SPLITS)
+    for name, default in {"sequences": 4, "frames": 24, "seed": 0}.items():
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args(arguments)
+    builders = SPLITS[given.split]
+    with writing(given.out):
+        export_categories(
+            list(builders), given.out, given.sequences, given.frames, given.seed, progress=tqdm, builders=builders
+        )
+
+
+if __name__ == "__main__":
+    main()
