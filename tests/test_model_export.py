@@ -14,8 +14,8 @@ from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
-from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.errors import InputError
+from zsp_lite.samples import REPOSITORY
 from zsp_lite.synthetic import model_export
 from zsp_lite.synthetic.ground_truth import ground_truth_pair, object_poses
 from zsp_lite.synthetic.model_export import RENDERED_FILE, export_models
@@ -136,11 +136,11 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
     ("wrong", "message"),
     [
         (["--models", "MODELS", "--preset", "paper"], "or --models"),
-        (["--models", "MODELS", "--sequences", "2"], "one sequence per model"),
+        (["--models", "MODELS", "--sequences", "2"], "--sequences does not go with --models"),
         (["--models", "MODELS", "--front", "+y"], "front is +y and up is +y, expected perpendicular axes"),
         (["--models", "nowhere"], "does not exist"),
-        (["--category", "mouse", "--image-size", "64"], "--image-size goes with --models"),
-        (["--category", "mouse", "--up", "+z"], "--front and --up go with --models"),
+        (["--category", "mouse", "--image-size", "64"], "--image-size does not go with --category"),
+        (["--category", "mouse", "--up", "+z"], "--up does not go with --category"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, capsys, wrong, message):

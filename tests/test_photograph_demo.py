@@ -7,9 +7,10 @@ import pytest
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, render
 
 from zsp_lite import demo
-from zsp_lite.cli import main as cli
+from zsp_lite.cli.demo import MODELS_NOTE
+from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
+from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
 from zsp_lite.demo import run_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
@@ -146,9 +147,10 @@ def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, 
     monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
     monkeypatch.setattr(demo, "run_demo", lambda dataset, backbone, solvers: iter(()))
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
-    assert cli.main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
+    assert main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert text.index("Photographed motorcycle") < text.index("One pair per category")
-    assert text.count("│ verified ") == 2 and "own saliency" in text and cli.MODELS_NOTE in " ".join(text.split())
+    assert text.count("│ verified ") == 2 and "own saliency" in text and MODELS_NOTE in " ".join(text.split())
     assert "Which way does a real motorcycle stand?" in (tmp_path / "report.html").read_text()

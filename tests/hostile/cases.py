@@ -33,9 +33,9 @@ from tests.hostile.harness import (
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import read_depth, read_image, read_mask
-from zsp_lite.data.label_import import import_labels
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
+from zsp_lite.data.published import import_labels
 from zsp_lite.importers import READERS
 from zsp_lite.io.ply import read_ply
 
@@ -195,7 +195,7 @@ for path in ("../../../etc/passwd", "/etc/passwd", "cup/a\0.jpg", "x/" * 50_000,
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
 for option, value in (("--executor", "json:loads"), ("--executor", "dask://\0"), ("--executor", "raises:now"),
                       ("--methods", "os:_exit"), ("--methods", "raises:now"), ("--categories", "../.."),
-                      ("--backbone", "\0"), ("--cache", "/dev/null/x")):  # fmt: skip
+                      ("--backbone", "\0")):  # fmt: skip
     command("malicious", f"benchmark {option} {value!r}", *ON_DATA, option, value, change=lambda folder: (
         sys.path.insert(0, str(folder)), written("raises.py", "raise SystemExit(3)")(folder)))  # fmt: skip
 
@@ -254,7 +254,7 @@ for argv in (
     ("estimate", "ROOT/a.png", "ROOT/nothing"), ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "nan,1,1,1"),
     ("tables", "\0"), ("tables", "ROOT"), ("compare", "ROOT", "\udcff"), ("data", "check", "\0"), ("data", "check", "ROOT/capture"),
     ("data", "labels", "file:///etc", "--root", "ROOT/data"), ("data", "transfer", "ROOT/data", "ROOT/data", "../cup"),
-    ("data", "labels", "http://localhost:1/x", "--root", "ROOT/data", "--sha256", "0" * 64),
+    ("data", "labels", "http://localhost:1/x", "--root", "ROOT/data"),
     ("data", "download", "co3d", "--category", "[/1]", "--root", "ROOT/new", "--yes"), ("weights", "fetch", "../../x"),
     ("data", "import", "lists", "ROOT/capture", "--root", "ROOT/data", "--category", "c", "--sequence", "..", "--box", "2,2,20,20"),
     ("data", "import", "lists", "ROOT/capture", "--root", "ROOT/data", "--category", "c", "--sequence", "s", "--box", "nan,1,2,3"),

@@ -1,78 +1,45 @@
-"""Option types, shared options and the examples under a help text, used by every command.
+"""Types of options, options that several commands share, and the examples below a help text.
 
-The command line uses click and not typer: click's usage errors are public classes that `main` can print as one line,
-and `--help` does not import pydantic.
+The command line uses click and not typer: `main` prints click's usage errors as one line, and `--help` does not import
+pydantic.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any
 
 import click
 
 from zsp_lite.backbones.facets import FACETS
 
-if TYPE_CHECKING:
-    from zsp_lite.backbones.load import BackboneConfig
 
-Command = TypeVar("Command", bound=Callable)
+class Parsed(click.ParamType):
+    """Type of an option: `parse` converts its text, and `valid` tells whether the value can be used."""
 
-COUNT = click.IntRange(1, 1_000_000)
-SEED = click.IntRange(min=0)
-
-
-class _Path(click.Path):
-    """A path as `pathlib.Path`; an empty one, and null bytes, which no file system has, are refused."""
+    def __init__(self, metavar: str, parse: Callable[[str], Any], valid: Callable[[Any], bool], expected: str):
+        self.name, self.parse, self.valid, self.expected = metavar, parse, valid, expected
 
     def convert(self, value, parameter, context):
-        if "\0" in str(value):
-            self.fail(f"got {value!r}, expected a path without null bytes", parameter, context)
-        if not str(value):
-            self.fail("got an empty path", parameter, context)
-        return Path(super().convert(value, parameter, context))
+        with suppress(ValueError, OverflowError):
+            if self.valid(found := self.parse(value)):
+                return found
+        self.fail(f"got {value!r}, expected {self.expected}", parameter, context)
 
 
-PATH = _Path()
+def _four_finite(values: tuple[float, ...]) -> bool:
+    return len(values) == 4 and all(map(math.isfinite, values))
 
 
-def names(text: str) -> list[str]:
-    """Parse "A,B" into ["A", "B"]."""
-    found = [name.strip() for name in text.split(",") if name.strip()]
-    if not found:
-        raise click.BadParameter(f"got {text!r}, expected names separated by commas")
-    return found
-
-
-def positive(text: str | float) -> float:
-    """Parse a positive, finite number."""
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise click.BadParameter(f"got {text!r}, expected a positive number")
-    return value
-
-
-def four_numbers(text: str) -> tuple[float, ...]:
-    """Parse "A,B,C,D" into four finite numbers."""
-    values = tuple(_number(word) for word in text.split(","))
-    if len(values) != 4 or not all(map(math.isfinite, values)):
-        raise click.BadParameter(f"got {text!r}, expected four numbers separated by commas")
-    return values
-
-
-def four_integers(text: str) -> tuple[int, ...]:
-    """Parse "A,B,C,D" into four integers."""
-    values = four_numbers(text)
-    if any(value != int(value) for value in values):
-        raise click.BadParameter(f"got {text!r}, expected four integers separated by commas")
-    return tuple(int(value) for value in values)
-
-
-def _number(text: str | float) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
+COUNT.name = INDEX.name = "n"
+PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
+NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
+LENGTH = Parsed("metres", float, lambda length: 0 < length < math.inf, "a positive number")
+BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _four_finite, "four integers")
+INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _four_finite, "four numbers")
 
 
 def examples(*lines: str) -> str:
@@ -80,45 +47,28 @@ def examples(*lines: str) -> str:
     return "\b\nExamples:\n" + "\n".join(f"  zsp-lite {line}" for line in lines)
 
 
-def out_option(default: str | None, text: str) -> Callable[[Command], Command]:
-    """Return the option --out, a folder to write."""
-    return click.option("--out", type=PATH, metavar="DIR", default=default, help=text)
+def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) -> None:
+    """Raise click.UsageError if an option was given, and `by`, which takes only some options, does not take it."""
+    for name, value in given.items():
+        if value and name not in taken:
+            raise click.UsageError(f"--{name.replace('_', '-')} does not go with {by}")
 
 
-seed_option = click.option("--seed", type=SEED, metavar="SEED", default=0, help="Seed of every random draw.")
-replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
+seed_option = click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 
 
-def backbone_options(command: Command) -> Command:
-    """Add --backbone, --layer, --facet and --image-size to a command; `backbone_config` takes their values."""
-    options = (
-        click.option(
-            "--backbone", metavar="NAME", default="zsp-tiny",
-            help="zsp-tiny, dino_vits8, dino_vits16, dino_vitb8, dino_vitb16, a checkpoint file, or hf:NAME for a "
-            "vision transformer from the Hugging Face hub or a local folder in its format.",
-        ),
-        click.option(
-            "--layer", metavar="L", show_default="the backbone's own",
-            help="Transformer block that gives the descriptors: block0, block1, ..., last, or a number. The published "
-            "code uses block9.",
-        ),
-        click.option(
-            "--facet", type=click.Choice(FACETS), default="key",
-            help="Activation of that block used as descriptor; the paper uses the keys.",
-        ),
-        click.option(
-            "--image-size", type=COUNT, metavar="PX", show_default="the checkpoint's, usually 224",
-            help="Input size of the backbone in pixels, rounded to a multiple of the patch size.",
-        ),
-    )  # fmt: skip
-    for option in reversed(options):
-        command = option(command)
-    return command
+def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `load_backbone` takes."""
 
+    @click.option("--backbone", "name", default="zsp-tiny", help="A name of `weights list`, a file, or hf:NAME.")
+    @click.option("--layer", show_default="the backbone's own", help="Block of the descriptors: block0, ..., last.")
+    @click.option("--facet", type=click.Choice(FACETS), default="key", help="Activation of that block to use.")
+    @click.option("--image-size", type=COUNT, show_default="usually 224", help="Side of the network's input in pixels.")
+    @wraps(command)
+    def with_backbone(name, layer, facet, image_size, **others):
+        from zsp_lite.backbones.load import BackboneConfig
 
-def backbone_config(backbone: str, layer: str | None, facet: str, image_size: int | None) -> "str | BackboneConfig":
-    """Return what `load_backbone` takes: the name alone where every other option has its default."""
-    from zsp_lite.backbones.load import BackboneConfig
+        config = BackboneConfig(name, layer, facet, image_size)
+        return command(backbone=name if config == BackboneConfig(name) else config, **others)
 
-    config = BackboneConfig(backbone, layer, facet, image_size)
-    return backbone if config == BackboneConfig(backbone) else config
+    return with_backbone

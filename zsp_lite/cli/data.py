@@ -9,32 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zsp_lite.cli.common import (
-    COUNT,
-    PATH,
-    examples,
-    four_integers,
-    four_numbers,
-    positive,
-    replace_option,
-)
-from zsp_lite.errors import InputError
+from zsp_lite.cli.common import BOX, COUNT, INTRINSICS, LENGTH, PATH, examples, refuse_options
 
 if TYPE_CHECKING:
     from zsp_lite.data.check import CategoryCheck
 
+_PROBLEMS_SHOWN = 5  # of a category
+_CHECK_COLUMNS = ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk")
+root_option = click.option("--root", type=PATH, required=True, help="Data folder.")
+replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
 
-@click.group(
-    no_args_is_help=False,
-    subcommand_metavar="ACTION ...",
-    epilog=examples(
-        "data download co3d --category toaster --single-sequence",
-        "data check path/to/co3d",
-        "data labels path/to/clone --root path/to/co3d",
-        "data transfer path/to/v1 path/to/v2 chair",
-        "data import nerfstudio path/to/scan --root mine --category cup --sequence cup_1 --box 120,200,300,280",
-    ),
-)
+
+@click.group(no_args_is_help=False, epilog=examples("data check path/to/co3d", "data import --help"))
 def data() -> None:
     """Download or check CO3D, import labels or captures, transfer labels from CO3D v1 to v2."""
 
@@ -42,9 +28,8 @@ def data() -> None:
 @data.command(epilog=examples("data check path/to/co3d", "data check path/to/co3d --deep"))
 @click.argument("root", type=PATH)
 @click.option("--deep", is_flag=True, help="Also decode every file; slow on large folders.")
-@click.option("--show", type=COUNT, metavar="N", default=5, help="Problems printed per category.")
 @click.option("--partial", is_flag=True, help="A sequence without any file is not a problem: it was not downloaded.")
-def check(root: Path, deep: bool, show: int, partial: bool) -> int:
+def check(root, deep, partial) -> int:
     """Report missing or broken files, the number of pairs that can be evaluated, and the size on disk.
 
     The exit code is 1 if there is any problem.
@@ -54,68 +39,54 @@ def check(root: Path, deep: bool, show: int, partial: bool) -> int:
     from zsp_lite.data.check import check_folder
 
     checks = check_folder(root, deep, lambda names: tqdm(names, "checking", disable=None), partial=partial)
-    return print_checks(root, checks, deep, show)
+    return print_checks(root, checks, deep)
 
 
-def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool, show: int) -> int:
-    """Print the results of `check_folder`.
-
-    Args:
-        root: The data folder.
-        checks: The results.
-        deep: Whether files were decoded.
-        show: Problems printed per category.
-
-    Returns:
-        Exit code: 1 if there is any problem, else 0.
-    """
-    from rich.console import Console
+def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> int:
+    """Print the results of `check_folder`, and return the exit code: 1 if there is any problem, else 0."""
     from rich.filesize import decimal
-    from rich.table import Table
 
-    table = Table(title=f"{root}: {len(checks)} categories, {decimal(sum(check.size for check in checks))}")
-    for column in ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk"):
-        table.add_column(column, justify="left" if column in ("category", "layout") else "right", no_wrap=True)
+    from zsp_lite.cli.terminal import print_rows
+
+    rows = []
     for check in checks:
         counts = (check.sequences, check.complete, check.labelled, check.usable, check.pairs, check.frames)
-        table.add_row(check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size))
-    Console(width=max(Console().width, 100), markup=False).print(table)
+        rows.append((check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size)))
+    size = decimal(sum(check.size for check in checks))
+    print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)
     for check in checks:
+        lines = []
         if check.absent:
-            print(f"{check.category}: {check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
+            lines.append(f"{check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
         if check.labelled > check.usable:
-            print(f"{check.category}: {check.usable} of {check.labelled} labelled sequences can be evaluated")
+            lines.append(f"{check.usable} of {check.labelled} labelled sequences can be evaluated")
         if check.defects:
             kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
-            print(f"{check.category}: {check.defects.total():,} frames cannot be used ({kinds})")
-        for problem in check.problems[:show]:
-            print(f"{check.category}: {problem}")
-        if (more := len(check.problems) - show) > 0:
-            print(f"{check.category}: and {more} more")
+            lines.append(f"{check.defects.total():,} frames cannot be used ({kinds})")
+        lines += check.problems[:_PROBLEMS_SHOWN]
+        if (more := len(check.problems) - _PROBLEMS_SHOWN) > 0:
+            lines.append(f"and {more} more")
+        for line in lines:
+            print(f"{check.category}: {line}")
     problems = sum(len(check.problems) for check in checks)
     tested = "can be decoded" if deep else "exists and is not empty (--deep decodes them)"
     print(f"{problems} problems." if problems else f"No problems: every annotated file {tested}.")
     return 1 if problems else 0
 
 
-@data.command(
-    epilog=examples(
-        "data labels path/to/clone --root path/to/co3d",
-        "data labels https://HOST/archive.zip --sha256 DIGEST --root path/to/co3d",
-    )
-)
-@click.argument("source")
-@click.option("--root", type=PATH, metavar="DIR", required=True, help="Data folder.")
-@click.option("--sha256", metavar="DIGEST", help="Digest of the archive; required with a URL.")
+@data.command(epilog=examples("data labels path/to/clone --root path/to/co3d"))
+@click.argument("source", type=PATH)
+@root_option
 @replace_option
-def labels(source: str, root: Path, sha256: str | None, replace: bool) -> None:
+def labels(source, root, replace) -> None:
     """Import the published pose labels and evaluation pairs into a data folder.
 
-    SOURCE is a local clone of the published repository, an archive of it, or the URL of an archive.
+    SOURCE is a local clone of the published repository, or an archive of it.
     """
-    from zsp_lite.data.label_import import import_labels, labelled_v2_categories
+    from zsp_lite.data.published import import_labels
+    from zsp_lite.data.transfer import labelled_v2_categories
 
-    counts = import_labels(source, root, sha256, replace)
+    counts = import_labels(source, root, replace=replace)
     print(f"Written to {root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
     if v2 := labelled_v2_categories(root):
         print(
@@ -125,55 +96,32 @@ def labels(source: str, root: Path, sha256: str | None, replace: bool) -> None:
 
 
 @data.command(epilog=examples("data transfer path/to/v1 path/to/v2 chair"))
-@click.argument("source", type=PATH, metavar="V1")
-@click.argument("target", type=PATH, metavar="V2")
+@click.argument("v1", type=PATH)
+@click.argument("v2", type=PATH)
 @click.argument("category")
-@click.option(
-    "--max-residual", type=positive, metavar="SHARE", default=0.05,
-    help="Largest difference of the camera centres, as a share of their spread.",
-)  # fmt: skip
 @replace_option
-def transfer(source: Path, target: Path, category: str, max_residual: float, replace: bool) -> None:
+def transfer(v1, v2, category, replace) -> None:
     """Transfer labels from a CO3D v1 folder to a v2 folder by aligning the camera centres of the same frames."""
-    from zsp_lite.data.label_import import transfer_labels
+    from zsp_lite.data.transfer import transfer_labels
 
-    residuals = transfer_labels(source, target, category, max_residual, replace)
+    residuals = transfer_labels(v1, v2, category, replace=replace)
     for name, residual in residuals.items():
         print(f"{name:24} camera centres differ by {100 * residual:.2f} % of their spread")
-    print(f"Written: {len(residuals)} labels of {category} in {target}")
+    print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
-@data.command(
-    "import",
-    epilog=examples(
-        "data import tum path/to/scan --root mine --category cup --sequence cup_1 --box 120,200,300,280",
-        "data import open3d path/to/scan --root mine --category cup --sequence cup_2 --masks path/to/masks",
-    ),
-)
+@data.command("import", epilog=examples("data import lists scan --root mine --category cup --sequence one"))
 @click.argument("layout", type=click.Choice(("tum", "nerfstudio", "open3d", "lists")))
 @click.argument("folder", type=PATH)
-@click.option("--root", type=PATH, metavar="DIR", required=True, help="Data folder, new or existing.")
+@root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
-@click.option(
-    "--box", type=four_integers, metavar="T,L,H,W",
-    help="Bounding box of the object in the first image in pixels: top, left, height, width. GrabCut segments the "
-    "object in all images.",
-)  # fmt: skip
-@click.option("--masks", type=PATH, metavar="DIR", help="Folder of mask files named like the images, instead of --box.")
-@click.option("--frames", type=COUNT, metavar="N", default=100, help="Maximum number of frames, evenly spaced.")
-@click.option(
-    "--intrinsics", type=four_numbers, metavar="FX,FY,CX,CY", show_default="those of the TUM benchmark",
-    help="Camera intrinsics of a tum folder in pixels, with pixel centres at half-integers.",
-)  # fmt: skip
-@click.option(
-    "--depth-unit", type=positive, metavar="M", show_default="0.001",
-    help="World units per stored depth value, for lists.",
-)  # fmt: skip
-def import_(
-    layout: str, folder: Path, root: Path, category: str, sequence: str, box: tuple[int, ...] | None,
-    masks: Path | None, frames: int, intrinsics: tuple[float, ...] | None, depth_unit: float | None,
-) -> None:  # fmt: skip
+@click.option("--box", type=BOX, help="Bounding box of the object in the first image in pixels.")
+@click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
+@click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced.")
+@click.option("--intrinsics", type=INTRINSICS, help="Camera intrinsics in pixels, pixel centres at half-integers.")
+@click.option("--depth-unit", type=LENGTH, show_default="0.001", help="World units per stored depth value.")
+def import_(layout, folder, root, category, sequence, box, masks, frames, **given) -> None:
     """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
 
     The first argument is the format of FOLDER, which holds:
@@ -196,16 +144,12 @@ def import_(
                   --depth-unit            metres per stored depth value, 0.001 by default
 
     Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
-    --masks, or by masks of the capture itself; frames without it are left out.
+    which GrabCut segments it in all images, by --masks, or by masks of the capture; frames without it are left out.
     """
     from zsp_lite.importers import READERS, import_capture
 
-    given = {"intrinsics": intrinsics, "depth_unit": depth_unit}
-    options = {name: value for name, value in given.items() if value is not None}
-    allowed = {"tum": "intrinsics", "lists": "depth_unit"}.get(layout)
-    if wrong := sorted(set(options) - {allowed}):
-        raise InputError(f"--{wrong[0].replace('_', '-')} does not go with the format {layout}")
-    capture = READERS[layout](folder, **options)
+    refuse_options(given, {"tum": ("intrinsics",), "lists": ("depth_unit",)}.get(layout, ()), f"the format {layout}")
+    capture = READERS[layout](folder, **{name: value for name, value in given.items() if value})
     done = import_capture(capture, root, category, sequence, box, masks, frames)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "

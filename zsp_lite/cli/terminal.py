@@ -1,17 +1,37 @@
-"""Tables of a benchmark run in the terminal."""
+"""Tables in the terminal: a table that is wider continues in the next line, and no figure is cut."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from zsp_lite.benchmark.formats import short_group
-from zsp_lite.benchmark.tables import PUBLISHED, Table
+if TYPE_CHECKING:
+    from zsp_lite.benchmark.tables import Table
 
 
-def as_rich(table: Table) -> RichTable:
-    """Format for a terminal: intervals below their figures, published figures dim."""
+def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> None:
+    """Print rows below their title; the first `texts` columns are aligned left, the others, with numbers, right."""
+    table = RichTable(title=title)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number < texts else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    _print_whole(table)
+
+
+def print_tables(tables: Iterable["Table"]) -> None:
+    """Print the tables of a benchmark run."""
+    for table in tables:
+        _print_whole(as_rich(table))
+
+
+def as_rich(table: "Table") -> RichTable:
+    """Format a table of a benchmark run: intervals below their figures, published figures dim."""
+    from zsp_lite.benchmark.formats import short_group
+    from zsp_lite.benchmark.tables import PUBLISHED
+
     made = RichTable(
         title=table.title, caption=table.note or None, caption_justify="left", box=SIMPLE_HEAD, pad_edge=False
     )
@@ -27,10 +47,7 @@ def as_rich(table: Table) -> RichTable:
     return made
 
 
-def print_tables(tables: Iterable[Table]) -> None:
-    """Print to the terminal; lines that are wider continue in the next one, and no figure is cut."""
+def _print_whole(table: RichTable) -> None:
     console = Console(markup=False)  # names may hold brackets
-    for table in tables:
-        made = as_rich(table)
-        needed = console.measure(made, options=console.options.update(max_width=1000)).maximum
-        Console(width=max(console.width, needed), markup=False).print(made)
+    needed = console.measure(table, options=console.options.update(max_width=1000)).maximum
+    Console(width=max(console.width, needed), markup=False).print(table)

@@ -1,0 +1,50 @@
+"""The command `demo`: a photographed motorcycle and one pair of every category."""
+
+import click
+
+from zsp_lite.choices import SOLVERS
+from zsp_lite.cli.common import PATH, backbone_options, examples
+
+SYNTHETIC_NOTE = "synthetic objects, composed of primitives, with depth holes and soft masks as in CO3D."
+MODELS_NOTE = "renderings of 3D models, with depth holes and soft masks as in CO3D."
+USER_NOTE = "the given folder in CO3D's layout."
+
+
+@click.command(epilog=examples("demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"))
+@click.option("--data", type=PATH, show_default="data_samples", help="Folder in CO3D's layout.")
+@click.option("--solver", type=click.Choice(SOLVERS), default="both", help="Solver for the pairs of the categories.")
+@backbone_options
+@click.option("--out", type=PATH, default="outputs/demo", help="Folder for the report.")
+def demo(data, solver, backbone, out) -> None:
+    """Estimate the pose of a real motorcycle and of one pair per category: tables, and a report with pictures.
+
+    The real motorcycle is a photograph; its targets are a category `motorcycle` of synthetic objects in the data.
+    """
+    from rich.console import Console
+
+    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.demo import run_demo, run_photograph
+    from zsp_lite.io.locks import writing
+    from zsp_lite.samples import sample_data
+    from zsp_lite.synthetic.export import SETTINGS_FILE
+    from zsp_lite.synthetic.model_export import RENDERED_FILE
+    from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows
+    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
+
+    folder = data or sample_data()
+    notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
+    note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
+    with writing(out), Console().status("estimating poses"):
+        dataset, model = Co3D(folder), load_backbone(backbone)
+        photograph = list(run_photograph(dataset, model))
+        results = list(run_demo(dataset, model, SOLVERS[solver]))
+        path = write_report(out / "report.html", results, str(folder), note, model.name, photograph)
+        write_overview(out / "overview.jpg", results)
+    if photograph:
+        title = f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"
+        print_rows(title, PHOTOGRAPH_COLUMNS, photograph_rows(photograph), texts=2)
+    rows = [row for result in results for row in table_rows(result)]
+    print_rows(f"One pair per category in {folder}, backbone {model.name}", COLUMNS, rows, texts=2)
+    print(legend(), f"Data: {note}", f"Report with pictures of every stage: {path}", sep="\n")
