@@ -52,19 +52,20 @@ def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[in
 
 
 def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> VisionTransformer:
-    """Build a transformer from weights in the DINO layout, whose shapes give its sizes; heads have 64 channels."""
+    """Build a transformer from weights in the DINO layout, whose shapes give its sizes."""
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
+        if num_heads is None:
+            num_heads = dim // 64 if dim % 64 == 0 else 0
+        with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
+            model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"{path.name}: not a vision transformer in the DINO layout ({error})") from error
-    if num_heads is None and dim % 64:
         raise InputError(
-            f"{path.name}: {dim} channels are not heads of 64, expected num_heads in the metadata of the .safetensors"
-        )
-    with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
-        model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads or dim // 64)
+            f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads is read from the metadata, "
+            "by default one per 64 channels"
+        ) from error
     load_weights(model, weights, path.name)
     return model
 

@@ -1,0 +1,74 @@
+"""Small backbones with random weights: a DINO transformer, and one of each architecture in Hugging Face's format."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+import transformers
+from torch import nn
+from transformers import AutoModel
+
+from zsp_lite.backbones.vit import VisionTransformer
+
+DEPTH, HEADS, DIM = 3, 4, 32  # of the models in Hugging Face's format
+
+
+def small_vit(seed: int = 0, **sizes) -> VisionTransformer:
+    torch.manual_seed(seed)
+    standard = {"image_size": 32, "patch_size": 8, "embed_dim": 64, "depth": 3, "num_heads": 1}
+    return with_large_weights(VisionTransformer(**(standard | sizes)))
+
+
+def with_large_weights(model: nn.Module) -> nn.Module:
+    """Replace the usual initial weights, which are too small to tell tokens apart."""
+    for parameter in model.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    return model
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What the tests know of an architecture by themselves: where its parts are and what stands before the patches."""
+
+    patch: int
+    special: int  # tokens before the patches
+    stack: str = "layers"
+    norm: str = "layernorm_before"
+    attention: str = "attention"
+    settings: dict = field(default_factory=dict)
+    interpolates: bool = True  # only when asked to
+
+
+_REGISTERS = {"num_register_tokens": 4}
+ARCHITECTURES = {
+    "vit": Architecture(16, 1),
+    "deit": Architecture(16, 2),
+    "dinov2": Architecture(14, 1, "encoder.layer", "norm1", interpolates=False),
+    "dinov2_with_registers": Architecture(14, 5, "encoder.layer", "norm1", settings=_REGISTERS, interpolates=False),
+    "dinov3_vit": Architecture(16, 5, "model.layer", "norm1", settings=_REGISTERS, interpolates=False),
+    "vit_mae": Architecture(16, 1),
+    "clip": Architecture(14, 1, "encoder.layers", "layer_norm1", "self_attn"),
+}
+
+
+def configuration(kind: str, patch: int = 16, **settings):
+    """Return a configuration; positions are stored for 3 x 3 patches, so every other image size interpolates them."""
+    sizes = {"hidden_size": DIM, "num_hidden_layers": DEPTH, "num_attention_heads": HEADS, "intermediate_size": 64}
+    vision = sizes | {"patch_size": patch, "image_size": 3 * patch} | settings
+    if kind in ("clip", "siglip", "blip"):
+        text = sizes | {"vocab_size": 99, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
+        return transformers.CONFIG_MAPPING[kind](vision_config=vision, text_config=text)
+    return transformers.CONFIG_MAPPING[kind](**vision)
+
+
+def save_model(folder: Path, config) -> Path:
+    torch.manual_seed(0)
+    with_large_weights(AutoModel.from_config(config)).save_pretrained(folder)
+    return folder
+
+
+def save_all(root: Path) -> dict[str, Path]:
+    return {
+        kind: save_model(root / kind, configuration(kind, one.patch, **one.settings))
+        for kind, one in ARCHITECTURES.items()
+    }
