@@ -64,10 +64,6 @@ def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, u
     assert (folder / "my_notebooks/00.ipynb").read_text() == "changed" and "move that folder away" in text
 
 
-def test_the_copy_of_the_notebooks_is_not_tracked():
-    assert "my_notebooks/" in (REPOSITORY / ".gitignore").read_text().splitlines()
-
-
 def test_the_version_is_the_same_everywhere():
     citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
     (latest, *_) = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(), re.MULTILINE)

@@ -68,12 +68,6 @@ def drawing_lines(cells: list[str]) -> list[int]:
     return counts
 
 
-def test_the_lines_that_draw_are_found_by_the_imports_and_by_the_usual_names():
-    first = "%matplotlib inline\nimport matplotlib.pyplot as plt\nfrom zsp_lite.viz import plots as p, scene3d\nx = 1"
-    second = "figure, axes = plt.subplots()\naxes[0, 1].plot(\n    x\n)\np.show(x); scene3d.draw(y)\nplots(x)"
-    assert drawing_lines([first, second, "p.ORANGE"]) == [0, 3, 0]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_at_most_a_third_of_a_cell_draws(path):
     """A cell may also be one drawing call, with the line that shows it."""

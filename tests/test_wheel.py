@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from zsp_lite.data import samples
+from zsp_lite import samples
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
 
@@ -66,29 +66,27 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     assert [path.name for path in cache.iterdir()] == ["samples"]
 
 
-def test_samples_are_found_in_the_cache_and_completed_after_an_interruption(tmp_path, monkeypatch):
+def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_path, monkeypatch):
     monkeypatch.setattr(samples, "REPOSITORY", tmp_path / "nowhere")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     calls = []
 
-    def synth(command, check):
-        out = command[-1]
-        out.mkdir(parents=True, exist_ok=True)
-        calls.append((command[1:-1], sorted(path.name for path in out.iterdir())))
+    def export(preset, out):
+        calls.append((preset, sorted(path.name for path in out.glob("made *"))))
         (out / f"made {len(calls)}").touch()
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(samples.subprocess, "run", synth)
+    monkeypatch.setattr("zsp_lite.synthetic.export.export_preset", export)
     with pytest.raises(KeyboardInterrupt):
         samples.sample_data()
     made = tmp_path / "cache" / "samples"
     assert samples.find_sample_data() == made and not made.exists()
-    assert samples.sample_data() == made
-    assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
-    command = ["-m", "zsp_lite", "synth", "--preset", "demo", "--out"]
-    assert samples.sample_data() == made and calls == [(command, []), (command, ["made 1"])]
+    for _ in range(2):  # the second time they are there
+        assert samples.sample_data() == made
+        assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
+        assert calls == [("demo", []), ("demo", ["made 1"])]
 
 
 def test_a_missing_data_folder_names_the_command_that_makes_one(tmp_path):

@@ -34,7 +34,6 @@ def _four_finite(values: tuple[float, ...]) -> bool:
 
 
 COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
-COUNT.name = INDEX.name = "n"
 PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
 NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
 LENGTH = Parsed("metres", float, lambda length: 0 < length < math.inf, "a positive number")

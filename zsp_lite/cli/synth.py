@@ -36,14 +36,14 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
 
     An existing folder is completed.
     """
+    if bool(preset) + bool(categories) + bool(models_folder) != 1:
+        raise click.UsageError("expected either --preset or --category or --models")
     from tqdm import tqdm
 
     from zsp_lite.io.locks import writing
     from zsp_lite.synthetic.export import export_categories, export_preset
     from zsp_lite.synthetic.model_export import export_models
 
-    if bool(preset) + bool(categories) + bool(models_folder) != 1:
-        raise click.UsageError("expected either --preset or --category or --models")
     sequences, frames, left_out = given["sequences"] or 4, given["frames"] or 24, {}
     if preset:
         refuse_options(given, (), "--preset")
