@@ -19,20 +19,20 @@ from zsp_lite.choices import MASKS, SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame, frame_defect
+from zsp_lite.data.frames import Frame, frame_defect, read_image
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, image_size
+from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
 from zsp_lite.importers.convert import READERS, capture_format
-from zsp_lite.importers.fusion import scale_frame, unit_scale
+from zsp_lite.importers.fusion import scale_frame
 from zsp_lite.importers.geometry_masks import masks_from_depth
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
-from zsp_lite.points import object_pixels, world_cloud
+from zsp_lite.points import object_pixels, unit_scale, world_cloud
 from zsp_lite.views import View, has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
@@ -40,14 +40,10 @@ _IMAGES = (".jpg", ".jpeg", ".png")
 _WHAT = {"image": "an image", "sequence": "a sequence of a data folder"} | {
     name: f"a capture of the format {name}" for name in READERS
 }
-_TAKEN = {"image": ("intrinsics", "depth", "depth_unit"), "tum": ("intrinsics",), "lists": ("depth_unit",)}
+_TAKEN = {"image": ("intrinsics", "depth", "depth_unit"), "lists": ("depth_unit",)}
 # What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
 _UNIT_OPTION = "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)"
-_UNITS = {
-    "nerfstudio": "set depth_unit_scale_factor in transforms.json",
-    "open3d": "depth of this format is in millimetres",
-    "tum": "depth of this format is in 1/5000 m",
-}
+_UNITS = {"nerfstudio": "set depth_unit_scale_factor in transforms.json"}
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
@@ -251,8 +247,8 @@ def open_source(
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder of a capture in a format of `importers.READERS`; or a
             JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
             its colours, and its mask, if there is one, NAME_mask.png.
-        intrinsics: fx, fy, cx, cy in pixels, with pixel centres at half-integers (0.5 more than OpenCV's cx and cy);
-            for an image, and for a capture of TUM's format.
+        intrinsics: fx, fy, cx, cy of an image in pixels, with pixel centres at half-integers (0.5 more than OpenCV's
+            cx and cy).
         depth: Depth file of an image, if it is named otherwise.
         depth_unit: World units per stored depth value, for an image and for a capture of plain lists; 0.001 by default.
         mask: "given", "box" or "auto". By default "box" if there is a box, "given" if the first frame has a mask, and
@@ -366,7 +362,7 @@ def _open_image(
 ) -> CaptureFrame:
     if intrinsics is None:
         raise InputError(f"image {path}: no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels")
-    size = image_size(path)
+    size = read_image(path).shape[:2]
     beside = [path.with_name(f"{path.stem}_depth{suffix}") for suffix in (".png", ".npy")]
     found = [Path(depth)] if depth is not None else [file for file in beside if file.is_file()]
     if not found:

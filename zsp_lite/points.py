@@ -65,6 +65,14 @@ def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     return float(points.std(axis=0).mean())
 
 
+def unit_scale(points: Float[np.ndarray, "n 3"]) -> float:
+    """Compute the factor that gives points (n, 3) unit standard deviation, averaged over the axes, as in CO3D."""
+    deviation = axis_deviation(points)
+    if not deviation > 0:
+        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object")
+    return 1 / deviation
+
+
 def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Gather a view's object points for display, without outliers.
 

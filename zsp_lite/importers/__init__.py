@@ -1,9 +1,10 @@
 """Import of RGB-D captures into CO3D's layout.
 
-capture: a frame of a capture, and helpers of the readers
-tum, nerfstudio, open3d_folder, lists: one reader per format
-masks: object masks by GrabCut from a bounding box, or from files
-fusion: fused point cloud of the object, and its scale
+capture: a frame of a capture
+nerfstudio, lists: one reader per format
+masks, geometry_masks: object masks by colours from a bounding box, from files, or from depth
+mask_flags: what speaks against a mask
+fusion: fused point cloud of the object
 convert: the whole import
 """
 

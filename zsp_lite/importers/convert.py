@@ -8,43 +8,30 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import CaptureFrame, subsample
-from zsp_lite.importers.fusion import fuse, scale_frame, unit_scale
+from zsp_lite.importers.capture import CaptureFrame, evenly_spaced
+from zsp_lite.importers.fusion import fuse, scale_frame
 from zsp_lite.importers.lists import read_lists
+from zsp_lite.importers.mask_flags import mask_flags
 from zsp_lite.importers.masks import masks_from_box, masks_from_files
 from zsp_lite.importers.nerfstudio import read_nerfstudio
-from zsp_lite.importers.open3d_folder import read_open3d
-from zsp_lite.importers.tum import read_tum
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
+from zsp_lite.points import unit_scale
 
-READERS: dict[str, Callable[..., list[CaptureFrame]]] = {
-    "tum": read_tum,
-    "nerfstudio": read_nerfstudio,
-    "open3d": read_open3d,
-    "lists": read_lists,
-}
-# Files and folders that only a capture of the format has, any of them.
-_SIGNS = {
-    "tum": ("groundtruth.txt",),
-    "nerfstudio": ("transforms.json",),
-    "open3d": ("trajectory.log", "scene/trajectory.log", "odometry.log"),
-    "lists": ("poses.txt",),
-}
+READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
+_SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
 MAX_FRAMES = 100  # about the length of CO3D's sequences
 
 
 def capture_format(folder: str | Path) -> str:
-    """Return the name in `READERS` of a capture's format, by the names of its files; InputError without one format."""
-    found = [name for name, signs in _SIGNS.items() if any((Path(folder) / sign).is_file() for sign in signs)]
-    if len(found) == 1:
-        return found[0]
-    files = "; ".join(f"{name}: {' or '.join(signs)}" for name, signs in _SIGNS.items())
-    if found:
-        raise InputError(f"folder {folder} has files of the formats {', '.join(found)}, expected one of them ({files})")
+    """Return the name in `READERS` of a capture's format, by the names of its files; InputError if there is none."""
+    for name, sign in _SIGNS.items():
+        if (Path(folder) / sign).is_file():
+            return name
+    files = ", ".join(f"{sign} ({name})" for name, sign in _SIGNS.items())
     raise InputError(
         f"folder {folder} is neither CATEGORY/SEQUENCE of a data folder nor a capture, expected one of its files "
-        f"({files}); `zsp-lite data import --help` lists what each format holds"
+        f"{files}; `zsp-lite data import --help` lists what each format holds"
     )
 
 
@@ -56,6 +43,7 @@ class ImportResult:
     empty: int  # frames that were left out because their masks are empty
     points: int
     scale: float  # factor from the capture's lengths to those of the sequence
+    flags: tuple[str, ...]  # what speaks against the masks
 
 
 def import_capture(
@@ -87,15 +75,14 @@ def import_capture(
         InputError: The capture cannot be read, segmented or fused, the sequence exists, or another process imports into
             the folder. Nothing is written then.
     """
-    plain_name(category, "category"), plain_name(sequence, "sequence")
-    folder = Path(root) / category / sequence
+    folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     unfinished = folder / ".unfinished"
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
-    capture = subsample(capture, max_frames)
-    frames = [frame.load() for frame in capture]
     if box is not None and masks is not None:
         raise InputError("both a box and a folder of masks are given, expected one of them")
+    capture = evenly_spaced(capture, max_frames)
+    frames = [frame.load() for frame in capture]
     if box is not None:
         frames = masks_from_box(frames, box)
     elif masks is not None:
@@ -109,6 +96,7 @@ def import_capture(
     if not seen:
         raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
     empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
+    flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
     scale = unit_scale(points)
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
@@ -119,4 +107,4 @@ def import_capture(
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(frames), empty, len(points), scale)
+    return ImportResult(len(frames), empty, len(points), scale, flags)

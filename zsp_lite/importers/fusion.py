@@ -1,4 +1,4 @@
-"""Fusion of the object's depth maps into one point cloud (Open3D), and the scale of CO3D's point clouds."""
+"""Fusion of the object's depth maps into one point cloud (Open3D)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.points import axis_deviation, object_pixels, object_points
+from zsp_lite.points import object_pixels, object_points
 
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
@@ -62,18 +62,9 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
     )
 
 
-def unit_scale(points: Float[np.ndarray, "n 3"]) -> float:
-    """Compute the factor that gives points (n, 3) unit standard deviation, averaged over the axes, as in CO3D."""
-    spread = axis_deviation(points)
-    if not spread > 0:
-        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object")
-    return 1 / spread
-
-
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
-    clouds = [frame.camera.to_world(object_points(frame))[::7] for frame in frames]
-    points = np.concatenate(clouds)
+    points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
     if len(points) < 4:
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))

@@ -1,7 +1,7 @@
-"""Object masks from depth alone: what stands on the supporting plane where the cameras look.
+"""Object masks without a box: what stands on the supporting plane where the cameras look.
 
-No box is needed. The plane of the table or floor is fitted to the points of all frames. What is above it falls into
-connected parts; the object is the part at the point that the optical axes approach.
+The plane of the table or floor is fitted to the points of all frames. What is above it falls into connected parts; the
+object is the part at the point that the optical axes approach. Where depth is unknown, colours decide.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,24 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import Frame
-from zsp_lite.data.photograph import fit_plane
+from zsp_lite.data.frames import Frame, mask_to_bbox
+from zsp_lite.data.geometry import fit_plane
 from zsp_lite.errors import InputError
+from zsp_lite.importers.masks import separate_colours
 
 # All lengths are relative to the distance of the cameras from the point that they look at.
-_REACH = 0.7  # points farther from that point are not part of the object
+REACH = 0.7  # points farther from that point are not part of the object
 _PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
 _CLEARANCE = 0.02  # smallest height of a point of the object above the plane
 _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
 _MIN_ON_PLANE = 0.05  # share of the points that must lie on it
-_SURROUNDED = 0.6  # share of the neighbours of a region of unknown depth that are on the object
 _POINTS = 20_000
 _MIN_PIXELS = 100
+# The bounding box of the object in known depth grows by these shares of its sides, half of it on each side: pixels of
+# unknown depth inside the first box may be on the object, and the colours of the background are those in the second.
+_UNKNOWN_PADDING, _CONTEXT_PADDING = 0.3, 0.8
 
 
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
@@ -38,16 +41,13 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     Raises:
         InputError: No depth is known, or nothing stands out where the cameras look.
     """
-    points = [_world_points(frame) for frame in frames]
+    points = [world_points(frame) for frame in frames]
     known = [np.isfinite(one[..., 0]) for one in points]
     if not any(one.any() for one in known):
         raise InputError(f"no depth is known in any of {len(frames)} frames, expected some to find the object")
     focus, distance = _focus(frames, points, known)
-    near = [np.linalg.norm(one - focus, axis=-1) < _REACH * distance for one in points]  # False for NaN
-    cloud = np.concatenate([one[chosen] for one, chosen in zip(points, near)])
-    cloud = cloud[:: -(-len(cloud) // _POINTS)] if len(cloud) else cloud
-    centres = np.stack([frame.camera.centre for frame in frames])
-    plane = _supporting_plane(cloud, centres, distance)
+    near = [np.linalg.norm(one - focus, axis=-1) < REACH * distance for one in points]  # False for NaN
+    plane = supporting_plane(frames, [one[chosen] for one, chosen in zip(points, near)], distance)
     if plane is not None:
         normal, offset = plane
         near = [chosen & (one @ normal - offset > _CLEARANCE * distance) for one, chosen in zip(points, near)]
@@ -56,8 +56,8 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     for frame, one, chosen, depth_known in zip(frames, points, near, known):
         mask = np.zeros(frame.camera.size, bool)
         mask[chosen] = part(one[chosen])
-        masked.append(replace(frame, mask=_filled(mask, depth_known)))
-    if not any((frame.mask > 0).sum() >= _MIN_PIXELS for frame in masked):
+        masked.append(replace(frame, mask=_with_unknown(frame, mask, depth_known).astype(np.float32)))
+    if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
             f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks, expected "
             "--box TOP,LEFT,HEIGHT,WIDTH around the object"
@@ -65,13 +65,38 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     return masked
 
 
-def _world_points(frame: Frame) -> Float[np.ndarray, "h w 3"]:
+def world_points(frame: Frame) -> Float[np.ndarray, "h w 3"]:
     """World points of all pixels, NaN where the depth is unknown."""
-    if frame.depth is None:
-        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to find the object")
     points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera))
     points[frame.depth <= 0] = np.nan
     return points
+
+
+def supporting_plane(
+    frames: Sequence[Frame], points: Sequence[Float[np.ndarray, "_ 3"]], distance: float
+) -> tuple[Float[np.ndarray, "3"], float] | None:
+    """Fit the plane that an object stands on to the points around it.
+
+    Returns:
+        Unit normal, to the side of the cameras, and offset of the plane `normal @ x = offset`; None if there is none.
+    """
+    centres = np.stack([frame.camera.centre for frame in frames])
+    cloud = np.concatenate(points)
+    cloud = cloud[:: max(1, -(-len(cloud) // _POINTS))]
+    rest = cloud
+    for _ in range(_PLANES):
+        if len(rest) < _MIN_PIXELS:
+            break
+        normal, offset = fit_plane(rest, _PLANE_DISTANCE * distance)
+        if np.median(centres @ normal - offset) < 0:
+            normal, offset = -normal, -offset
+        height = cloud @ normal - offset
+        on = np.abs(height) < _PLANE_DISTANCE * distance
+        below = (height < -3 * _PLANE_DISTANCE * distance).mean()
+        if on.mean() >= _MIN_ON_PLANE and below <= _MAX_BELOW:
+            return normal, offset
+        rest = rest[np.abs(rest @ normal - offset) >= _PLANE_DISTANCE * distance]
+    return None
 
 
 def _focus(
@@ -89,33 +114,15 @@ def _focus(
         focus = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(frames))
         if (np.einsum("nj,nj->n", focus - centres, axes) > 0).all():
             return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
-    height, width = frames[0].camera.size
+    first = next(k for k, one in enumerate(known) if one.any())
+    height, width = frames[first].camera.size
     middle = np.zeros((height, width), bool)
     middle[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
-    chosen = points[0][middle & known[0]] if (middle & known[0]).any() else points[0][known[0]]
-    depth = frames[0].camera.to_camera(chosen)[:, 2]
+    middle &= known[first]
+    chosen = points[first][middle if middle.any() else known[first]]
+    depth = frames[first].camera.to_camera(chosen)[:, 2]
     focus = np.median(chosen[depth <= np.quantile(depth, 0.25)], axis=0)
-    return focus, float(np.linalg.norm(focus - centres[0]))
-
-
-def _supporting_plane(
-    cloud: Float[np.ndarray, "n 3"], centres: Float[np.ndarray, "v 3"], distance: float
-) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """Fit the plane that the object stands on; its normal points to the cameras. None if there is none."""
-    rest = cloud
-    for _ in range(_PLANES):
-        if len(rest) < _MIN_PIXELS:
-            break
-        normal, offset = fit_plane(rest, _PLANE_DISTANCE * distance)
-        if np.median(centres @ normal - offset) < 0:
-            normal, offset = -normal, -offset
-        height = cloud @ normal - offset
-        on = np.abs(height) < _PLANE_DISTANCE * distance
-        below = (height < -3 * _PLANE_DISTANCE * distance).mean()
-        if on.mean() >= _MIN_ON_PLANE and below <= _MAX_BELOW:
-            return normal, offset
-        rest = rest[np.abs(rest @ normal - offset) >= _PLANE_DISTANCE * distance]
-    return None
+    return focus, float(np.linalg.norm(focus - centres[first]))
 
 
 def _part_at(focus: Float[np.ndarray, "3"], points: Sequence[Float[np.ndarray, "_ 3"]], voxel: float):
@@ -136,16 +143,20 @@ def _part_at(focus: Float[np.ndarray, "3"], points: Sequence[Float[np.ndarray, "
     return lambda some: parts[tuple(np.floor((some - low) / voxel).astype(int).T)] == best
 
 
-def _filled(mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Add the regions of unknown depth that the mask surrounds, close small gaps and remove single pixels."""
-    holes, count = ndimage.label(~known)
-    ring = ndimage.grey_dilation(holes, (3, 3)) * known  # the known pixels beside each region
-    around, inside = np.bincount(ring.ravel(), minlength=count + 1), np.bincount(ring[mask], minlength=count + 1)
-    surrounded = inside > _SURROUNDED * np.maximum(around, 1)
-    surrounded[0] = False
-    filled = (mask | surrounded[holes]).astype(np.uint8)
-    size = max(3, round(min(mask.shape) / 40) | 1)
-    filled = np.pad(filled, size)
-    filled = cv2.morphologyEx(filled, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-    filled = cv2.morphologyEx(filled, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    return filled[size:-size, size:-size].astype(np.float32)
+def _with_unknown(
+    frame: Frame, mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Remove single pixels of a mask, and add the pixels of unknown depth around it that have the object's colours."""
+    mask = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    if not mask.any():
+        return mask > 0
+    inner, context = (
+        np.s_[top : top + height, left : left + width]
+        for top, left, height, width in (mask_to_bbox(mask, padding=p) for p in (_UNKNOWN_PADDING, _CONTEXT_PADDING))
+    )
+    labels = np.full(mask.shape, cv2.GC_BGD, np.uint8)
+    labels[inner][~known[inner]] = cv2.GC_PR_FGD
+    labels[mask > 0] = cv2.GC_FGD
+    if (labels[context] == cv2.GC_BGD).any():
+        mask[context] = separate_colours(frame.rgb[context], labels[context])
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0

@@ -11,16 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import (
-    CaptureFrame,
-    camera_from_pose,
-    image_size,
-    listed_file,
-    parse_numbers,
-    read_rows,
-)
-from zsp_lite.io.files import path_inside
+from zsp_lite.data.frames import read_image
+from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
+from zsp_lite.io.files import path_inside, read_bytes
+
+_LISTS = ("rgb.txt", "depth.txt", "poses.txt")
 
 
 def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
@@ -29,37 +25,42 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
     Raises:
         InputError: A list is missing or invalid, or the lists differ in length.
     """
-    folder = Path(folder)
-    columns = {"rgb.txt": 1, "depth.txt": 1, "poses.txt": 12}
-    rows = {name: read_rows(path_inside(folder, name), count, "list") for name, count in columns.items()}
-    counts = {name: len(found) for name, found in rows.items()}
-    if len(set(counts.values())) > 1 or not counts["rgb.txt"]:
+    lists = {name: _read_lines(folder, name) for name in _LISTS}
+    counts = {name: len(lines) for name, lines in lists.items()}
+    if len(set(counts.values())) > 1 or not lists["rgb.txt"]:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers, at least 1")
-    matrix = _intrinsics(path_inside(folder, "intrinsics.txt"))
-    masks = {path.stem: f"masks/{path.name}" for path in sorted((folder / "masks").glob("*"))}
+    rows = [_numbers(text, f"{folder}/intrinsics.txt", (3,)) for text in _read_lines(folder, "intrinsics.txt")]
+    if len(rows) != 3 or [*rows[2], rows[1][0], rows[0][1]] != [0, 0, 1, 0, 0] or min(rows[0][0], rows[1][1]) <= 0:
+        raise InputError(f"intrinsics {folder}/intrinsics.txt are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+    (fx, _, cx), (_, fy, cy), _ = rows
+    masks = {path.stem: f"masks/{path.name}" for path in sorted((Path(folder) / "masks").glob("*"))}
     size, frames = None, []
-    for (line, image), (_, depth), (pose_line, pose) in zip(*rows.values()):
-        where = f"{folder / 'poses.txt'}, line {pose_line}"
-        values = parse_numbers(pose, where)
-        if len(values) not in (12, 16):
-            raise InputError(f"{where}: {len(values)} numbers, expected 12 or 16")
+    for number, (image, depth, numbers) in enumerate(zip(*lists.values()), 1):
+        where = f"{folder}/poses.txt, line {number}"
         pose = np.eye(4)
-        pose[: len(values) // 4] = np.array(values).reshape(-1, 4)
-        path = listed_file(folder, image[0], f"{folder / 'rgb.txt'}, line {line}")
-        size = size or image_size(path)
-        camera = camera_from_pose(pose, matrix.diagonal()[:2], matrix[:2, 2], size, where)
-        depth_path = listed_file(folder, depth[0], f"{folder / 'depth.txt'}, line {line}")
-        mask = listed_file(folder, masks[path.stem], f"capture {folder}") if path.stem in masks else None
-        frames.append(CaptureFrame(path, depth_path, camera, float(len(frames)), depth_unit, mask=mask))
+        values = np.array(_numbers(numbers, where, (12, 16))).reshape(-1, 4)
+        pose[: len(values)] = values
+        image, depth = path_inside(folder, image), path_inside(folder, depth)
+        size = size or read_image(image).shape[:2]
+        camera = camera_from_pose(pose, (fx, fy), (cx, cy), size, where)
+        mask = path_inside(folder, masks[image.stem]) if image.stem in masks else None
+        frames.append(CaptureFrame(image, depth, camera, float(number - 1), depth_unit, mask=mask))
     return frames
 
 
-def _intrinsics(path: Path) -> np.ndarray:
-    rows = [parse_numbers(words, f"{path}, line {line}") for line, words in read_rows(path, 3, "intrinsics")]
-    if len(rows) != 3 or any(len(row) != 3 for row in rows):
-        raise InputError(f"intrinsics {path} have {len(rows)} lines, expected a 3 x 3 matrix in pixels")
-    matrix = np.array(rows)
-    if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] or matrix[0, 1]:
-        raise InputError(f"intrinsics {path} are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-    return matrix
+def _read_lines(folder: str | Path, name: str) -> list[str]:
+    """Read the lines of a text file, without comments (#) and empty lines."""
+    text = read_bytes(path_inside(folder, name), "list").decode("utf-8", "replace")
+    return [line for part in text.splitlines() if (line := part.split("#")[0].strip())]
+
+
+def _numbers(text: str, where: str, counts: tuple[int, ...]) -> list[float]:
+    """Convert a line to numbers; InputError if they are not as many as one of `counts`."""
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(abs(value) <= MAX_LENGTH for value in values):  # false for NaN too
+        raise InputError(f"{where}: {text[:100]!r}, expected {' or '.join(map(str, counts))} finite numbers")
+    return values

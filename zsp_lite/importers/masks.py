@@ -1,4 +1,4 @@
-"""Object masks of a capture: by GrabCut from one bounding box, or from mask files."""
+"""Object masks of a capture by colours, from one bounding box (GrabCut), or from mask files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,16 +6,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.frames import Frame, frame_defect, read_mask
+from zsp_lite.data.geometry import largest_region
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 from zsp_lite.points import object_pixels, object_points
 
 _ITERATIONS = 4  # of GrabCut
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
+_SMALLEST_BOX = 4  # pixels
 _BALL_OFFSET = 0.6  # distance of the ball's centre behind the visible surface, relative to its radius
 _POINTS = 4000
 
@@ -37,44 +39,42 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     """
     height, width = frames[0].camera.size
     top, left, box_height, box_width = box
-    if min(top, left) < 0 or min(box_height, box_width) < 4 or top + box_height > height or left + box_width > width:
+    inside = min(top, left) >= 0 and top + box_height <= height and left + box_width <= width
+    if not inside or min(box_height, box_width) < _SMALLEST_BOX:
         raise InputError(f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}")
-    masked, points, ball = [], np.zeros((0, 3)), np.zeros((0, 3))
-    for frame in frames:
-        if masked:
-            box = None if frame_defect(frame) else _project_box(frame, np.concatenate([points, ball]))
-        mask = np.zeros(frame.camera.size, np.float32) if box is None else grab_cut(frame.rgb, box)
+    first = replace(frames[0], mask=grab_cut(frames[0].rgb, box))
+    points = _inner_points(first)
+    if not len(points):
+        raise InputError(
+            f"frame {first.name}: GrabCut finds no object with known depth in the box {tuple(box)}, expected another "
+            "--box or mask files (--masks DIR)"
+        )
+    ball, masked = _ball(first, box), [first]
+    for frame in frames[1:]:
+        found = None if frame_defect(frame) else _project_box(frame, np.concatenate([points, ball]))
+        mask = np.zeros(frame.camera.size, np.float32) if found is None else grab_cut(frame.rgb, found)
         masked.append(replace(frame, mask=mask))
-        if not mask.any():
-            if len(masked) > 1:
-                continue
-            raise InputError(
-                f"frame {frame.name}: GrabCut finds no object in the box {tuple(box)}, expected another --box or mask "
-                "files (--masks DIR)"
-            )
-        points = np.concatenate([points, _object_points(masked[-1])])
-        if not len(points):
-            raise InputError(f"frame {frame.name}: no known depth on the object, expected some to track it")
+        points = np.concatenate([points, _inner_points(masked[-1])])
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
-        if len(masked) == 1:
-            ball = _ball(masked[0], box)
     return masked
 
 
 def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]:
     """Read the masks of frames from files of the same names as the images, with any extension."""
-    files = {path.stem: path for path in sorted(Path(folder).glob("*")) if path.is_file()}
+    files = {path.stem: path.name for path in sorted(Path(folder).glob("*"))}
     masked = []
     for frame in frames:
         stem = Path(frame.name).stem
         if stem not in files:
             raise InputError(f"folder {folder} has no mask {stem}.png for the image {frame.name}")
-        masked.append(replace(frame, mask=read_mask(path_inside(folder, files[stem].name))))
+        masked.append(replace(frame, mask=read_mask(path_inside(folder, files[stem]))))
     return masked
 
 
-def grab_cut(rgb: np.ndarray, box: Box) -> Float[np.ndarray, "h w"]:
-    """Segment the object inside a box (top, left, height, width) by the colours of an 8-bit image.
+def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
+    """Segment the object inside a box (top, left, height, width) by colours.
+
+    Two pixels at the border of the image are background, so that there is some.
 
     Returns:
         (H, W) mask of 0 and 1: the largest connected foreground region, or 0 everywhere if there is none.
@@ -82,20 +82,20 @@ def grab_cut(rgb: np.ndarray, box: Box) -> Float[np.ndarray, "h w"]:
     top, left, height, width = box
     labels = np.full(rgb.shape[:2], cv2.GC_BGD, np.uint8)
     labels[top : top + height, left : left + width] = cv2.GC_PR_FGD
-    if (labels == cv2.GC_PR_FGD).all():
-        raise InputError(f"box {tuple(box)} covers the whole image, expected some background around the object")
+    labels[[0, 1, -2, -1]] = labels[:, [0, 1, -2, -1]] = cv2.GC_BGD
+    return largest_region(separate_colours(rgb, labels)).astype(np.float32)
+
+
+def separate_colours(rgb: UInt8[np.ndarray, "h w 3"], labels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Select the foreground by GrabCut, given OpenCV's label of each pixel; there must be background and foreground."""
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
-    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    inside = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
-    inside = cv2.morphologyEx(inside, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, regions, statistics, _ = cv2.connectedComponentsWithStats(inside)
-    if count < 2:
-        return np.zeros(inside.shape, np.float32)
-    return (regions == 1 + statistics[1:, cv2.CC_STAT_AREA].argmax()).astype(np.float32)
+    bgr, labels = np.ascontiguousarray(rgb[..., ::-1]), labels.copy()
+    cv2.grabCut(bgr, labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-def _object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
+def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """World points inside the mask, without its border, where depth may be that of the background."""
     inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
     return frame.camera.to_world(object_points(inner))
@@ -122,8 +122,5 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box | None:
     margin = _PADDING / 2 * (high - low).max()
     left, top = np.floor(low - margin).clip(0, (width - 1, height - 1)).astype(int)
     right, bottom = np.ceil(high + margin).clip(1, (width, height)).astype(int)
-    if right - left < 4 or bottom - top < 4:
-        return None
-    if right - left == width and bottom - top == height:
-        left, top, right, bottom = 2, 2, width - 2, height - 2
-    return int(top), int(left), int(bottom - top), int(right - left)
+    box = int(top), int(left), int(bottom - top), int(right - left)
+    return box if min(box[2:]) >= _SMALLEST_BOX else None

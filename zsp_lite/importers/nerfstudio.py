@@ -4,36 +4,40 @@ Its cameras have OpenGL's axes (+y up, looking along -z), and its pixel centres 
 """
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
-from zsp_lite.data.annotations import decode
-from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, listed_file
-from zsp_lite.io.files import path_inside, read_bytes
+from zsp_lite.data.cameras import MOST_PIXELS
+from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
+from zsp_lite.io.files import path_inside, read_json
 
 FILE = "transforms.json"
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
+_FocalLength = Annotated[float, msgspec.Meta(ge=1e-3, le=MAX_LENGTH)]  # pixels
+_Position = Annotated[float, msgspec.Meta(ge=-MAX_LENGTH, le=MAX_LENGTH)]  # pixels
+_Side = Annotated[float, msgspec.Meta(ge=1, le=MOST_PIXELS, multiple_of=1)]  # pixels; exporters write 640 or 640.0
+_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 
 
 class _Intrinsics(msgspec.Struct, kw_only=True):
     """Intrinsics, given for all frames together or for each frame."""
 
-    fl_x: float | None = None
-    fl_y: float | None = None
-    cx: float | None = None
-    cy: float | None = None
-    w: int | float | None = None
-    h: int | float | None = None
-    k1: float | None = None
-    k2: float | None = None
-    p1: float | None = None
-    p2: float | None = None
-    k3: float | None = None
-    k4: float | None = None
+    fl_x: _FocalLength | None = None
+    fl_y: _FocalLength | None = None
+    cx: _Position | None = None
+    cy: _Position | None = None
+    w: _Side | None = None
+    h: _Side | None = None
+    k1: _Coefficient | None = None
+    k2: _Coefficient | None = None
+    p1: _Coefficient | None = None
+    p2: _Coefficient | None = None
+    k3: _Coefficient | None = None
+    k4: Annotated[float, msgspec.Meta(ge=0, le=0)] | None = None  # OpenCV's model has no term of r^8
 
 
 class _Frame(_Intrinsics, kw_only=True):
@@ -45,8 +49,8 @@ class _Frame(_Intrinsics, kw_only=True):
 
 class _File(_Intrinsics, kw_only=True):
     frames: list[_Frame]
-    camera_model: str = "OPENCV"
-    depth_unit_scale_factor: float = 0.001
+    camera_model: Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"] = "OPENCV"
+    depth_unit_scale_factor: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)] = 0.001
 
 
 def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
@@ -60,32 +64,24 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
             k4 is not 0.
     """
     path = path_inside(folder, FILE)
-    content = decode(read_bytes(path, FILE), _File, path)
-    if content.camera_model not in _MODELS:
-        raise InputError(f"{path}: camera_model is {content.camera_model!r}, expected one of {', '.join(_MODELS)}")
+    content = read_json(path, _File, "capture")
+    common = {name: getattr(content, name) for name in _Intrinsics.__struct_fields__}
     frames = []
     for number, frame in enumerate(content.frames):
         if frame.depth_file_path is None:
             continue
         where = f"{path}, frame {number}"
-        given = {}
-        for name in _Intrinsics.__struct_fields__:
-            own, common = getattr(frame, name), getattr(content, name)
-            given[name] = common if own is None else own
-        given["fl_y"] = given["fl_x"] if given["fl_y"] is None else given["fl_y"]
+        given = {name: getattr(frame, name) for name in common}
+        given = common | {name: value for name, value in given.items() if value is not None}
         missing = [name for name in ("fl_x", "cx", "cy", "w", "h") if given[name] is None]
         if missing:
             raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
-        if given["k4"]:
-            raise InputError(f"{where}: k4 is {given['k4']}, expected 0: OpenCV's distortion model has no r^8 term")
+        focal_length = given["fl_x"], given["fl_y"] or given["fl_x"]
+        size = int(given["h"]), int(given["w"])
         pose = np.array(frame.transform_matrix) @ _TO_OPENCV
-        size = given["h"], given["w"]
-        if any(isinstance(side, float) and not side.is_integer() for side in size):
-            raise InputError(f"{where}: h and w are {size}, expected integers")
-        size = int(size[0]), int(size[1])
-        camera = camera_from_pose(pose, (given["fl_x"], given["fl_y"]), (given["cx"], given["cy"]), size, where)
-        image, depth = (listed_file(Path(folder), name, where) for name in (frame.file_path, frame.depth_file_path))
-        mask = None if frame.mask_path is None else listed_file(Path(folder), frame.mask_path, where)
+        camera = camera_from_pose(pose, focal_length, (given["cx"], given["cy"]), size, where)
+        image, depth = (path_inside(folder, name) for name in (frame.file_path, frame.depth_file_path))
+        mask = None if frame.mask_path is None else path_inside(folder, frame.mask_path)
         distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
         unit = content.depth_unit_scale_factor
         frames.append(CaptureFrame(image, depth, camera, float(number), unit, distortion, mask))
