@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zsp_lite.cli.common import BOX, COUNT, INTRINSICS, LENGTH, PATH, examples, refuse_options
+from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options
 
 if TYPE_CHECKING:
     from zsp_lite.data.check import CategoryCheck
@@ -111,7 +111,7 @@ def transfer(v1, v2, category, replace) -> None:
 
 
 @data.command("import", epilog=examples("data import lists scan --root mine --category cup --sequence one"))
-@click.argument("layout", type=click.Choice(("tum", "nerfstudio", "open3d", "lists")))
+@click.argument("layout", type=click.Choice(("nerfstudio", "lists")))
 @click.argument("folder", type=PATH)
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
@@ -119,24 +119,16 @@ def transfer(v1, v2, category, replace) -> None:
 @click.option("--box", type=BOX, help="Bounding box of the object in the first image in pixels.")
 @click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
 @click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced.")
-@click.option("--intrinsics", type=INTRINSICS, help="Camera intrinsics in pixels, pixel centres at half-integers.")
-@click.option("--depth-unit", type=LENGTH, show_default="0.001", help="World units per stored depth value.")
-def import_(layout, folder, root, category, sequence, box, masks, frames, **given) -> None:
+@click.option("--depth-unit", type=LENGTH, show_default="0.001", help="World units per stored depth value, for lists.")
+def import_(layout, folder, root, category, sequence, box, masks, frames, depth_unit) -> None:
     """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
 
     The first argument is the format of FOLDER, which holds:
 
     \b
-      tum         rgb.txt, depth.txt      lines: time file; depth in 1/5000 m
-                  groundtruth.txt         lines: time tx ty tz qx qy qz qw, camera to world
-                  --intrinsics            of the camera, if it is not the benchmark's default
       nerfstudio  transforms.json         intrinsics, and per frame file_path, depth_file_path and
                                           transform_matrix; phone scanners export it; depth in mm,
                                           or depth_unit_scale_factor; mask_path is used if present
-      open3d      color/, depth/          images and 16-bit depth in mm, sorted by the numbers in
-                                          their names
-                  camera_intrinsic.json   as Open3D writes it, pixel centres at integers
-                  trajectory.log          camera to world, one pose per image
       lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG or .npy
                   masks/                  if present, mask files named like the images
                   poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
@@ -148,10 +140,13 @@ def import_(layout, folder, root, category, sequence, box, masks, frames, **give
     """
     from zsp_lite.importers import READERS, import_capture
 
-    refuse_options(given, {"tum": ("intrinsics",), "lists": ("depth_unit",)}.get(layout, ()), f"the format {layout}")
-    capture = READERS[layout](folder, **{name: value for name, value in given.items() if value})
+    given = {} if depth_unit is None else {"depth_unit": depth_unit}
+    refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
+    capture = READERS[layout](folder, **given)
     done = import_capture(capture, root, category, sequence, box, masks, frames)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )
+    for flag in done.flags:
+        print(f"flag: {flag}")

@@ -44,9 +44,8 @@ def estimate(reference, target, solver, reference_frame, targets, not_upright, a
 
     \b
     --mask        given: with the images; box: by GrabCut from --box, the default with a box;
-                  auto: what stands on a plane, by the depth alone, the default without masks
-    --intrinsics  of an image, or of a capture in TUM's format; pixel centres at half-integers, 0.5 more
-                  than OpenCV's cx and cy
+                  auto: what stands on a plane, by depth and colours, the default without masks
+    --intrinsics  of an image; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
     --depth-unit  of an image, or of a capture given as lists: 0.001 for millimetres, 1 for metres
     --depth       16-bit PNG or .npy, registered to the colours
 
