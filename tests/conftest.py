@@ -53,17 +53,6 @@ def raises(expected, *args, **kwargs):
 pytest.raises = raises
 
 
-@pytest.fixture(scope="module")
-def coarse_rooms():
-    """Coarse textures of random rooms, which take less time, for tests that look at the object."""
-    from zsp_lite.synthetic import room, textures
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "_FLOOR_PIXELS", 384)
-        patch.setattr(textures, "TILE", 192)
-        yield
-
-
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
     """A labelled data set with the category "ellipsoid": two sequences of seven views of one object.

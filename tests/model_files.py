@@ -78,6 +78,6 @@ def studio() -> Room:
     plain = np.full((8, 8, 3), 0.55, np.float32)
     light = np.array([0.55, 0.45, 0.7])
     light /= np.linalg.norm(light)
-    camera = CheapCamera(exposure=0.42, noise=0.0, blur=0.3, vignetting=0.0)
+    camera = CheapCamera(exposure=0.42, noise=0.0, vignetting=0.0)
     size = np.array([14.0, 14, 12])
-    return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), np.ones(3), 0.0, camera)
+    return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), camera)

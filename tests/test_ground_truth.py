@@ -6,9 +6,9 @@ from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.depth import patch_points
-from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
+from zsp_lite.samples import sample_data
 from zsp_lite.synthetic.export import export_categories, make_object
 from zsp_lite.synthetic.ground_truth import (
     correct_matches,

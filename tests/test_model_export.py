@@ -23,7 +23,6 @@ from zsp_lite.synthetic.models import list_models
 
 FRAMES, SIZE = 5, 64
 SETTINGS = {"frames": FRAMES, "seed": 3, "image_size": SIZE}
-pytestmark = pytest.mark.usefixtures("coarse_rooms")
 
 
 @pytest.fixture(scope="module")

@@ -7,17 +7,15 @@ from pathlib import Path
 
 from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.io.files import read_json, write_atomic
+from zsp_lite.io.files import read_json, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.recording import (
-    MOST_FRAMES,
-    MOST_PIXELS,
+    check_settings,
     read_poses,
     record_sequence,
-    stable_hash,
     write_labels,
     write_pairs,
     write_sequence,
@@ -56,10 +54,8 @@ PRESETS = {
 }
 
 
-def export_preset(
-    preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] | None = None
-) -> None:
-    """Write a preset with its evaluation pairs to a folder, see `export_categories`."""
+def export_preset(preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] = iter) -> None:
+    """Write a preset with its evaluation pairs to a folder; arguments and errors as of `export_categories`."""
     if preset not in PRESETS:
         raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
     wanted = PRESETS[preset]
@@ -77,29 +73,38 @@ def export_categories(
     frames: int,
     seed: int,
     image_size: int = 256,
-    progress: Callable[[Iterable], Iterable] | None = None,
+    progress: Callable[[Iterable], Iterable] = iter,
     builders: Mapping[str, Builder] = CATEGORIES,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
     A sequence depends only on the seed, its category and its index. An incomplete export is completed; complete
-    sequences are not rendered again. The first sequence of a category is the reference of its labels. `image_size` is
-    the shorter image side in pixels, `progress` wraps the loop over sequences, as tqdm does, and `builders` has the
-    builder of each category. Raises InputError if a category is unknown, or the folder was written with other settings.
+    sequences are not rendered again. The first sequence of a category is the reference of its labels.
+
+    Args:
+        categories: Names of categories.
+        out: Data folder to write.
+        sequences: Sequences per category.
+        frames: Frames per sequence.
+        seed: Seed of objects, rooms, cameras and noise.
+        image_size: Shorter image side in pixels.
+        progress: Wraps the loop over sequences, as tqdm does.
+        builders: Builder of each category.
+
+    Raises:
+        InputError: A category is unknown, a number is out of its range, or the folder was written with other settings.
     """
     for category in categories:
         if category not in builders:
             raise InputError(f"category is {category!r}, expected one of {', '.join(builders)}")
     check_integer("sequences", sequences, 1, _MOST_SEQUENCES)
-    check_integer("frames", frames, 1, MOST_FRAMES)
-    check_integer("image_size", image_size, 32, MOST_PIXELS)
-    check_integer("seed", seed, 0)
+    check_settings(frames, image_size, seed)
     out = Path(out)
     _write_settings(out, {"seed": seed, "frames": frames, "image_size": image_size})
     jobs = [(category, index) for category in categories for index in range(sequences)]
-    for category, index in progress(jobs) if progress else jobs:
+    for category, index in progress(jobs):
         name = sequence_name(seed, category, index)
-        if name not in read_poses(out, category) or name not in _complete_sequences(out, category):
+        if name not in _complete_sequences(out, category):
             recorded = make_sequence(category, index, frames, seed, image_size, builders)
             write_sequence(out, category, make_object(category, index, seed, builders), recorded)
     for category in categories:
@@ -111,36 +116,35 @@ def make_sequence(
 ) -> tuple[SequenceData, RenderedSequence]:
     """Make sequence number `index` of a category, with simulated sensor errors, and its exact rendering."""
     name = sequence_name(seed, category, index)
-    key = stable_hash(seed, category, index)
+    key = stable_hash(f"{seed}/{category}/{index}")
     return record_sequence(make_object(category, index, seed, builders), name, key, frames, image_size)
 
 
 def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
-    key = stable_hash(seed, category, index)
+    key = stable_hash(f"{seed}/{category}/{index}")
     return with_materials(make_shape(builders[category], [key, 0]), random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
     """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
-    digits = stable_hash(seed, category, index)
+    digits = stable_hash(f"{seed}/{category}/{index}")
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
-def _write_settings(out: Path, settings: dict) -> None:
-    """Write the settings of the export, or raise InputError if the folder has others."""
+def _write_settings(out: Path, settings: dict[str, int]) -> None:
+    """Write the settings of the export; InputError if the folder has others."""
     path = out / SETTINGS_FILE
-    if path.is_file():
-        found = read_json(path, dict, "settings")
-        if not settings.items() <= found.items():
-            raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
+    found = read_json(path, dict[str, int], "settings") if path.is_file() else settings
+    if found != settings:
+        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())
 
 
 def _complete_sequences(out: Path, category: str) -> set[str]:
-    """Return the names of the sequences that are in both annotation files of the category."""
+    """Return the names of the sequences with an object pose that are in both annotation files of the category."""
     dataset = Co3D(out)
     if category not in dataset.categories():
         return set()
     listed = {sequence.sequence_name for sequence in dataset.sequences(category)}
-    return listed & {key.sequence_name for key in dataset.frame_list(category)}
+    return listed & {key.sequence_name for key in dataset.frame_list(category)} & read_poses(out, category).keys()

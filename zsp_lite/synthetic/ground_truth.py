@@ -15,13 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.neighbors import NearestNeighbors
 
-from zsp_lite.data.annotations import decode
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_bytes
+from zsp_lite.io.files import read_json
 from zsp_lite.synthetic.recording import POSES_FILE
 from zsp_lite.views import object_crop, patch_mask
 
@@ -62,21 +60,13 @@ class ObjectPose:
 
 @dataclass(frozen=True, eq=False)
 class GroundTruthPair:
-    """Object crops of two instances of a category with their ground-truth matches.
-
-    Attributes:
-        category: Category of both.
-        reference: Object crop of the reference frame.
-        target: Object crop of the target frame.
-        cells: Matching target patch (row, col) of each reference patch, see `ground_truth_matches`.
-        valid: Reference patches that have a match.
-    """
+    """Object crops of two instances of a category with their ground-truth matches."""
 
     category: str
-    reference: Frame
+    reference: Frame  # object crops
     target: Frame
-    cells: Int[np.ndarray, "rows cols 2"]
-    valid: Bool[np.ndarray, "rows cols"]
+    cells: Int[np.ndarray, "rows cols 2"]  # matching target patch (row, col) of each reference patch
+    valid: Bool[np.ndarray, "rows cols"]  # reference patches that have a match
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
@@ -92,7 +82,7 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
     if not path.is_file():
         raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
     found = {}
-    for sequence, pose in decode(read_bytes(path, "object poses"), dict[str, _Pose], path).items():
+    for sequence, pose in read_json(path, dict[str, _Pose], "object poses").items():
         trans = np.array(pose.trans)
         found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, np.array(pose.low), np.array(pose.high))
     return found
@@ -101,22 +91,11 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
 def patch_coordinates(
     frame: Frame, pose: ObjectPose, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-    """Return the box coordinates of the object point that each patch shows.
+    """Return the box coordinates of the object point that each patch shows, and the patches where they are known.
 
-    Args:
-        frame: Frame, whole or cropped to the object, with depth and mask.
-        pose: Pose of the object in the world of the frame.
-        grid: Patches (rows, columns).
-
-    Returns:
-        Box coordinates, and the patches where they are known: the mask covers a quarter of the patch, an object pixel
-        of the patch has depth, and the point is inside the box.
-
-    Raises:
-        InputError: The frame has no depth or no mask.
+    They are known where the mask covers a quarter of the patch, an object pixel of the patch has depth, and the point
+    is inside the box. The frame is a whole one or an object crop, with depth and mask.
     """
-    if frame.depth is None or frame.mask is None:
-        raise InputError(f"{frame.name or 'frame'}: expected a depth map and a mask for the coordinates of its patches")
     # Object pixels only: the floor between the spokes of a bicycle is inside the box as well.
     points, measured = patch_points(np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid)
     coordinates = pose.to_box(frame.camera.to_world(points))
@@ -131,14 +110,9 @@ def ground_truth_matches(
 ) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
     """Match each reference patch to the target patch with the nearest box coordinates.
 
-    Args:
-        reference: Coordinates and validity of the reference patches, from `patch_coordinates`.
-        target: The same of the target patches.
-        tolerance: Largest distance of a match in box coordinates.
-
-    Returns:
-        Target patch (row, col) of each reference patch, and the reference patches that have a match. Patches without
-        a match (not visible in the target view, or unknown) have the cell (0, 0).
+    `reference` and `target` are results of `patch_coordinates`, `tolerance` is the largest distance of a match. Returns
+    the target patch (row, col) of each reference patch, and the reference patches that have a match; patches without
+    a match (not visible in the target view, or unknown) have the cell (0, 0).
     """
     (points, known), (target_points, target_known) = reference, target
     cells, valid = np.zeros((*known.shape, 2), int), np.zeros_like(known)

@@ -109,7 +109,7 @@ def _cloth(rng: np.random.Generator) -> Material:
 
 def _metal(rng: np.random.Generator) -> Material:
     colour = hsv(rng.uniform(20, 60), rng.uniform(0, 0.3), rng.uniform(0.65, 0.95))
-    return Material(np.append(colour, 1.0), metallic=1.0, roughness=rng.uniform(0.2, 0.55))
+    return Material(np.append(colour, 1.0), specular=0.4, roughness=rng.uniform(0.2, 0.55))
 
 
 def _rubber(rng: np.random.Generator) -> Material:

@@ -1,30 +1,26 @@
 """Export of a folder of textured meshes as a data folder in CO3D's layout, with pose labels and evaluation pairs."""
 
-import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from zsp_lite.data.annotations import decode
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.errors import InputError, check_integer
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.models import Model, list_models
 from zsp_lite.synthetic.recording import (
-    MOST_FRAMES,
-    MOST_PIXELS,
+    check_settings,
     read_poses,
     record_sequence,
-    stable_hash,
     write_labels,
     write_pairs,
     write_sequence,
 )
 
 RENDERED_FILE = "rendered_models.json"  # in the data folder: the settings, and the model of each sequence
-_PAIRS, _TARGETS = 20, (1, 3, 5)
+_PAIRS, _TARGETS = 20, (1, 3, 5)  # evaluation pairs per category, for each of these numbers of target views
 
 
 class ModelRecord(msgspec.Struct, frozen=True):
@@ -52,24 +48,36 @@ def export_models(
     image_size: int = 256,
     front: str | None = None,
     up: str | None = None,
-    progress: Callable[[Iterable], Iterable] | None = None,
+    progress: Callable[[Iterable], Iterable] = iter,
 ) -> dict[str, str]:
     """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
 
     A sequence has the name of its model, and depends only on the seed, the model and its orientation. An incomplete
     export is completed; complete sequences are not rendered again, unless the model or its orientation changed. The
-    first model of a category is the reference of its labels. `front` and `up` are those of `list_models`.
+    first model of a category is the reference of its labels.
 
-    Returns the models that were left out ("CATEGORY/NAME"), with the reason. Raises InputError if the folder holds no
-    usable model, a setting is out of its range, or `out` was written with other settings.
+    Args:
+        folder: Folder of models, see `list_models`.
+        out: Data folder to write.
+        frames: Frames per sequence.
+        seed: Seed of rooms, cameras and noise.
+        image_size: Shorter image side in pixels.
+        front: Front of the models in the axes of their files, for those that `models.json` does not orient.
+        up: Their upper side.
+        progress: Wraps the loop over models, as tqdm does.
+
+    Returns:
+        The models that were left out ("CATEGORY/NAME"), with the reason.
+
+    Raises:
+        InputError: The folder holds no usable model, a setting is out of its range, or `out` was written with other
+            settings.
     """
-    check_integer("frames", frames, 1, MOST_FRAMES)
-    check_integer("image_size", image_size, 32, MOST_PIXELS)
-    check_integer("seed", seed, 0)
+    check_settings(frames, image_size, seed)
     models, out = list_models(folder, front, up), Path(out)
     rendered = _read_rendered(out, {"seed": seed, "frames": frames, "image_size": image_size})
     left_out = {}
-    for model in progress(models) if progress else models:
+    for model in progress(models):
         record = _record(model, Path(folder))
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
@@ -79,7 +87,7 @@ def export_models(
         except InputError as error:
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
-        key = stable_hash(seed, model.category, model.name)
+        key = stable_hash(f"{seed}/{model.category}/{model.name}")
         recorded = record_sequence(mesh, model.name, key, frames, image_size)
         write_sequence(out, model.category, mesh, recorded)
         # The record is written last; a sequence with a record is complete.
@@ -96,20 +104,20 @@ def export_models(
 
 
 def _record(model: Model, folder: Path) -> ModelRecord:
-    info, digest = model.info, hashlib.sha256(read_bytes(model.path, "model")).hexdigest()
+    info = model.info
     rotation = tuple(np.round(info.axes(model.path.suffix), 9).ravel().tolist())
-    file = model.path.relative_to(folder).as_posix()
+    file, digest = model.path.relative_to(folder).as_posix(), sha256(model.path, "model")
     return ModelRecord(file, digest, rotation, info.author, info.licence, info.source, info.changes)
 
 
 def _read_rendered(out: Path, settings: dict[str, int | str]) -> _Rendered:
-    """Return the records of an earlier export. Raises InputError if the folder is another one's."""
+    """Return the records of an earlier export; InputError if the folder holds something else."""
     path = out / RENDERED_FILE
     if not path.is_file():
         if out.is_dir() and Co3D(out).categories():
             raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
         return _Rendered(settings, {})
-    found = decode(read_bytes(path, "records"), _Rendered, path)
+    found = read_json(path, _Rendered, "records")
     if found.settings != settings:
         raise InputError(f"folder {out} was written with {found.settings}, expected {settings} or another folder")
     return found

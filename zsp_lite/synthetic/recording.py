@@ -1,29 +1,29 @@
 """Recording of one object as a sequence of a data folder, with object pose, labels and evaluation pairs."""
 
-import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from zsp_lite.data.annotations import decode
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
+from zsp_lite.errors import check_integer
+from zsp_lite.io.files import read_json, write_atomic
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.sensor import simulate_capture
 from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
-JPEG_QUALITY = 88
-MOST_FRAMES, MOST_PIXELS = 10_000, 4096  # of a sequence; of a side of an image
+_JPEG_QUALITY = 88
 
 
-def stable_hash(seed: int, category: str, item: int | str) -> int:
-    """Return a 64-bit hash that is the same on every machine and in every process."""
-    return int.from_bytes(hashlib.sha256(f"{seed}/{category}/{item}".encode()).digest()[:8], "big")
+def check_settings(frames: int, image_size: int, seed: int) -> None:
+    """Raise InputError if the number of frames, the shorter image side or the seed is out of its range."""
+    check_integer("frames", frames, 1, 10_000)
+    check_integer("image_size", image_size, 32, 4096)
+    check_integer("seed", seed, 0)
 
 
 def record_sequence(
@@ -49,13 +49,13 @@ def write_sequence(
     poses = read_poses(out, category)
     poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
     write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-    write_co3d(out, category, [data], JPEG_QUALITY)
+    write_co3d(out, category, [data], _JPEG_QUALITY)
 
 
 def read_poses(out: Path, category: str) -> dict:
     """Return the entries of a category's file of object poses by sequence; empty without the file."""
     path = out / category / POSES_FILE
-    return decode(read_bytes(path, "object poses"), dict, path) if path.is_file() else {}
+    return read_json(path, dict, "object poses") if path.is_file() else {}
 
 
 def write_labels(out: Path, category: str, names: Iterable[str]) -> None:
@@ -74,4 +74,4 @@ def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], se
     dataset = Co3D(out)
     for n_targets in targets:
         sampled = sample_pairs(dataset, category, pairs, n_targets, seed)
-        write_upstream_pairs(upstream_pairs_path(out, category, pairs, n_targets), sampled, dataset)
+        write_published_pairs(pairs_path(out, category, pairs, n_targets), sampled, dataset)

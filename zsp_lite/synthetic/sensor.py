@@ -15,21 +15,34 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
 from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
+from zsp_lite.synthetic.textures import smooth_noise
 
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
 _OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
 
 
-def smooth_noise(rng: np.random.Generator, size: tuple[int, int], sigma: float) -> Float[np.ndarray, "h w"]:
-    """Return Gaussian noise of unit variance, smoothed by a Gaussian of `sigma` pixels."""
-    noise = _blur(rng.standard_normal(size).astype(np.float32), sigma)
-    return noise / (noise.std() + 1e-6)
+def stereo_depth(
+    view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
+) -> Float[np.ndarray, "h w"]:
+    """Simulate the depth map of multi-view stereo, 0 where there is no measurement.
+
+    The holes are fractions of the pixels of the object and of the floor. The noise is mostly correlated between
+    pixels. It is 0.5 % of the depth at the object and grows with the square of the depth.
+    """
+    confidence = _stereo_confidence(view, rng)
+    known = np.zeros(view.mask.shape, bool)
+    for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
+        if region.any():
+            known |= region & (confidence >= np.quantile(confidence[region], holes))
+    near = np.median(view.depth[view.mask])
+    noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(view.mask.shape)
+    noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
+    return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
 
-def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
+def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
-    rng = np.random.default_rng(seed)
     scale = min(view.mask.shape) / 100
     grey = _blur(view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]), 0.6 * scale)
     energy = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
@@ -47,29 +60,8 @@ def stereo_confidence(view: Rendering, seed: int | np.random.Generator) -> Float
     return texture + noise - 1.5 * edge - 1.5 * grazing
 
 
-def stereo_depth(
-    view: Rendering, seed: int | np.random.Generator, object_holes: float = 0.4, floor_holes: float = 0.2
-) -> Float[np.ndarray, "h w"]:
-    """Simulate the depth map of multi-view stereo, 0 where there is no measurement.
-
-    The holes are fractions of the pixels of the object and of the floor. The noise is mostly correlated between
-    pixels. It is 0.5 % of the depth at the object and grows with the square of the depth.
-    """
-    rng = np.random.default_rng(seed)
-    confidence = stereo_confidence(view, rng)
-    known = np.zeros(view.mask.shape, bool)
-    for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
-        if region.any():
-            known |= region & (confidence >= np.quantile(confidence[region], np.clip(holes, 0, 1)))
-    near = np.median(view.depth[view.mask])
-    noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(view.mask.shape)
-    noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
-    return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
-
-
-def soft_mask(mask: Bool[np.ndarray, "h w"], seed: int | np.random.Generator) -> Float[np.ndarray, "h w"]:
+def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Simulate the probability map (float32) of a segmentation network: a soft edge, displaced by up to two pixels."""
-    rng = np.random.default_rng(seed)
     inside = mask.astype(np.uint8)
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     distance -= np.where(mask, 0.5, -0.5)
@@ -81,10 +73,9 @@ def fused_cloud(
     views: Sequence[Rendering],
     depths: Sequence[Float[np.ndarray, "h w"]],
     n_points: int,
-    seed: int | np.random.Generator,
+    rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Sample points of the object from the depth maps of all views: world points, unit normals, 8-bit colours."""
-    rng = np.random.default_rng(seed)
     points, normals, colours = [], [], []
     for view, depth in zip(views, depths, strict=True):
         row, col = np.nonzero((depth > 0) & view.mask)
@@ -97,7 +88,7 @@ def fused_cloud(
 
 
 def simulate_capture(
-    sequence: RenderedSequence, name: str, seed: int | np.random.Generator
+    sequence: RenderedSequence, name: str, rng: np.random.Generator
 ) -> tuple[SequenceData, RenderedSequence]:
     """Convert an exact rendering to a sequence with the errors of CO3D's data.
 
@@ -105,12 +96,11 @@ def simulate_capture(
     scores are drawn from the range of the sequences that the paper labels. Returns the sequence, and the exact
     rendering in the same unit.
     """
-    rng = np.random.default_rng(seed)
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
     depths, masks = [], []
     for view in sequence.views:
         shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)
-        depths.append(stereo_depth(view, rng, *shares))
+        depths.append(stereo_depth(view, *shares, rng))
         masks.append(soft_mask(view.mask, rng))
     points, normals, colours = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
     factor = round(1 / axis_deviation(points), 9)

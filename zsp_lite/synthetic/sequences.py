@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
+from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.raytracing import MeshScene
@@ -31,16 +32,15 @@ class RenderedSequence:
         return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
 
 
-def image_shape(image_size: int, seed: int | np.random.Generator) -> tuple[int, int]:
+def image_shape(image_size: int, rng: np.random.Generator) -> tuple[int, int]:
     """Draw (height, width) of a square, portrait or landscape picture whose shorter side has `image_size` pixels."""
-    rng = np.random.default_rng(seed)
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     unit = image_size / min(tall, wide)
     return round(tall * unit), round(wide * unit)
 
 
 def handheld_sweep(
-    vertices: Float[np.ndarray, "v 3"], seed: int | np.random.Generator, frames: int, size: tuple[int, int]
+    vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator, frames: int, size: tuple[int, int]
 ) -> list[Camera]:
     """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object.
 
@@ -48,7 +48,6 @@ def handheld_sweep(
     jitter. All cameras share one focal length: the object fills 55 to 75 % of the shorter image side in the median
     view and is inside the image in all views.
     """
-    rng = np.random.default_rng(seed)
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
 
@@ -75,23 +74,20 @@ def handheld_sweep(
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
 
-def render_sequence(
-    mesh: TexturedMesh, seed: int | np.random.Generator, frames: int, image_size: int
-) -> RenderedSequence:
+def render_sequence(mesh: TexturedMesh, rng: np.random.Generator, frames: int, image_size: int) -> RenderedSequence:
     """Render views around an object in a random room; `image_size` is the shorter image side.
 
     The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
     """
-    rng = np.random.default_rng(seed)
     cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
-    scene = MeshScene(mesh, random_room(rng), seed=int(rng.integers(2**32)))
+    scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
     rounded = partial(np.round, decimals=9)
     views = []
     for camera in cameras:
-        view = scene.render(camera, rng)
+        view = scene.render(camera)
         pose = rounded(view.camera.matrix @ to_object) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
