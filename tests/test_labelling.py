@@ -103,15 +103,13 @@ def test_a_label_is_rigid_and_maps_centre_to_centre():
     [
         (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
         (corners(), corners()[:4], "4 keypoints picked and 5"),
-        (corners(), corners()[[0, 1, 2, 3, 3]], "keypoints leg and number 5 of the sequence are the same point"),
         (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
-        (corners()[:4] * np.nan, corners()[:4], "reference are not finite"),
+        (corners()[:4] * np.nan, corners()[:4], "finite"),
     ],
 )
-def test_bad_picks_are_refused_in_one_line(reference, picks, message):
-    with pytest.raises(InputError, match=message) as caught:
-        align_picks(reference, picks, ["a", "b", "c", "leg"])
-    assert "\n" not in str(caught.value)
+def test_bad_picks_are_refused(reference, picks, message):
+    with pytest.raises(InputError, match=message):
+        align_picks(reference, picks)
 
 
 def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
@@ -171,37 +169,18 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     assert labelling.progress()[-1].state == "open"
 
 
-@pytest.mark.parametrize("point", [(0, np.nan, 0), (np.inf, 0, 0), (1, 2)])
-def test_a_pick_is_moved_to_finite_points_only_and_the_session_stays_readable(root, point):
-    labelling = Labelling(root, "chair")
-    pick_all(labelling, "best", corners())
-    with pytest.raises(InputError, match="pick on best is .*expected a finite point"):
-        labelling.move("best", 0, point)
-    np.testing.assert_array_equal(Labelling(root, "chair").picks("best"), corners())
-
-
-def test_undo_without_picks_leaves_a_skipped_sequence_skipped(root):
+def test_a_change_that_is_refused_leaves_a_skipped_sequence_skipped(root):
     labelling = Labelling(root, "chair")
     labelling.skip("b")
     labelling.undo("b")
-    assert labelling.progress() == Labelling(root, "chair").progress()
-    assert labelling.progress()[-1].state == "skipped"
-
-
-def test_a_refused_change_leaves_a_skipped_sequence_skipped(root):
-    labelling = Labelling(root, "chair")
-    labelling.skip("b")
-    with pytest.raises(InputError, match="b has no pick 0"):
-        labelling.move("b", 0, (0, 0, 0))
     with pytest.raises(InputError, match="all 0 keypoints are picked"):
         labelling.pick("b", (0, 0, 0))
+    assert labelling.progress() == Labelling(root, "chair").progress()
     assert labelling.progress()[-1].state == "skipped"
 
 
 def test_a_guess_puts_the_picks_on_the_cloud(root):
     labelling = Labelling(root, "chair")
-    with pytest.raises(InputError, match="needs 4 keypoints on the reference first"):
-        labelling.guess("a", Sim3.identity())
     cloud = labelling.cloud("a")[0]
     pick_all(labelling, "best", cloud[:5] + 1e-4)
     labelling.guess("a", Sim3.identity())
@@ -215,11 +194,12 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners()[:3])
     for call, message in (
-        (lambda: labelling.accept("a"), "3 of 5 keypoints picked"),
+        (lambda: labelling.accept("a"), "a has 3 of 5 keypoints, expected all, at least 4"),
         (lambda: labelling.accept("best"), "is the reference"),
         (lambda: labelling.pick("none", (0, 0, 0)), "sequence is 'none', expected one of best, a, b"),
-        (lambda: labelling.pick("a", (0, np.nan, 0)), "expected a finite point"),
-        (lambda: labelling.rename(9, "x"), "expected 0 to 4"),
+        (lambda: labelling.skip("best"), "best is the reference, which cannot be skipped"),
+        (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a are .*expected finite points"),
+        (lambda: labelling.move("a", 0, (0, np.inf, 0)), "picks on a are .*expected finite points"),
         (lambda: Labelling(root, "chair", reference="a"), "expected one reference sequence"),
         (lambda: Labelling(root, "chair", ["c"]), "has no point cloud"),
         (lambda: Labelling(root, "stool"), "category 'stool' is not in"),
@@ -227,6 +207,7 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
         with pytest.raises(InputError, match=message):
             call()
     assert read_labels(root, "chair") == {}
+    np.testing.assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
 
 
 def test_existing_labels_decide_the_reference(root):
@@ -238,7 +219,7 @@ def test_broken_picks_are_named(root):
     labelling = Labelling(root, "chair")
     labelling.pick("best", (0, 0, 0))
     labelling.path.write_text(labelling.path.read_text().replace('"keypoint 1"', '"seat", "back"'))
-    with pytest.raises(InputError, match="2 names and 1 picks on the reference"):
+    with pytest.raises(InputError, match="2 names, but 1 picks on the reference"):
         Labelling(root, "chair")
     labelling.path.write_text("{")
     with pytest.raises(InputError, match="label_picks/chair.json"):
@@ -265,10 +246,10 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     rms = np.sqrt(np.square(expected).mean())
     assert rms > MAX_RESIDUAL == 0.15
     assert labelling.doubt("a") == (
-        f"residual {100 * rms:.0f} % of the object's size, above 15 %; the worst keypoint is "
+        f"residual of {100 * rms:.0f} % of the object's size, above 15 %; the worst keypoint is "
         f"{labelling.names[expected.argmax()]} with {100 * expected.max():.0f} %"
     )
-    with pytest.raises(InputError, match="sequence a: residual .* expected a smaller one, or confirmed=True"):
+    with pytest.raises(InputError, match="sequence a has a residual .* expected a smaller one, or confirmed=True"):
         labelling.accept("a")
     assert "a" not in read_labels(root, "chair")
     labelling.accept("a", confirmed=True)
@@ -284,8 +265,6 @@ def test_the_reference_of_given_sequences_is_the_best_of_them(root):
     write_co3d(root, "chair", [sequence_data("c", quality=2.5)])
     labelling = Labelling(root, "chair", ["b", "c", "a", "b"])
     assert labelling.reference == "c" and labelling.sequences == ["c", "b", "a"]
-    with pytest.raises(InputError, match="c is the reference, which cannot be skipped"):
-        labelling.skip("c")
 
 
 def test_the_contact_sheet_has_a_row_for_every_candidate(root):
@@ -293,8 +272,6 @@ def test_the_contact_sheet_has_a_row_for_every_candidate(root):
     figure = contact_sheet(dataset, "chair", dataset.select("chair"), views=3)
     assert len(figure.axes) == 9
     assert figure.axes[0].get_ylabel() == "best\ncloud 3.00\nviews 2.00"
-    with pytest.raises(InputError, match="no candidate sequences"):
-        contact_sheet(dataset, "chair", [])
 
 
 @pytest.mark.slow

@@ -124,19 +124,7 @@ def test_a_larger_image_gives_a_larger_grid(model):
     assert tokens.grid == (3, 6) and tokens.keys.shape == (1, 18, DIM)
 
 
-@pytest.mark.parametrize("shape", [(3, 32, 32), (1, 1, 32, 32), (1, 3, 33, 32), (1, 3, 0, 32)])
-def test_images_that_do_not_divide_into_patches_are_refused(model, shape):
-    with pytest.raises(InputError, match="images: expected"):
-        model(torch.zeros(shape))
-
-
 @pytest.mark.parametrize("arguments", [(33, 8, 48, 1, 6), (32, 8, 50, 1, 6), (32, 8, 48, 0, 6)])
 def test_sizes_that_do_not_fit_are_refused(arguments):
     with pytest.raises(InputError, match="VisionTransformer"):
         VisionTransformer(*arguments)
-
-
-@pytest.mark.parametrize("layer", [-1, DEPTH])
-def test_a_layer_that_does_not_exist_is_refused(model, images, layer):
-    with pytest.raises(InputError, match="layer"):
-        model.extract(images, layer)

@@ -105,7 +105,9 @@ def test_a_large_residual_is_accepted_by_a_second_press_only(labelling):
         click(box, "sequence", point)
     box.buttons["accept"].click()
     assert (
-        "Not done: residual" in message(box) and "above 15 %" in message(box) and "press accept again" in message(box)
+        "Not done: residual of" in message(box)
+        and "above 15 %" in message(box)
+        and "press accept again" in message(box)
     )
     assert "a" not in read_labels(labelling.root, "chair")
     labelling.move("a", 0, picks[2] + 0.01)  # other picks are asked about anew

@@ -9,25 +9,12 @@ from matplotlib.figure import Figure
 from zsp_lite.data.annotations import SequenceAnnotation
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import crop_to_object, resize_frame
-from zsp_lite.errors import InputError
 
 _SIDE = 128  # pixels of a thumbnail
 
 
 def contact_sheet(dataset: Co3D, category: str, sequences: Sequence[SequenceAnnotation], views: int = 4) -> Figure:
-    """Draw one row of evenly spaced frames per sequence, with its quality scores.
-
-    Args:
-        dataset: The data set.
-        category: Name of the category.
-        sequences: The sequences, in the order of the rows.
-        views: Number of frames per row.
-
-    Raises:
-        InputError: There are no sequences, or a frame cannot be loaded.
-    """
-    if not sequences:
-        raise InputError(f"category {category} has no candidate sequences, expected at least one")
+    """Draw one row of evenly spaced frames per sequence, with its quality scores."""
     figure, axes = plt.subplots(
         len(sequences), views, figsize=(1.5 * views + 2.4, 1.5 * len(sequences)), squeeze=False, layout="constrained"
     )

@@ -23,22 +23,7 @@ def guess_alignment(
     """Estimate the similarity from the world of the reference sequence to that of another sequence.
 
     Poses are estimated by the verified solver between evenly spaced frames of both sequences; the estimate of the
-    highest confidence is returned.
-
-    Args:
-        dataset: The data set.
-        backbone: The backbone.
-        category: Name of the category.
-        reference: Name of the reference sequence.
-        sequence: Name of the other sequence.
-        references: Number of frames of the reference sequence.
-        views: Number of frames of the other sequence.
-
-    Returns:
-        The similarity and its confidence, in [0, 1].
-
-    Raises:
-        InputError: A sequence has no frame with camera, mask and depth.
+    highest confidence is returned, with its confidence in [0, 1].
     """
     method = ZeroShotPose(backbone, solver="verified")
     first, second = _frames(dataset, category, reference, references), _frames(dataset, category, sequence, views)

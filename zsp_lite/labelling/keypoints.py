@@ -4,7 +4,6 @@ See "Labelling pose for evaluation" in the paper's supplement: at least four key
 the clouds of the reference sequence and of another sequence, and aligned by Umeyama's method with scale.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,36 +35,22 @@ class Alignment:
         return float(np.sqrt(np.square(self.residuals).mean()))
 
 
-def align_picks(reference: ArrayLike, picks: ArrayLike, names: Sequence[str] = ()) -> Alignment:
+def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
     """Align keypoints by Umeyama's method with scale.
 
     Args:
         reference: (n, 3) keypoints on the reference sequence, n >= 4.
         picks: (n, 3) the same keypoints on another sequence.
-        names: Names of the keypoints, for error messages.
 
     Raises:
-        InputError: The numbers differ or are below 4, two keypoints are at one place, or all are collinear.
+        InputError: The numbers differ or are below 4, a keypoint is not finite, or all are equal or collinear.
     """
-    reference, picks = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (reference, picks))
+    reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
         raise InputError(
             f"{len(picks)} keypoints picked and {len(reference)} on the reference, expected equally many, "
             f"at least {MIN_KEYPOINTS}"
         )
-    for points, owner in ((reference, "reference"), (picks, "sequence")):
-        _check_distinct(points, owner, names)
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
-
-
-def _check_distinct(points: Float[np.ndarray, "n 3"], owner: str, names: Sequence[str]) -> None:
-    if not np.isfinite(points).all():
-        raise InputError(f"keypoints of the {owner} are not finite: {points.tolist()}")
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    first, second = np.unravel_index(distance.argmin(), distance.shape)
-    if distance[first, second] < 1e-9:
-        same = [names[i] if i < len(names) else f"number {i + 1}" for i in (first, second)]
-        raise InputError(f"keypoints {same[0]} and {same[1]} of the {owner} are the same point, expected two points")

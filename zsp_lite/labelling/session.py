@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.annotations import SequenceAnnotation, Triple, decode
+from zsp_lite.data.annotations import Triple
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
@@ -43,7 +43,7 @@ class Progress:
         state: "reference", "open", "accepted" or "skipped".
         picks: Number of picked keypoints.
         rms: RMS residual of the alignment relative to the spread of the picks, or None before all keypoints are picked.
-        problem: Why the picks give no alignment, such as two at one place; "" if there is no problem.
+        problem: Why the picks give no alignment, such as all on one line; "" if there is no problem.
     """
 
     sequence: str
@@ -80,36 +80,28 @@ class Labelling:
         self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
         with_cloud = [name for name, one in known.items() if one.point_cloud is not None]
-        chosen = sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud
-        chosen = list(dict.fromkeys(chosen))
         self.path = self.root / "label_picks" / f"{self.category}.json"
-        stored = decode(read_bytes(self.path, "picks"), _Picks, self.path) if self.path.is_file() else None
-        if stored and len(stored.names) != len(stored.picks.get(stored.reference_seq, [])):
+        stored = read_json(self.path, _Picks, "picks") if self.path.is_file() else None
+        if stored and len(stored.names) != (found := len(stored.picks.get(stored.reference_seq, []))):
+            raise InputError(f"picks {self.path}: {len(stored.names)} names, but {found} picks on the reference")
+        references = {label.reference_seq for label in read_labels(root, category).values()}
+        references |= ({stored.reference_seq} if stored else set()) | ({reference} if reference else set())
+        if len(references) > 1:
             raise InputError(
-                f"picks {self.path}: {len(stored.names)} names and "
-                f"{len(stored.picks.get(stored.reference_seq, []))} picks on the reference, expected equally many"
-            )
-        labelled = {label.reference_seq for label in read_labels(root, category).values()}
-        references = ({stored.reference_seq} if stored else set()) | labelled
-        if len(references | ({reference} if reference else set())) > 1:
-            given = f"reference {reference}, " if reference else ""
-            raise InputError(
-                f"category {category}: {given}labels and picks on disk refer to {', '.join(sorted(references))}, "
+                f"category {category}: reference, stored picks and labels name {', '.join(sorted(references))}, "
                 "expected one reference sequence"
             )
-        best = max(chosen, key=lambda name: _cloud_quality(known.get(name)), default="")
-        self.reference = reference or next(iter(references), None) or best
-        if self.reference and self.reference not in chosen:
-            chosen.insert(0, self.reference)
-        for name in chosen:
-            if name not in with_cloud:
-                raise InputError(
-                    f"sequence {category}/{name} has no point cloud, expected some of {', '.join(with_cloud) or 'none'}"
-                )
-        if len(chosen) < 2:
+        chosen = sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud
+        chosen = list(dict.fromkeys([*references, *chosen]))
+        if missing := [name for name in chosen if name not in with_cloud]:
             raise InputError(
-                f"category {category} has {len(chosen)} sequence with a point cloud, expected at least two"
+                f"sequence {category}/{missing[0]} has no point cloud, expected some of "
+                f"{', '.join(with_cloud) or 'none'}"
             )
+        if len(chosen) < 2:
+            raise InputError(f"category {category} has {len(chosen)} sequence with a point cloud, expected two")
+        best = max(chosen, key=lambda name: known[name].point_cloud.quality_score or -np.inf)
+        self.reference = next(iter(references), best)
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -139,101 +131,75 @@ class Labelling:
                 return self.dataset.camera(frame).R
         return np.eye(3)
 
-    def pick(self, sequence: str, point: Point, name: str | None = None) -> None:
+    def pick(self, sequence: str, point: Point, name: str = "") -> None:
         """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a new one of that name.
 
         Raises:
             InputError: All keypoints are picked, the point is not finite, or the reference's keypoints are in use on
                 other sequences.
         """
-        point = _finite_point(point, sequence)
-        picks = self._editable(sequence)
-        if sequence == self.reference:
-            self._stored.names.append(name or f"keypoint {len(picks) + 1}")
-        elif len(picks) >= len(self.names):
+        picks = self.picks(sequence)
+        if sequence != self.reference and len(picks) >= len(self.names):
             raise InputError(f"sequence {sequence}: all {len(self.names)} keypoints are picked; undo one to pick again")
-        picks.append(point)
-        self._save(sequence)
+        self.put(sequence, [*picks, point], (*self.names, name or f"keypoint {len(picks) + 1}"))
 
     def undo(self, sequence: str) -> None:
         """Remove the last pick of a sequence, if there is one."""
-        if len(self.picks(sequence)):
-            self._editable(sequence).pop()
-            if sequence == self.reference:
-                self._stored.names.pop()
-            self._save(sequence)
+        if len(picks := self.picks(sequence)):
+            self.put(sequence, picks[:-1], self.names[:-1])
 
     def clear(self, sequence: str) -> None:
         """Remove all picks of a sequence. An accepted label is kept until another one is accepted."""
-        self._editable(sequence).clear()
-        if sequence == self.reference:
-            self._stored.names.clear()
-        self._save(sequence)
+        self.put(sequence, [])
 
-    def put(self, sequence: str, points: Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
-        """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints, to undo a change.
-
-        Raises:
-            InputError: The points are not finite, or their number does not fit the keypoints.
-        """
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        wanted = len(names) if sequence == self.reference else min(len(points), len(self.names))
-        if not np.isfinite(points).all() or len(points) != wanted:
-            raise InputError(f"{len(points)} picks for {sequence}, expected {wanted} finite points")
-        self._editable(sequence)[:] = [tuple(point) for point in points.tolist()]
-        if sequence == self.reference:
-            self._stored.names[:] = names
-        self._save(sequence)
-
-    def rename(self, index: int, name: str) -> None:
-        """Rename keypoint `index` (from 0)."""
-        if not 0 <= index < len(self.names) or not name.strip():
-            raise InputError(f"keypoint {index} as {name!r}: expected 0 to {len(self.names) - 1}, and a name")
-        self._stored.names[index] = name.strip()
-        self._save()
+    def move(self, sequence: str, index: int, point: Point) -> None:
+        """Move pick `index` (from 0) of a sequence to another point (3,)."""
+        picks = self.picks(sequence)
+        picks[index] = point
+        self.put(sequence, picks, self.names)
 
     def guess(self, sequence: str, sim3: Sim3) -> None:
         """Set the picks of a sequence by transforming the keypoints of the reference.
 
         Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken. `sim3` maps
         the world of the reference to that of the sequence.
-
-        Raises:
-            InputError: The sequence is the reference, or fewer than four keypoints are defined.
         """
-        if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
-            raise InputError(f"a guess for {sequence} needs {MIN_KEYPOINTS} keypoints on the reference first")
-        cloud, moved = self.cloud(sequence)[0], sim3.apply(self.picks(self.reference))
-        picks = self._editable(sequence)
-        taken: list[int] = []
-        for point in moved:
+        cloud, taken = self.cloud(sequence)[0], []
+        for point in sim3.apply(self.picks(self.reference)):
             distance = np.square(cloud - point).sum(axis=1)
             distance[taken] = np.inf
             taken.append(int(distance.argmin()))
-        picks[:] = [tuple(cloud[index].tolist()) for index in taken]
+        self.put(sequence, cloud[taken])
+
+    def put(self, sequence: str, points: Sequence[Point] | Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
+        """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints.
+
+        A sequence that was skipped is open again.
+        """
+        points = np.array(points, dtype=np.float64).reshape(-1, 3)
+        if not np.isfinite(points).all():
+            raise InputError(f"picks on {sequence} are {points.tolist()}, expected finite points")
+        if self._known(sequence) == self.reference:
+            others = [name for name, picks in self._stored.picks.items() if name != sequence and picks]
+            if others:
+                raise InputError(
+                    f"keypoints of the reference {sequence} are in use on {', '.join(others)}; clear those first"
+                )
+            self._stored.names[:] = names
+        self._stored.picks[sequence] = points.tolist()
         self._save(sequence)
 
-    def move(self, sequence: str, index: int, point: Point) -> None:
-        """Move pick `index` (from 0) of a sequence to another point (3,)."""
-        picks = self._editable(sequence)
-        if not 0 <= index < len(picks):
-            raise InputError(f"sequence {sequence} has no pick {index}, expected 0 to {len(picks) - 1}")
-        picks[index] = _finite_point(point, sequence)
-        self._save(sequence)
+    def rename(self, index: int, name: str) -> None:
+        """Rename keypoint `index` (from 0)."""
+        self._stored.names[index] = name
+        self._save()
 
     def alignment(self, sequence: str) -> Alignment | None:
-        """Align the reference with a sequence by the picks.
-
-        Returns:
-            The alignment, or None before all keypoints are picked.
-
-        Raises:
-            InputError: Two picks are at one place, or all are collinear.
-        """
+        """Align the reference with a sequence by the picks; None before all keypoints are picked."""
         picks = self.picks(sequence)
         if len(picks) < MIN_KEYPOINTS or len(picks) != len(self.names):
             return None
-        return align_picks(self.picks(self.reference), picks, self.names)
+        return align_picks(self.picks(self.reference), picks)
 
     def relative_residuals(self, sequence: str) -> Float[np.ndarray, " n"] | None:
         """Return the residual of each keypoint relative to the object's size; None before all keypoints are picked.
@@ -248,22 +214,18 @@ class Labelling:
         return distance / max(float((high - low).max()), 1e-12)
 
     def doubt(self, sequence: str) -> str:
-        """Say why a label should be checked before it is accepted.
-
-        Returns:
-            One line with the residual and the worst keypoint if the RMS residual is above `MAX_RESIDUAL`; "" otherwise.
-        """
+        """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; "" otherwise."""
         residuals = self.relative_residuals(sequence)
         if residuals is None or (rms := float(np.sqrt(np.square(residuals).mean()))) <= MAX_RESIDUAL:
             return ""
         worst = int(residuals.argmax())
         return (
-            f"residual {100 * rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst keypoint is "
-            f"{self.names[worst]} with {100 * residuals[worst]:.0f} %"
+            f"residual of {100 * rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst keypoint "
+            f"is {self.names[worst]} with {100 * residuals[worst]:.0f} %"
         )
 
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
-        """Write the labels of a sequence, also in `doubt` if `confirmed`, and of the reference (the identity).
+        """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference, the identity.
 
         Returns:
             The label file of the sequence.
@@ -272,16 +234,16 @@ class Labelling:
             InputError: Keypoints are missing, the sequence is the reference, or the label is in doubt and not
                 confirmed.
         """
-        if self._known(sequence) == self.reference:
-            raise InputError(f"sequence {sequence} is the reference: its label is the identity and comes by itself")
-        alignment = self.alignment(sequence)
-        if alignment is None:
-            raise InputError(
-                f"sequence {sequence}: {len(self.picks(sequence))} of {len(self.names)} keypoints picked, "
-                f"expected all, at least {MIN_KEYPOINTS}"
-            )
-        if not confirmed and (doubt := self.doubt(sequence)):
-            raise InputError(f"sequence {sequence}: {doubt}; expected a smaller one, or confirmed=True")
+        alignment, picked = self.alignment(sequence), len(self.picks(sequence))
+        if sequence == self.reference:
+            problem = "is the reference: its label is the identity and comes by itself"
+        elif alignment is None:
+            problem = f"has {picked} of {len(self.names)} keypoints, expected all, at least {MIN_KEYPOINTS}"
+        else:
+            problem = "" if confirmed else self.doubt(sequence)
+            problem = problem and f"has a {problem}; expected a smaller one, or confirmed=True"
+        if problem:
+            raise InputError(f"sequence {sequence} {problem}")
         centre = self.cloud(self.reference)[0].mean(axis=0)
         label = rigid_label(alignment.sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
@@ -290,16 +252,10 @@ class Labelling:
         return path
 
     def skip(self, sequence: str) -> None:
-        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of its picks.
-
-        Any later change of its picks includes it again.
-
-        Raises:
-            InputError: The sequence is the reference, or has a label that was not made of picks.
-        """
-        if self._known(sequence) == self.reference:
+        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of its picks."""
+        path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
+        if sequence == self.reference:
             raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
-        path = label_folder(self.root, self.category) / f"{sequence}.json"
         if path.is_file() and len(self.picks(sequence)) != len(self.names):
             raise InputError(f"sequence {sequence} has a label not made of picks; remove {path} to leave it out")
         path.unlink(missing_ok=True)
@@ -327,31 +283,8 @@ class Labelling:
             raise InputError(f"sequence is {sequence!r}, expected one of {', '.join(self.sequences)}")
         return sequence
 
-    def _editable(self, sequence: str) -> list[Triple]:
-        """Return the list of a sequence's picks; InputError if the reference's keypoints are in use."""
-        if self._known(sequence) == self.reference:
-            others = [name for name, picks in self._stored.picks.items() if name != sequence and picks]
-            if others:
-                raise InputError(
-                    f"keypoints of the reference {sequence} are in use on {', '.join(others)}; clear those first"
-                )
-        return self._stored.picks.setdefault(sequence, [])
-
     def _save(self, changed: str | None = None) -> None:
         """Write the session; a changed sequence is no longer skipped."""
         if changed in self._stored.skipped:
             self._stored.skipped.remove(changed)
         write_atomic(self.path, msgspec.json.format(msgspec.json.encode(self._stored), indent=1))
-
-
-def _finite_point(point: Point, sequence: str) -> Triple:
-    point = np.asarray(point, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise InputError(f"pick on {sequence} is {point.tolist()}, expected a finite point (3,)")
-    return tuple(point.tolist())
-
-
-def _cloud_quality(sequence: SequenceAnnotation | None) -> float:
-    """Return the quality score of a sequence's point cloud, or -inf without one."""
-    score = None if sequence is None or sequence.point_cloud is None else sequence.point_cloud.quality_score
-    return -np.inf if score is None else score

@@ -89,7 +89,7 @@ class _LabellingWidget:
             raise InputError(f"the reference has {len(labelling.names)} keypoints, expected {MIN_KEYPOINTS} first")
         name = self.controls["name"].value.strip() if sequence == labelling.reference else ""
         with self._undoable(sequence):
-            labelling.pick(sequence, point, name or None)
+            labelling.pick(sequence, point, name)
         self.controls["name"].value = ""
         number = len(labelling.picks(sequence))
         if sequence != labelling.reference and number == len(labelling.names):
