@@ -17,37 +17,35 @@ def chair(a: Assembly) -> None:
     def add_to_back(mesh: Mesh, material: int, mirror: bool = False) -> None:
         a.add(mesh.rotated("y", -lean).translated((-depth / 2 + thick / 2, 0, height)), material, mirror)
 
-    style = a.choice(4)
-    if style == 0:
+    style = ("panel", "round", "slats", "rungs")[a.choice(4)]
+    if style == "panel":
         add_to_back(box((thick, width * a.u(0.8, 1), back), (0, 0, back / 2)), 1)
-    elif style == 1:
+    elif style == "round":
         add_to_back(rounded_box((thick * 1.5, width * 0.95, back * 0.6), (0, 0, back * 0.7), 3), 1)
         add_to_back(rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg), 2, mirror=True)
     else:
-        rungs, n_posts = ((0.93,), 4 + a.choice(3)) if style == 2 else ((0.35, 0.65, 0.95), 2)
+        rungs, n_posts = ((0.93,), 4 + a.choice(3)) if style == "slats" else ((0.35, 0.65, 0.95), 2)
         for y in np.linspace(-0.45, 0.45, n_posts) * width:
             add_to_back(box((thick * 0.7, 0.08, back), (0, y, back / 2)), 2)
         rung_height = back * a.u(0.1, 0.2)
         for share in rungs:
             add_to_back(box((thick * 0.8, width, rung_height), (0, 0, back * share)), 1)
 
-    x, y, base = depth / 2 - 0.06, width / 2 - 0.06, a.choice(4)
-    if base == 0:
+    x, y, base = depth / 2 - 0.06, width / 2 - 0.06, ("swivel", "cantilever", "legs", "legs")[a.choice(4)]
+    if base == "swivel":
         a.add(rod((0, 0, 0.1), (0, 0, height), leg * 1.3), 2)
         for angle in np.arange(5) * TAU / 5 + a.u(0, 1):
             foot = (0.55 * np.cos(angle), 0.55 * np.sin(angle), 0.06)
             a.add(capsule((0, 0, 0.14), foot, leg), 2)
-            a.add(ellipsoid((0.06, 0.06, 0.06), foot), 3)
-    elif base == 1:
-        # A cantilever: one bent tube per side, open at the back.
+    elif base == "cantilever":  # one bent tube per side, open at the back
         corners = [(-x, y, height - thick / 2), (x, y, height - thick / 2), (x, y, leg), (-x, y, leg)]
         for start, end in zip(corners, corners[1:]):
             a.add(capsule(start, end, leg), 2, mirror=True)
         a.add(rod((-x, y, leg), (-x, -y, leg), leg), 2)
     else:
-        splay, foot = a.u(0, 0.14), leg * a.u(0.6, 1)
+        splay = a.u(0, 0.14)
         for side in (-1, 1):
-            a.add(rod((side * x, y, height), (side * (x + splay), y + splay, 0), leg, foot), 2, mirror=True)
+            a.add(rod((side * x, y, height), (side * (x + splay), y + splay, 0), leg), 2, mirror=True)
     if a.chance(0.45):
         rest = height + a.u(0.22, 0.4)
         a.add(rounded_box((depth * a.u(0.7, 0.95), 0.12, 0.09), (0, width / 2, rest), 5), 3, mirror=True)
@@ -82,18 +80,15 @@ def toilet(a: Assembly) -> None:
 
 
 def hairdryer(a: Assembly) -> None:
-    """Build a hair dryer: barrel, nozzle or diffuser at the front, grille at the back, handle below with switches."""
+    """Build a hair dryer: barrel, nozzle or diffuser at the front, grille at the back, handle below with a switch."""
     length, radius = a.u(0.9, 1.3), a.u(0.22, 0.34)
-    mouth, style = radius * a.u(0.55, 0.85), a.choice(3)
-    # The axis of the barrel is z, and becomes x.
+    mouth = radius * a.u(0.55, 0.85)
     rear, front = -length * 0.43, length * 0.57
     back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
     a.add(lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4), 0)
-    if style == 0:
-        a.add(rod((front, 0, 0), (front + a.u(0.12, 0.3), 0, 0), mouth, mouth * a.u(0.6, 0.95)), 1)
-    elif style == 1:
-        # A concentrator nozzle becomes flat towards its slot.
-        reach, high, wide = a.u(0.25, 0.4), a.u(0.25, 0.45), a.u(1.0, 1.5)
+    if a.chance(0.6):
+        # A nozzle becomes more or less flat towards its slot.
+        reach, high, wide = a.u(0.15, 0.4), a.u(0.25, 0.8), a.u(0.8, 1.5)
         cone = cylinder(mouth, mouth, reach, 20).translated((0, 0, reach / 2))
         share = cone.vertices[:, 2:] / reach
         flat = Mesh(cone.vertices * (1 + share * (np.array([high, wide, 1]) - 1)), cone.faces)
@@ -102,27 +97,21 @@ def hairdryer(a: Assembly) -> None:
         reach = a.u(0.2, 0.3)
         bowl = [[mouth, 0], [mouth * 1.1, reach * 0.3], [radius * 1.4, reach], [0.001, reach * 0.8]]
         a.add(lathe(bowl, 24).rotated("y", TAU / 4).translated((front, 0, 0)), 1)
-    a.add(torus(radius * 0.68, 0.035, (1, 0, 0), (rear, 0, 0)), 3)
     for y in (-0.4, 0, 0.4):
-        a.add(box((0.03, 0.03, radius * 1.1), (rear, y * radius, 0)), 3)
+        a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), 3)  # a bar of the grille
     top, bottom = np.array([-0.08, 0, -radius * 0.5]), np.array([-0.08 + a.u(-0.25, 0.15), 0, -a.u(0.7, 1.1)])
     a.add(capsule(top, bottom, a.u(0.11, 0.16), a.u(0.09, 0.13)), 0 if a.chance(0.5) else 2)
-    switch = top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]
-    a.add(box((0.06, 0.1, 0.22), switch), 3)
-    if a.chance(0.5):
-        a.add(box((0.05, 0.08, 0.08), switch + [0, 0, 0.2]), 5)
-    if a.chance(0.5):
-        a.add(torus(radius, 0.03, (1, 0, 0), (-length * 0.1, 0, 0)), 4)
+    a.add(box((0.06, 0.1, 0.22), top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]), 3)  # the switch
     a.add(capsule(bottom, bottom + [-a.u(0.1, 0.35), a.u(-0.2, 0.2), -0.38], 0.035, 0.025), 3)
 
 
 def toaster(a: Assembly) -> None:
     """Build a toaster: two or four slots; lever, dial and buttons at the front end; nearly symmetric otherwise."""
     length, width, height, feet = a.u(1.0, 1.6), a.u(0.55, 0.85), a.u(0.65, 0.95), a.u(0.03, 0.08)
-    end, top, middle, style = length / 2, feet + height, feet + height / 2, a.choice(3)
-    if style == 0:
+    end, top, middle = length / 2, feet + height, feet + height / 2
+    if a.chance(0.6):
         a.add(rounded_box((length, width, height), (0, 0, middle), a.u(4, 9)), 0)
-    elif style == 1:
+    else:
         # An arch across, with flat end plates of another material.
         angle = np.linspace(0, np.pi, 13)
         y = width / 2 * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.6
@@ -132,9 +121,6 @@ def toaster(a: Assembly) -> None:
         plate = (arch - [0, middle]) * 1.03 + [0, middle]
         for side in (-1, 1):
             a.add(extrusion(plate, length * 0.09, "yz", side * length * 0.455), 1)
-    else:
-        a.add(box((length * 0.96, width, height), (0, 0, middle)), 0)
-        a.add(box((length, width * 0.86, height * 0.9), (0, 0, middle)), 1)
     a.add(box((length * 0.8, width * 0.78, 0.03), (0, 0, top)), 2)
     slot_y = width * (0.22 if a.chance(0.75) else 0)
     slots, slot = ((-0.21, 0.21), length * 0.34) if length > 1.35 and a.chance(0.6) else ((0,), length * 0.66)
@@ -148,9 +134,8 @@ def toaster(a: Assembly) -> None:
     a.add(rounded_box((0.16, a.u(0.14, 0.3), 0.08), (end + 0.07, 0, middle + a.u(-0.1, 0.25) * height), 4), 4)
     knob_y, knob_z = a.u(0.18, 0.28) * width, feet + height * 0.25
     a.add(rod((end - 0.03, knob_y, knob_z), (end + 0.07, knob_y, knob_z), a.u(0.06, 0.1)), 5)
-    for k in range(1 + a.choice(3)):
-        button_z = feet + height * (0.2 + 0.14 * k)
-        a.add(rod((end - 0.03, -knob_y, button_z), (end + 0.04, -knob_y, button_z), 0.035), 5)
+    for z in knob_z + height * 0.14 * np.arange(1 + a.choice(3)):
+        a.add(rod((end - 0.03, -knob_y, z), (end + 0.04, -knob_y, z), 0.035), 5)  # a button
     for x in (-0.36, 0.36):
         a.add(cylinder(0.06, 0.07, feet * 2).translated((x * length, width * 0.32, feet / 2)), 3, mirror=True)
     if a.chance(0.6):

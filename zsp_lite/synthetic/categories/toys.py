@@ -8,7 +8,7 @@ from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid
 
 
 def teddybear(a: Assembly) -> None:
-    """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging, optional shirt and hat."""
+    """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging, optional shirt."""
     belly, tall, skull = a.u(0.36, 0.55), a.u(0.48, 0.68), a.u(0.32, 0.46)
     standing = a.chance(0.3)
     floor = a.u(0.35, 0.5) if standing else 0.0
@@ -19,9 +19,9 @@ def teddybear(a: Assembly) -> None:
     a.add(ellipsoid((snout, a.u(0.15, 0.21), 0.15), face - [0, 0, 0.09]), 1)
     a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), 3)
     a.add(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), 3, mirror=True)
-    ear, ear_at = a.u(0.12, 0.2), head + [0, skull * a.u(0.65, 0.85), skull * a.u(0.65, 0.85)]
-    a.add(ellipsoid((0.075, ear, ear), ear_at), 0, mirror=True)
-    a.add(ellipsoid((0.05, ear * 0.6, ear * 0.6), ear_at + [0.05, 0, 0]), 1, mirror=True)
+    ear = a.u(0.12, 0.2)
+    ear_at = head + [0, skull * a.u(0.65, 0.85), skull * a.u(0.65, 0.85)]
+    a.add(ellipsoid((0.075, ear, ear), ear_at), 1, mirror=True)
     for side in (1, -1):  # each arm has its own pose
         shoulder = np.array([0, side * belly * 0.8, floor + tall * 1.45])
         hand = shoulder + [a.u(-0.05, 0.45), side * a.u(0.2, 0.42), a.u(-0.5, 0.45)]
@@ -36,17 +36,11 @@ def teddybear(a: Assembly) -> None:
         a.add(capsule((0.1, belly * 0.55, 0.15), foot, leg), 0, mirror=True)
         a.add(ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05]), 1, mirror=True)
     a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), 0)  # the tail
-    clothes = a.choice(4)
-    if clothes < 2:
+    if a.chance(0.6):  # a light belly
         a.add(ellipsoid((belly * 0.3, belly * 0.65, tall * 0.65), (belly * 0.62, 0, floor + tall * 0.95)), 1)
-    elif clothes == 2:
+    elif a.chance(0.6):
         shirt = np.array([[0.97, 0.75], [1.04, 1.0], [0.96, 1.4], [0.66, 1.78]]) * [belly, tall]
         a.add(lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), 4)
-    if a.chance(0.4):
-        a.add(ellipsoid((0.06, 0.12, 0.09), (belly * 0.62, 0.1, floor + tall * 1.78)), 5, mirror=True)  # a bow
-    if a.chance(0.2):
-        a.add(cylinder(skull * 0.55, skull * 0.45, 0.22).translated(head + [0, 0, skull * 1.05]), 6)
-        a.add(cylinder(skull * 0.8, skull * 0.8, 0.04).translated(head + [0, 0, skull * 0.94]), 6)
 
 
 def toyplane(a: Assembly) -> None:
@@ -67,7 +61,6 @@ def toyplane(a: Assembly) -> None:
         for x in (lead - 0.1, trail + 0.1):
             place = np.array([x - sweep * 0.6, span * 0.65, 0])
             a.add(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3, mirror=True)
-        a.add(rod((wing_x, 0.08, 0), (wing_x, 0.12, upper), 0.02), 3, mirror=True)
     fin, stabiliser = a.u(0.3, 0.6), a.u(0.3, 0.55)
     a.add(extrusion([[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]], 0.06), 2)
     outline = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
@@ -76,7 +69,6 @@ def toyplane(a: Assembly) -> None:
         below_wing = (wing_x - sweep * 0.4, span * 0.4, wing_z - 0.13)
         engine = np.array(below_wing if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08))
         a.add(rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.u(0.1, 0.13)), 3, mirror=True)
-        a.add(rod(engine, engine + [0.22, 0, 0], 0.07), 5, mirror=True)
     else:
         a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), 3)
         blade, turn, n_blades = a.u(0.3, 0.45), a.u(0, np.pi), 2 + a.choice(3)
@@ -84,9 +76,6 @@ def toyplane(a: Assembly) -> None:
             upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
             a.add(upright.rotated("x", turn + k * TAU / n_blades), 5)
     a.add(ellipsoid((a.u(0.2, 0.35), radius * 0.7, radius * 0.7), (length * a.u(0.16, 0.28), 0, radius * 0.75)), 4)
-    if length > 2 and a.chance(0.6):
-        for x in np.linspace(-length * 0.2, length * 0.15, 4):
-            a.add(box((0.09, 0.05, 0.09), (x, radius * 0.88, 0.08)), 4, mirror=True)
     if a.chance(0.6):
         gear = np.array([wing_x + 0.1, 0.25, -radius - 0.22])
         a.add(rod(gear * [1, 0.6, 0], gear, 0.025), 3, mirror=True)
@@ -112,41 +101,29 @@ def toytruck(a: Assembly) -> None:
     a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), 4)
     a.add(ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28)), 5, mirror=True)
     a.add(box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)), 6)
-    a.add(box((0.1, width * 0.95, 0.1), (nose + 0.03, 0, deck - 0.02)), 2)
 
     load = rear - 0.05 - tail  # the length behind the cab
-    load_x, style = tail + load / 2, a.choice(5)
-    if style == 0:
+    load_x, style = tail + load / 2, ("box", "tank", "crane", "tipper", "flat bed")[a.choice(5)]
+    if style == "box":
         height = a.u(0.6, 1.0)
         a.add(box((load, width * a.u(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)), 1)
-        a.add(box((0.02, width * 0.04, height * 0.9), (tail - 0.01, 0, deck + 0.08 + height / 2)), 2)
-    elif style == 1:
+    elif style == "tank":
         radius = width * a.u(0.38, 0.5)
         a.add(rod((tail, 0, deck + radius), (tail + load, 0, deck + radius), radius, sides=22), 1)
-        a.add(cylinder(0.1, 0.1, 0.08).translated((load_x, 0, deck + 2 * radius + 0.02)), 7)
-    elif style == 2:
+    elif style == "crane":
         mast = np.array([load_x, 0, deck + 0.3])
         jib = mast + [-load * a.u(0.4, 0.7), 0, a.u(0.5, 0.9)]
         a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), 1)
         a.add(box((0.3, 0.3, 0.3), mast + [0, 0, 0.08]), 1)
         a.add(rod(mast, jib, 0.07, 0.05), 1)
         a.add(rod(jib, jib - [0, 0, 0.45], 0.02), 3)
-        a.add(ellipsoid((0.07, 0.04, 0.09), jib - [0, 0, 0.45]), 3)
     else:
-        # A flat bed with walls, or a tipper: the same, tilted about its rear edge.
-        tilt, wall = a.u(0.15, 0.6) if style == 3 else 0.0, a.u(0.2, 0.45)
-        tray = [
-            box((load, width, 0.06), (load / 2, 0, 0)),
-            box((0.06, width, wall), (load, 0, wall / 2)),
-            box((load, 0.06, wall), (load / 2, width / 2, wall / 2)),
-            box((load, 0.06, wall), (load / 2, -width / 2, wall / 2)),
-        ]
-        for mesh in tray:
+        # A tipper is a flat bed that is tilted about its rear edge.
+        tilt, wall = a.u(0.15, 0.6) if style == "tipper" else 0.0, a.u(0.2, 0.45)
+        bottom, front_wall = box((load, width, 0.06), (load / 2, 0, 0)), box((0.06, width, wall), (load, 0, wall / 2))
+        side_wall = box((load, 0.06, wall), (load / 2, width / 2, wall / 2))
+        for mesh in (bottom, front_wall, side_wall, side_wall.mirrored()):
             a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), 1)
-        if style == 3:
-            a.add(rod((load_x, 0, deck), (load_x + 0.1, 0, deck + 0.12 + load / 2 * np.sin(tilt)), 0.05), 2)
-        elif a.chance(0.6):
-            a.add(ellipsoid((load * 0.4, width * 0.4, wall * 1.1), (load_x, 0, deck + 0.15)), 7)
     rear_axles = [tail + 0.3] if a.chance(0.5) else [tail + 0.25, tail + 0.25 + 2.1 * wheel]
     for x in (nose - cab_length * 0.6 - 0.1, *rear_axles):
         add_wheels(a, x, width / 2 - 0.02, wheel, 0.16)
@@ -154,12 +131,13 @@ def toytruck(a: Assembly) -> None:
 
 def toybus(a: Assembly) -> None:
     """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
-    city_bus, double_decker, school_bus = np.arange(3) == a.choice(3)
+    style = ("city bus", "double-decker", "school bus")[a.choice(3)]
+    n_floors = 2 if style == "double-decker" else 1
     length, width, wheel = a.u(1.9, 2.9), a.u(0.65, 0.9), a.u(0.15, 0.22)
-    height = a.u(0.65, 0.85) * (1.6 if double_decker else 1)
+    height = a.u(0.65, 0.85) * (1.6 if n_floors == 2 else 1)
     nose, tail, floor = length / 2, -length / 2, wheel * 0.8
-    bonnet = a.u(0.3, 0.45) if school_bus else 0.0
-    if school_bus:
+    bonnet = a.u(0.3, 0.45) if style == "school bus" else 0.0
+    if bonnet:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
         a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), 0)
     else:
@@ -168,25 +146,19 @@ def toybus(a: Assembly) -> None:
     body, middle = front - tail, (front + tail) / 2
     a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
     a.add(box((body * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)), 1)
-    n_windows, window_height = 4 + a.choice(4), height * (0.2 if double_decker else 0.3)
+    n_windows, window_height = 4 + a.choice(4), height * (0.2 if n_floors == 2 else 0.3)
     pitch = body * 0.9 / n_windows
-    for share in (0.36, 0.78) if double_decker else (0.66,):
+    for share in (0.36, 0.78) if n_floors == 2 else (0.66,):
         z = floor + height * share
         for k in range(n_windows):
             x = tail + body * 0.05 + (k + 0.5) * pitch
             a.add(box((pitch * 0.82, width * 1.015, window_height), (x, 0, z)), 4)
         a.add(box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), 4)
         a.add(box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), 4)
-    door = height * (0.42 if double_decker else 0.72)
+    door = height * (0.42 if n_floors == 2 else 0.72)
     a.add(box((pitch * 0.9, 0.04, door), (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)), 6)
     a.add(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), 5, mirror=True)
     a.add(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), 7, mirror=True)
-    for x in (nose, tail):
-        a.add(box((0.1, width, 0.08), (x, 0, floor + 0.02)), 2)
-    if a.chance(0.5):
-        a.add(box((0.1, 0.06, 0.14), (front - 0.02, width * 0.54, floor + height * 0.6)), 3, mirror=True)
-    if a.chance(0.5):
-        a.add(box((body * a.u(0.15, 0.3), width * 0.6, 0.1), (tail + body * 0.3, 0, floor + height + 0.03)), 1)
     for x in (nose - length * a.u(0.18, 0.24), tail + length * a.u(0.17, 0.24)):
         add_wheels(a, x, width / 2 - 0.04, wheel, 0.12)
 
@@ -200,7 +172,6 @@ def toytrain(a: Assembly) -> None:
     cab_x, floor = tail + cab_length / 2 + 0.04, deck + 0.06
     a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), 0)
     a.add(box((cab_length * 0.5, width * 1.03, cab_height * 0.3), (cab_x, 0, deck + cab_height * 0.72)), 4)
-    a.add(box((cab_length * 1.03, width * 0.7, cab_height * 0.24), (cab_x, 0, deck + cab_height * 0.78)), 4)
     a.add(ellipsoid((cab_length * 0.68, width * 0.6, a.u(0.08, 0.18)), (cab_x, 0, floor + cab_height)), 1)
     rear, front = tail + cab_length, nose - 0.06  # of the hood
     if a.chance(0.7):
@@ -208,29 +179,22 @@ def toytrain(a: Assembly) -> None:
         boiler, top = floor + radius, floor + radius * 1.9
         a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), 0)
         a.add(rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), 6)
-        for share in (0.25, 0.6):
-            x = rear + (front - rear) * share
-            a.add(rod((x, 0, boiler), (x + 0.05, 0, boiler), radius * 1.04, sides=24), 7)
         chimney, mouth = a.u(0.2, 0.45), a.u(0.08, 0.18)
         profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
         a.add(lathe(profile).translated((front - 0.2, 0, top)), 3)
         a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)), 7)
-        light_z = boiler + radius * 0.6
-        a.add(rod((front, 0, light_z), (front + 0.15, 0, light_z), 0.08, 0.1), 5)
+        a.add(rod((front, 0, boiler), (front + 0.15, 0, boiler), 0.08, 0.1), 5)
     else:
         hood_width, hood_height = width * a.u(0.7, 0.95), cab_height * a.u(0.55, 0.8)
         middle = (rear + front) / 2
         a.add(rounded_box((front - rear, hood_width, hood_height), (middle, 0, floor + hood_height / 2), 9), 0)
-        a.add(box((0.04, hood_width * 0.6, hood_height * 0.4), (front, 0, deck + hood_height * 0.4)), 6)
         a.add(ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8)), 5, mirror=True)
         a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)
-    # The cowcatcher slopes down and forwards.
-    a.add(extrusion([[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]], width * 0.75), 7)
-    a.add(rod((tail - 0.12, 0, deck), (tail, 0, deck), 0.05), 3)
+    cowcatcher = [[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]]
+    a.add(extrusion(cowcatcher, width * 0.75), 7)
     axles = np.linspace(tail + wheel * 1.3, nose - wheel * 1.6, 2 + a.choice(3))
-    big_rear = a.chance(0.4)
-    for k, x in enumerate(axles):
-        add_wheels(a, x, width / 2 - 0.03, wheel * (1.35 if big_rear and k == 0 else 1), 0.08)
+    for x in axles:
+        add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
     a.add(box((axles[-1] - axles[0], 0.03, 0.05), (axles.mean(), width / 2 + 0.06, wheel)), 7, mirror=True)
 
 
