@@ -12,14 +12,14 @@ from synthetic_views import CoordinateBackbone
 import zsp_lite
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.database import read_records
 from zsp_lite.benchmark.extractors import random_backbone
 from zsp_lite.benchmark.methods import METHODS
+from zsp_lite.benchmark.records import read_records
 from zsp_lite.benchmark.run import category_pairs, evaluate
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import sample_pairs, write_upstream_pairs
+from zsp_lite.data.pairs import sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 
@@ -136,7 +136,7 @@ def test_shipped_pairs_come_first_and_only_where_there_are_enough(folder, tmp_pa
     dataset = Co3D(shutil.copytree(folder, tmp_path / "copy"))
     sampled = sample_pairs(dataset, "lump", 4, 3, seed=9)
     path = dataset.root / "determ_eval" / "4samples_3tgt" / "lump.pt"
-    write_upstream_pairs(path, sampled, dataset)
+    write_published_pairs(path, sampled, dataset)
     assert category_pairs(dataset, "lump", 3, 3) == sampled[:3]
     assert category_pairs(dataset, "lump", 5, 3, seed=1) == sample_pairs(dataset, "lump", 5, 3, seed=1)
 

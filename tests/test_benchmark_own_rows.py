@@ -1,7 +1,6 @@
 """Rows of one's own: what they may be and may return, and how a row, a backbone or a function is told from another."""
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -11,12 +10,12 @@ import torch
 from benchmark_folder import own_method, small_folder
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.benchmark import provenance
-from zsp_lite.benchmark.database import read_records
+from zsp_lite.benchmark import identity
 from zsp_lite.benchmark.extractors import EXTRACTORS
 from zsp_lite.benchmark.identity import fingerprint as extractor_fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, resolve
 from zsp_lite.benchmark.problem import Answer, as_answer
+from zsp_lite.benchmark.records import read_records
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
@@ -58,38 +57,14 @@ def one_way(similarity, on_reference, on_target):
     return partner, score.double()
 
 
-def git(folder, *arguments):
-    author = ["-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run(["git", "-C", str(folder), *author, *arguments], check=True, capture_output=True)
-
-
-def test_the_revision_is_that_of_the_librarys_folder(tmp_path, monkeypatch):
-    package, docs = tmp_path / "package", tmp_path / "docs"
-    monkeypatch.setattr(provenance, "_PACKAGE", package)
-    revision = provenance.git_revision.__wrapped__
-    for path in (package, docs):
-        path.mkdir()
-        (path / "__init__.py").write_text("a = 1\n")
-    git(tmp_path, "init")
-    assert revision() is None
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "first")
-    first = revision()
-    assert first and "modified" not in first
-
-    (docs / "__init__.py").write_text("a = 2\n")
-    git(tmp_path, "commit", "-am", "docs")
-    (docs / "__init__.py").write_text("a = 3\n")
-    assert revision() == first
-
-    found = [first]
-    for name, text in (("new.py", "b = 1\n"), ("new.py", "b = 2\n"), ("__init__.py", "a = 2\n")):
-        (package / name).write_text(text)
-        found.append(revision())
-    assert len(set(found)) == 4 and all(one.startswith(f"{first}-modified-") for one in found[1:])
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "library")
-    assert revision() not in found and "modified" not in revision()
+def test_the_library_is_known_by_its_source(tmp_path, monkeypatch):
+    monkeypatch.setattr(identity, "_PACKAGE", tmp_path)
+    found = []
+    for name, text in (("a.py", "x = 1"), ("a.py", "x = 2"), ("b/c.py", ""), ("notes.md", "no source")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+        found.append(identity.library_version.__wrapped__()["source"])
+    assert len(set(found)) == 3 and found[2] == found[3]
 
 
 def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
@@ -136,8 +111,8 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     "answer, told",
     [
         (Answer(2 * np.eye(3)), "not a rotation"),
-        (Answer(np.eye(3), details={"error": 1.0}), "details have reserved names: error"),
-        (Answer(np.eye(3), details={"matches": np.arange(3)}), "matches is a ndarray"),
+        (Answer(np.eye(3), details={"error": 1.0}), "detail error of the row is a float, expected .* another name"),
+        (Answer(np.eye(3), details={"matches": np.arange(3)}), "detail matches of the row is a ndarray"),
     ],
 )
 def test_an_answer_that_says_too_much_is_refused(answer, told):

@@ -7,9 +7,9 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.benchmark import extractors
-from zsp_lite.benchmark.database import read_records
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
+from zsp_lite.benchmark.records import read_records
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels

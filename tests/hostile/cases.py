@@ -71,7 +71,7 @@ COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
     "results": (RESULTS, ("tables", f"ROOT/{RESULTS}")),
     "compared results": (RESULTS, ("compare", f"ROOT/{RESULTS}", f"ROOT/{RESULTS}")),
-    "run to continue": ("out/run.sqlite", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
+    "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "settings of a run": ("out/run.json", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "checked annotations": (FRAMES, ("data", "check", "ROOT/data")),
     "weights": ("x.safetensors", ("weights", "verify", "ROOT/x.safetensors")),

@@ -23,11 +23,7 @@ _MAX_DISTANCE = 1e6
 
 
 def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Sim3:
-    """Align two point clouds by Open3D's point-to-point ICP with scale, initialised with the identity.
-
-    Returns:
-        The similarity from source to target.
-    """
+    """Align point clouds by Open3D's point-to-point ICP with scale, starting from the identity."""
     open3d = load_open3d()
     clouds = [open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)) for points in (source, target)]
     registration = open3d.pipelines.registration
@@ -43,20 +39,11 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
     return Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
-def align(
-    reference: Frame,
-    targets: Sequence[Frame],
-    view: int,
-    firsts: tuple[Camera, Camera],
-    seed: int | np.random.Generator,
-) -> Sim3:
-    """Estimate the pose of a reference frame relative to one target frame by ICP.
+def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int) -> Sim3:
+    """Estimate the pose of a reference frame in target `view` by ICP, from camera points to camera points.
 
     Initially, both clouds are placed as if their camera (of the reference, of target `view`) were the first camera of
     its sequence. Both camera frames then coincide, up to the difference of the first cameras of the two sequences.
-
-    Returns:
-        Similarity from reference-camera points to points in the camera of target `view`.
     """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera
@@ -71,9 +58,7 @@ def align(
 def _cloud(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """Object points in camera coordinates, with in-painted depth if fewer than 10 pixels have known depth."""
     points = object_points(frame)
-    if len(points) >= _MIN_POINTS:
-        return points
-    return object_points(replace(frame, depth=inpaint_depth(frame.depth)))
+    return points if len(points) >= _MIN_POINTS else object_points(replace(frame, depth=inpaint_depth(frame.depth)))
 
 
 def _subsample(points: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:

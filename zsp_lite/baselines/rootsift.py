@@ -1,8 +1,4 @@
-"""Dense RootSIFT descriptors on the patch grid, in place of the features of a network.
-
-All descriptors are upright and their centres form a grid, so the weights of the histograms are separable in rows and
-columns. Two small matrix products compute all descriptors, faster than OpenCV's loop over keypoints.
-"""
+"""Dense RootSIFT descriptors on the patch grid, in place of the features of a network."""
 
 from collections.abc import Sequence
 
@@ -37,7 +33,7 @@ class RootSift:
     patch_size = 8
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
-        """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]; InputError for others."""
+        """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
         return [self._describe(image, index) for index, image in enumerate(images)]
 
     def _describe(self, image: Image, index: int) -> FeatureMap:
@@ -55,10 +51,10 @@ class RootSift:
 def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
-    """Compute the descriptors of upright keypoints on a grid, equal to OpenCV's `SIFT.compute` up to rounding.
+    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding.
 
-    Returns:
-        (side, side, 128) integers from 0 to 255.
+    The weights of the histograms are separable in rows and columns, so two small matrix products compute all of them,
+    faster than OpenCV's loop over keypoints.
     """
     n, side = len(grey), len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)

@@ -9,17 +9,11 @@ from jaxtyping import Float, Int
 
 from zsp_lite.data.depth import inpaint_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
-from zsp_lite.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of an image.
-
-    Attributes:
-        pixels: (n, 2) positions (x, y), with pixel centres at half-integers.
-        descriptors: (n, 128) descriptors of unit length.
-    """
+    """Keypoints of an image: positions (x, y) with pixel centres at half-integers, and descriptors of unit length."""
 
     pixels: Float[np.ndarray, "n 2"]
     descriptors: Float[np.ndarray, "n 128"]
@@ -54,9 +48,7 @@ def mutual_matches(
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Match keypoints as mutual nearest neighbours of their descriptors.
 
-    Returns:
-        Indices of the matched keypoints in `first` and in `second`, and the cosine similarities of their descriptors,
-        most similar first.
+    Returns the indices in `first` and in `second` and the cosine similarities of the k best matches, the best first.
     """
     if not len(first.pixels) or not len(second.pixels):
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
@@ -70,8 +62,6 @@ def mutual_matches(
 
 def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Compute the points of pixels in camera coordinates, with in-painted depth where it is unknown."""
-    if frame.depth is None:
-        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one to unproject matches")
     height, width = frame.camera.size
     columns, rows = np.floor(pixels).astype(np.int64).clip(0, (width - 1, height - 1)).T
     return frame.camera.unproject_camera(pixels, inpaint_depth(frame.depth)[rows, columns])

@@ -6,8 +6,8 @@
     store cache  frames and their features, in memory and on disk
     evaluation   all rows on one pair
     execution    chunks of pairs in this process, a pool, Dask, or any `concurrent.futures.Executor`
-    database     folder of a run
-    summary tables formats figures compare results reports      evaluation of a run
+    records      folder of a run: a line for each pair
+    results      a run that was read; summary statistics tables figures compare: what is made of it
 
 docs/scale.md shows how to run it on several processes and machines, with Dask or MPI.
 """

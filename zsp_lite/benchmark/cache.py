@@ -1,6 +1,5 @@
 """Feature maps on disk, shared between runs."""
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,8 +7,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.provenance import library_version
+from zsp_lite.benchmark.identity import digest, fingerprint, library_version
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
@@ -22,7 +20,7 @@ _UNCACHED = ("rootsift",)  # computed faster than read
 class FeatureCache:
     """A folder of feature maps in full precision: results with it equal those without it.
 
-    A file's name is a hash of the library's version, of the extractor's fingerprint and of its input: the crop's
+    A file's name is a hash of the library's source, of the extractor's fingerprint and of its input: the crop's
     pixels, and for extractors with `describe` also the depth, the mask and the camera. Only results of the type
     FeatureMap are kept. The fingerprint of a user-defined extractor without weights is its name: use another folder
     when its code changes.
@@ -38,10 +36,8 @@ class FeatureCache:
         if hasattr(self.extractors[features], "describe"):
             camera = frame.camera
             seen += [frame.depth, frame.mask, camera.R, camera.t, camera.focal_length, camera.principal_point]
-        digest = hashlib.sha256(f"{library_version()} {self._fingerprints[features]}".encode())
-        for array in seen:
-            digest.update(b"none" if array is None else f"{array.dtype}{array.shape}".encode() + array.tobytes())
-        name = digest.hexdigest()[:16]
+        parts = ("none" if part is None else part for part in seen)
+        name = digest(library_version()["source"], self._fingerprints[features], *parts)
         return self.folder / name[:2] / f"{name}.safetensors"
 
     def read(self, features: str, frame: Frame) -> FeatureMap | None:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from zsp_lite.benchmark.results import Results
+from zsp_lite.benchmark.statistics import paired_test
 from zsp_lite.benchmark.summary import weights_of_pairs
 from zsp_lite.benchmark.tables import Cell, PValue, Table, make_table
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import accuracy, median, paired_test
+from zsp_lite.metrics import accuracy, median
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Difference:
     Attributes:
         acc30: Acc30 of A and of B in percent.
         median: Median error of A and of B in degrees.
-        test: Result of `metrics.paired_test`, with bootstrap intervals and p values over objects.
+        test: Result of `benchmark.statistics.paired_test`, with bootstrap intervals and p values over objects.
     """
 
     first: str

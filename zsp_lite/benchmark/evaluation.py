@@ -12,8 +12,8 @@ from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.best_view import mask_iou
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.labels import PoseLabel, relative_pose
-from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import FatalError, InputError, describe_failure
 from zsp_lite.metrics import rotation_error, translation_error
 from zsp_lite.pipeline import view_alignment
@@ -30,7 +30,7 @@ def evaluate_pair(
     labels: Mapping[str, PoseLabel],
     keep_hypotheses: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate rows on a pair.
+    """Evaluate rows on a pair: a line of the run's results.
 
     Args:
         pair: The pair.
@@ -47,25 +47,20 @@ def evaluate_pair(
         foreground with the mask}.
 
     Raises:
-        InputError: If a pose label or a file is missing. (Rows that raise InputError count as failed.)
+        InputError: If a file is damaged. (Rows that raise InputError count as failed.)
         FatalError: If features are not finite, or the function of a row raises another exception.
     """
-    for sequence in (pair.reference_sequence, pair.target_sequence):
-        if sequence not in labels:
-            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one for each sequence of a pair")
     start = time.perf_counter()
     store.timings.clear()
     problem = Problem(pair, store)
     truths = _true_poses(problem, labels)
     results = {name: _evaluate(method, problem, truths, keep_hypotheses) for name, method in methods.items()}
     saliency_iou = _saliency_iou(problem, store)
+    seconds = round(time.perf_counter() - start, 5)
+    timings = dict(store.timings)
     return {
-        "pair": pair.key,
-        "results": results,
-        "seconds": round(time.perf_counter() - start, 5),
-        "timings": dict(store.timings),
-        "saliency_iou": saliency_iou,
-    }
+        "pair": pair.key, "results": results, "seconds": seconds, "timings": timings, "saliency_iou": saliency_iou,
+    }  # fmt: skip
 
 
 def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Float[np.ndarray, "n 4 4"]:
@@ -87,8 +82,12 @@ def _evaluate(
         raise
     except InputError as error:
         return {"error": FAILED, "failed": str(error)}
+
+    def error_of(rotation: Float[np.ndarray, "3 3"], view: int) -> float:
+        return float(rotation_error(rotation, truths[view, :3, :3]))
+
     details = {"timings": {"total": time.perf_counter() - start}} | dict(answer.details)
-    result = {"error": float(rotation_error(answer.rotation, truths[answer.view, :3, :3])), "view": int(answer.view)}
+    result = {"error": error_of(answer.rotation, answer.view), "view": int(answer.view)}
     if answer.translation is not None:
         result["translation_error"] = float(translation_error(answer.translation, truths[answer.view, :3, 3]))
     if answer.scale is not None:
@@ -96,15 +95,12 @@ def _evaluate(
     if answer.hypotheses:
         result["one_of_two"] = answer.one_of_two
         different = [one for index, one in enumerate(answer.hypotheses) if one.mode == index]
-        if len(different) > 1:
-            second = different[1]
-            result["second_error"] = float(rotation_error(second.sim3.R, truths[second.view, :3, :3]))
+        result |= {"second_error": error_of(one.sim3.R, one.view) for one in different[1:2]}
     if keep_hypotheses and answer.hypotheses:
         result["hypotheses"] = [
             {
-                "error": float(rotation_error(one.sim3.R, truths[one.view, :3, :3])),
-                "view": one.view, "scale": one.sim3.scale, "score": one.score, "confidence": one.confidence,
-                "terms": one.terms,
+                "error": error_of(one.sim3.R, one.view), "view": one.view, "scale": one.sim3.scale, "score": one.score,
+                "confidence": one.confidence, "terms": one.terms,
             }
             for one in answer.hypotheses
         ]  # fmt: skip
@@ -113,15 +109,13 @@ def _evaluate(
 
 
 def _solve(method: Method, problem: Problem) -> Answer:
-    """Call the function of a row. Raises FatalError if it is not of this library and raises no InputError."""
+    """Call the function of a row. Its exceptions other than InputError end the run, in one line if it is a user's."""
     try:
         return as_answer(method.solve(problem))
-    except InputError:
-        raise
     except Exception as error:
         own = getattr(method.solve, "estimator", method.solve)
         module = getattr(own, "__module__", None) or type(own).__module__
-        if module.startswith("zsp_lite."):
+        if isinstance(error, InputError) or module.startswith("zsp_lite."):
             raise
         raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
 
@@ -148,9 +142,7 @@ def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]
 def _saliency_iou(problem: Problem, store: FrameStore) -> dict[str, float]:
     """IoU of the backbone's foreground (the paper's threshold) with the mask's patches, by SEQUENCE/FRAME."""
     found: dict[str, float] = {}
-    if not has_saliency(store.extractors.get("backbone")):
-        return found
-    for key in problem.keys:
+    for key in problem.keys if has_saliency(store.extractors.get("backbone")) else ():
         features = store.description("backbone", key)
         if features is not None and (frame := store.frame(key)).mask is not None:
             iou = mask_iou(features.foreground().cpu(), patch_mask(frame, features.grid))

@@ -4,7 +4,6 @@ A chunk is a few pairs of one category that share frames. Workers return the rec
 loses the chunks that were being evaluated.
 """
 
-import inspect
 import os
 import signal
 import threading
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from itertools import groupby, islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
+from pathlib import Path
 from typing import Any
 
 import cloudpickle
@@ -28,9 +28,8 @@ from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import Method, import_object
 from zsp_lite.benchmark.store import FrameStore, torch_threads
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError, check_integer, describe_failure
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
@@ -57,7 +56,7 @@ class Setup:
     methods: Mapping[str, Method]
     backbone: Any
     fingerprint: str | None = None
-    cache: str | None = None
+    cache: str | Path | None = None
     threads: int | None = None
     keep_hypotheses: bool = False
 
@@ -94,26 +93,23 @@ class Evaluator:
 def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
     """Divide pairs of one category into chunks of about `size` pairs that share frames.
 
-    Pairs are ordered by target sequence. Pairs that differ only in the number of target views stay together. Where
-    possible, so do those of a target sequence.
+    Pairs that differ only in the number of target views stay together. Where possible, so do those of a target
+    sequence.
     """
 
-    def sequence(pair: Pair) -> tuple:
-        return (pair.target_sequence,)
-
-    def problem(pair: Pair) -> tuple:
+    def question(pair: Pair) -> tuple:
         return pair.target_sequence, pair.reference_sequence, pair.reference_frame
 
     chunks: list[Chunk] = [[]]
-    ordered = sorted(pairs, key=lambda pair: (*problem(pair), len(pair.target_frames), pair.key))
-    for _, members in groupby(ordered, sequence):
-        problems = [list(one) for _, one in groupby(members, problem)]
-        if len(chunks[-1]) + sum(map(len, problems)) > size:
+    ordered = sorted(pairs, key=lambda pair: (*question(pair), len(pair.target_frames), pair.key))
+    for _, members in groupby(ordered, lambda pair: pair.target_sequence):
+        together = [list(found) for _, found in groupby(members, question)]
+        if len(chunks[-1]) + sum(map(len, together)) > size:
             chunks.append([])
-        for one in problems:
+        for found in together:
             if len(chunks[-1]) >= size:
                 chunks.append([])
-            chunks[-1] += [(pair, pairs[pair]) for pair in one]
+            chunks[-1] += [(pair, pairs[pair]) for pair in found]
     return [chunk for chunk in chunks if chunk]
 
 
@@ -150,21 +146,14 @@ def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[W
 
 
 def _make_executor(path: str, number: int) -> Executor:
-    """Call the class "module:Class" of an executor, or a function that returns one, with the number of workers."""
-    expected = "expected dask://HOST:PORT or module:Class of an executor"
+    """Call the class "module:Class" of an executor with the number of workers."""
+    maker = import_object(path) if ":" in path else None
+    if not (isinstance(maker, type) and issubclass(maker, Executor)):
+        raise InputError(f"executor {path!r}: expected dask://HOST:PORT or module:Class of an executor")
     try:
-        maker = import_object(path)
-    except InputError as error:
-        raise InputError(f"executor {path!r}: {expected} ({error})") from error
-    if not (inspect.isfunction(maker) or (isinstance(maker, type) and issubclass(maker, Executor))):
-        raise InputError(f"executor {path!r} is a {type(maker).__name__}, {expected}")
-    try:
-        made = maker(number)
+        return maker(number)
     except Exception as error:  # it is not of this library
         raise InputError(f"executor {path!r} cannot be made for {number} workers: {describe_failure(error)}") from error
-    if not isinstance(made, Executor):
-        raise InputError(f"executor {path!r} gave a {type(made).__name__}, {expected}")
-    return made
 
 
 def evaluate_chunks(
@@ -274,10 +263,10 @@ def _dask(address: str) -> Iterator[Workers]:
         raise InputError("executor dask://: needs Dask: pip install dask distributed") from error
     try:
         client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_DASK_TIMEOUT)
+        number = sum(client.nthreads().values())
     except (OSError, ValueError) as error:
         raise InputError(f"executor dask://{address}: no scheduler answers there ({error})") from error
     with client:
-        number = sum(client.nthreads().values())
         if number == 0:
             raise InputError(f"executor dask://{address}: the scheduler has no workers, expected at least one")
         # A chunk depends on files: equal arguments need not give equal results.

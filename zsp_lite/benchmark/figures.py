@@ -1,7 +1,6 @@
 """Figures of a run: error distribution, error curves, accuracy against target views, and reliability of confidences."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -138,7 +137,6 @@ def write_figures(results: Results, folder: str | Path) -> list[Path]:
     """Write the figures for which the run has rows as PNG files; returns their paths."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    results = _printable(results)
     first = "ours" if "ours" in results.rows else next(iter(results.rows))
     makers = {
         "error_distribution": lambda: error_distribution(results, first),
@@ -158,13 +156,3 @@ def write_figures(results: Results, folder: str | Path) -> list[Path]:
         plt.close(figure)
         written.append(path)
     return written
-
-
-def _printable(results: Results) -> Results:
-    """Replace what is no valid text in the names of rows and pairs, which matplotlib would refuse."""
-
-    def clean(name: str) -> str:
-        return name.encode(errors="replace").decode()
-
-    rows = {clean(name): {clean(key): found for key, found in row.items()} for name, row in results.rows.items()}
-    return replace(results, rows=rows)

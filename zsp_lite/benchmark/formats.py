@@ -60,10 +60,10 @@ def write_tables(tables: Iterable[Table], folder: str | Path) -> list[Path]:
     for table in tables:
         for suffix, render in ((".csv", as_csv), (".md", as_markdown), (".tex", as_latex), (".html", as_html)):
             written.append(folder / f"{table.name}{suffix}")
-            write_atomic(written[-1], render(table).encode(errors="replace"))
+            write_atomic(written[-1], render(table).encode())
         pages.append(as_html(table))
     page = f'<!doctype html>\n<meta charset="utf-8">\n<title>zsp-lite benchmark</title>\n<style>{_STYLE}</style>\n'
-    write_atomic(folder / "tables.html", (page + "\n".join(pages)).encode(errors="replace"))
+    write_atomic(folder / "tables.html", (page + "\n".join(pages)).encode())
     return [*written, folder / "tables.html"]
 
 
@@ -73,16 +73,15 @@ def insert_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     A table stands between the lines <!-- table NAME --> and <!-- end of table -->.
     """
     by_name = {table.name: table for table in tables}
-    marks = _MARK.findall(text)
-    if not marks:
-        raise InputError("document has no marked table, expected <!-- table NAME --> and <!-- end of table -->")
-    if 2 * len(_MARKED.findall(text)) != len(marks):
-        raise InputError(f"document has the marks {', '.join(marks)}, expected a start and an end for each table")
+    marks, marked = _MARK.findall(text), [name for _, name, _, _ in _MARKED.findall(text)]
+    if not marks or 2 * len(marked) != len(marks) or not set(marked) <= by_name.keys():
+        raise InputError(
+            f"document has the marks {', '.join(marks) or 'of no table'}, expected <!-- table NAME --> and "
+            f"<!-- end of table --> for each table, with names out of {', '.join(by_name)}"
+        )
 
     def render(found: re.Match[str]) -> str:
         start, name, _, end = found.groups()
-        if name not in by_name:
-            raise InputError(f"document has a mark for table {name}, the run has tables {', '.join(by_name)}")
         table = by_name[name]
         cells = table.cells.loc[:, [not re.fullmatch(r"\w+ Acc30", title) for _, title in table.cells.columns]]
         short = Table(name, f"{table.title} ({pairs:,} pairs)", cells.rename(columns=short_group, level="group"))
@@ -97,7 +96,7 @@ def update_document(path: str | Path, tables: Sequence[Table], pairs: int) -> No
         text = read_bytes(Path(path), "document").decode()
     except UnicodeDecodeError as error:
         raise InputError(f"document {path} is not UTF-8 text ({error})") from error
-    write_atomic(path, insert_tables(text, tables, pairs).encode(errors="replace"))
+    write_atomic(path, insert_tables(text, tables, pairs).encode())
 
 
 def short_group(group: str) -> str:

@@ -1,14 +1,37 @@
-"""What a run remembers of its rows, extractors and labels: names, settings and hashes of weights."""
+"""What a run remembers of its library, machine, rows, extractors and labels: names, versions and hashes."""
 
 import dataclasses
+import functools
 import hashlib
-from collections.abc import Mapping
+import os
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
+
+_PACKAGE = Path(__file__).parents[1]
+_DEPENDENCIES = ("torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d")
+
+
+def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
+    """Return a hash of texts and arrays, 16 hexadecimal digits that are the same on every machine."""
+    found = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, torch.Tensor):
+            part = part.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
+        elif isinstance(part, np.ndarray):
+            found.update(f"{part.dtype}{part.shape}".encode())
+        found.update(part.encode() if isinstance(part, str) else part if isinstance(part, bytes) else part.tobytes())
+    return found.hexdigest()[:16]
 
 
 def described(value: Any) -> str:
@@ -37,30 +60,48 @@ def fingerprint(extractor: Any) -> str:
     """
     if extractor is None:
         return "None"
-    name = getattr(extractor, "name", None) or described(extractor)
-    weights = extractor.model.state_dict() if isinstance(extractor, Backbone) else _weights(extractor)
-    settings = ""
-    if isinstance(extractor, Backbone):
-        settings = repr(
-            (extractor.layer, extractor.facet, extractor.saliency_heads, extractor.image_size, extractor.mean,
-             extractor.std)
-        )  # fmt: skip
-    return f"{name} {_hash(weights, settings)}" if weights else name
-
-
-def array_digest(array: np.ndarray, text: str = "") -> str:
-    """Return a hash of an array of numbers and a text."""
-    return hashlib.sha256(np.ascontiguousarray(array, np.float64).tobytes() + text.encode()).hexdigest()[:16]
-
-
-def _weights(extractor: Any) -> Mapping[str, torch.Tensor]:
+    name, settings = getattr(extractor, "name", None) or described(extractor), ""
     state_dict = getattr(extractor, "state_dict", None)
-    return state_dict() if callable(state_dict) else {}
+    if isinstance(extractor, Backbone):
+        state_dict, image = extractor.model.state_dict, (extractor.image_size, extractor.mean, extractor.std)
+        settings = repr((extractor.layer, extractor.facet, extractor.saliency_heads, *image))
+    weights = state_dict() if callable(state_dict) else {}
+    parts = (part for key, weight in sorted(weights.items()) for part in (key, weight))
+    return f"{name} {digest(settings, *parts)}" if weights else name
 
 
-def _hash(weights: Mapping[str, torch.Tensor], settings: str) -> str:
-    digest = hashlib.sha256(settings.encode())
-    for key, weight in sorted(weights.items()):
-        tensor = weight.detach().cpu().contiguous().reshape(-1)
-        digest.update(key.encode() + tensor.view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()[:16]
+@functools.cache
+def library_version() -> dict[str, str]:
+    """Return {"version": of zsp_lite, "source": a hash of its Python files}."""
+    files = sorted(_PACKAGE.rglob("*.py"))
+    parts = (part for path in files for part in (path.relative_to(_PACKAGE).as_posix(), path.read_bytes()))
+    return {"version": __version__, "source": digest(*parts)}
+
+
+def environment() -> dict[str, Any]:
+    """Describe this call: time, command, versions of the library and its dependencies, git commit and machine."""
+    program = Path(sys.argv[0]).name
+    versions = {"python": platform.python_version(), "zsp-lite": __version__}
+    for package in _DEPENDENCIES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
+        "versions": versions,
+        "git": {"commit": _git_commit()},
+        "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+    }
+
+
+def _git_commit() -> str | None:
+    """The commit of the library's checkout; None for an installed copy."""
+    git = ["git", "-C", str(_PACKAGE)]
+    try:
+        # An installed copy may lie inside the repository of another project, whose commit says nothing.
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], check=True, capture_output=True)
+        return subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

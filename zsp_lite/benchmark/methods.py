@@ -5,6 +5,7 @@ results of such functions.
 """
 
 import importlib
+import operator
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -118,6 +119,10 @@ GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "t
 GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
 # The paper's tables and the rows beyond the paper.
 GROUPS["all"] = _union("paper", "verified-views", "oracle-view")
+_EXPECTED = (
+    f"one of {', '.join((*GROUPS, *METHODS))}, module:name, a Method, a function of a problem, or an object with "
+    "estimate(reference, targets)"
+)
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
@@ -130,13 +135,11 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
     Raises:
         InputError: A name is unknown or cannot be imported, or an object is none of these.
     """
-    if isinstance(methods, str):
-        methods = [methods]
     if not isinstance(methods, Mapping):
-        names = [member for name in methods for member in GROUPS.get(name, (name,))]
-        methods = {name: name for name in names}
+        names = [methods] if isinstance(methods, str) else methods
+        methods = {member: member for name in names for member in GROUPS.get(name, (name,))}
     if not methods:
-        raise InputError(f"no methods, expected some of {', '.join((*GROUPS, *METHODS))}, or module:name")
+        raise InputError(f"no methods, expected {_EXPECTED}")
     return {str(name): _method(str(name), meant) for name, meant in methods.items()}
 
 
@@ -153,23 +156,15 @@ def description(method: Method) -> str:
 
 def _method(name: str, meant: Any) -> Method:
     if isinstance(meant, str):
-        if meant in METHODS:
-            return METHODS[meant]
-        if ":" not in meant:
-            raise InputError(
-                f"method {meant!r} is unknown, expected one of {', '.join((*GROUPS, *METHODS))}, or module:name"
-            )
-        meant = import_object(meant)
+        meant = METHODS.get(meant) or (import_object(meant) if ":" in meant else meant)
     if isinstance(meant, Method):
         return meant
     if callable(getattr(meant, "estimate", None)):
         return Method(solve=_Estimator(meant))
     if callable(meant):
         return Method(solve=meant)
-    raise InputError(
-        f"method {name!r} is a {type(meant).__name__}, expected a Method, a function of a problem, or an object "
-        "with estimate(reference, targets)"
-    )
+    what = "unknown" if isinstance(meant, str) else f"a {type(meant).__name__}"
+    raise InputError(f"method {name!r} is {what}, expected {_EXPECTED}")
 
 
 def import_object(path: str) -> Any:
@@ -178,14 +173,10 @@ def import_object(path: str) -> Any:
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
     try:
-        found = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"{path!r} cannot be imported: {error}") from error
+        return operator.attrgetter(name)(importlib.import_module(module))
     except (Exception, SystemExit) as error:  # a module may raise anything
-        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
-    return found
+        reason = error if isinstance(error, ImportError | AttributeError) else describe_failure(error)
+        raise InputError(f"{path!r} cannot be imported: {reason}") from error
 
 
 @dataclass(frozen=True)

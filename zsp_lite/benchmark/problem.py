@@ -11,8 +11,8 @@ from jaxtyping import Float
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.store import FrameKey, FrameStore
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.pairs import Pair
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.pipeline import ZeroShotPose
@@ -181,20 +181,21 @@ class Problem:
 
     def _estimate(self, features: str, method: ZeroShotPose, target: int | None) -> PoseEstimate:
         reference, *views = self.views(features, method.foreground, method.saliency_threshold)
-        targets = list(zip(self.keys[1:], views))
+        keys = self.keys[1:]
         if target is not None:
-            targets = [targets[target]]
+            keys, views = [keys[target]], [views[target]]
         if not method.upright:
-            return method.estimate_from_views(reference, [view for _, view in targets])
+            return method.estimate_from_views(reference, views)
         settings = tuple(getattr(method, name) for name in _MATCH_SETTINGS)
-        matches, seconds = [], 0.0
-        for key, view in targets:
+        matched, seconds = [], 0.0
+        for key, view in zip(keys, views):
             name = ("matches", features, key, settings)
             if name not in self._shared:
                 similarity = self.store.similarity(features, self.keys[0], key, method, reference, view)
                 start = time.perf_counter()
-                self._shared[name] = method.match_views(reference, view, similarity), time.perf_counter() - start
-            match, matching_seconds = self._shared[name]
-            matches.append(match)
+                self._shared[name] = method.match_views(reference, [view], [similarity]), time.perf_counter() - start
+            one, matching_seconds = self._shared[name]
+            matched += one
             seconds += matching_seconds
-        return method.estimate_from_pairs(reference, [view for _, view in targets], matches, {"matching": seconds})
+        found = method.estimate_from_views(reference, views, matched)
+        return replace(found, timings={"matching": seconds} | found.timings)

@@ -10,19 +10,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A published table.
-
-    Attributes:
-        columns: Names of the columns.
-        rows: Label to one value per column.
-    """
+    """A published table: its columns, and by label of a row one value per column."""
 
     columns: tuple[str, ...]
     rows: dict[str, tuple[float, ...]]
 
 
+_FIGURES = ("med", "acc30", "acc15")
+_CATEGORIES = ("bike", "hydrant", "mcycle", "teddy", "toaster")
+
 TABLE_1 = PublishedTable(
-    ("med", "acc30", "acc15", "bike", "hydrant", "mcycle", "teddy", "toaster"),
+    (*_FIGURES, *_CATEGORIES),
     {
         "ICP": (111.8, 3.8, 0.7, 3.0, 6.0, 1.0, 1.0, 7.0),
         "SIFT": (129.4, 4.0, 1.5, 3.0, 11.0, 1.0, 1.0, 0.0),
@@ -35,7 +33,7 @@ TABLE_1 = PublishedTable(
 )
 
 TABLE_2 = PublishedTable(
-    ("med", "acc30", "acc15"),
+    _FIGURES,
     {
         "Ours-BV (N=1)": (92.8, 12.6, 3.7),
         "Ours-BV (N=3)": (69.5, 26.1, 8.0),
@@ -47,7 +45,7 @@ TABLE_2 = PublishedTable(
 )
 
 TABLE_3 = PublishedTable(
-    ("med", "acc30", "acc15"),
+    _FIGURES,
     {
         "CyclicalDistIoU": (94.7, 22.3, 13.1),
         "GlobalSim": (71.9, 36.8, 23.7),
@@ -68,7 +66,7 @@ TARGETS = PublishedTable(
 )
 
 MATCHERS = PublishedTable(
-    ("med", "acc30", "acc15"),
+    _FIGURES,
     {
         "Optimal transport": (54.6, 44.8, 29.1),
         "Dual softmax": (54.0, 44.5, 30.1),
@@ -78,15 +76,11 @@ MATCHERS = PublishedTable(
 
 CORRESPONDENCES = PublishedTable(
     ("no_kmeans_acc30", "no_kmeans_acc15", "kmeans_acc30", "kmeans_acc15"),
-    {
-        "30": (38.7, 25.2, 43.5, 29.0),
-        "50": (42.0, 28.6, 46.3, 31.1),
-        "70": (43.4, 30.4, 47.1, 30.8),
-    },
+    {"30": (38.7, 25.2, 43.5, 29.0), "50": (42.0, 28.6, 46.3, 31.1), "70": (43.4, 30.4, 47.1, 30.8)},
 )
 
 DEPTH = PublishedTable(
-    ("med", "acc30", "acc15"),
+    _FIGURES,
     {
         "No depth (essential matrix)": (81.7, 23.6, 6.8),
         "Ours-BV": (61.1, 35.4, 10.6),
@@ -94,11 +88,4 @@ DEPTH = PublishedTable(
     },
 )
 
-TRIALS = PublishedTable(
-    ("acc30",),
-    {
-        "500": (45.8,),
-        "1000": (46.3,),
-        "2000": (46.6,),
-    },
-)
+TRIALS = PublishedTable(("acc30",), {"500": (45.8,), "1000": (46.3,), "2000": (46.6,)})

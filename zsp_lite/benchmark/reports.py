@@ -6,7 +6,6 @@ from pathlib import Path
 from zsp_lite.benchmark.formats import write_tables
 from zsp_lite.benchmark.results import RESULTS, Results, export_results, read_runs
 from zsp_lite.benchmark.tables import every_table
-from zsp_lite.errors import InputError
 
 
 def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None = None) -> Results:
@@ -14,7 +13,7 @@ def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None
 
     Args:
         run: A run's folder or its `results.json.gz`, or several, which are pooled.
-        out: Folder to write to. Default: the folder of the run; required for pooled runs.
+        out: Folder to write to. Default: that of the (first) run.
 
     Returns:
         The run.
@@ -26,10 +25,9 @@ def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None
     from zsp_lite.benchmark.figures import write_figures
 
     paths = [Path(run)] if isinstance(run, str | Path) else list(map(Path, run))
-    if out is None and len(paths) > 1:
-        raise InputError("pooled runs: expected a folder for their tables")
     results = read_runs(paths)
-    out = Path(out) if out is not None else paths[0] if paths[0].is_dir() else paths[0].parent
+    folder = paths[0] if paths[0].is_dir() else paths[0].parent
+    out = folder if out is None else Path(out)
     if len(paths) > 1 or paths[0].is_dir():
         export_results(results, out / RESULTS)
     write_tables(every_table(results.summary), out / "tables")

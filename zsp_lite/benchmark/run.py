@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.database import RunFolder
 from zsp_lite.benchmark.execution import (
     CHUNK_SIZE,
     MOST_WORKERS,
@@ -19,13 +18,13 @@ from zsp_lite.benchmark.execution import (
     open_workers,
 )
 from zsp_lite.benchmark.extractors import make_extractors
-from zsp_lite.benchmark.identity import array_digest, fingerprint
+from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
-from zsp_lite.benchmark.provenance import environment, library_version
+from zsp_lite.benchmark.records import open_run
 from zsp_lite.benchmark.results import results_of
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
+from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import make_folder, write_atomic
@@ -86,29 +85,40 @@ def evaluate(
     named = isinstance(backbone, str | BackboneConfig)
     loaded = load_backbone(backbone) if named else backbone
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
-    settings = _settings(root, loaded, extractors, rows, row_pairs, pairs, targets, seed)
     _check_rows(rows, extractors)
+    settings = {
+        "data": str(root).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "pairs": pairs,
+        "targets": targets, "seed": seed, "library": library_version(),
+        "methods": {name: _identity(row, extractors) for name, row in rows.items()}, "labels": _labels(root, work),
+    }  # fmt: skip
     if threads is not None:
         check_integer("threads", threads, 1, MOST_WORKERS)
     if cache is not None:
-        make_folder(cache, "cache folder")  # before anything is written
-    with RunFolder(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
+        cache = make_folder(cache, "cache folder").resolve()  # before anything is written
+    with open_run(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
         threads = threads or max(1, available_cores() // opened.number)
         setup = Setup(
-            str(Path(root).resolve()), rows, backbone if named else loaded, settings["backbone"],
-            None if cache is None else str(Path(cache).resolve()), threads, keep_hypotheses,
+            str(Path(root).resolve()), rows, backbone if named else loaded, settings["backbone"], cache, threads,
+            keep_hypotheses,
         )  # fmt: skip
-        todo = _unfinished(work, folder.finished())
+        known = folder.read().rows
+        todo = {
+            category: {
+                pair: names for pair, every in found.items()
+                if (names := [name for name in every if pair.key not in known.get(name, ())])
+            }
+            for category, found in work.items()
+        }  # fmt: skip
         total, left = sum(map(len, work.values())), sum(map(len, todo.values()))
         where = executor if isinstance(executor, str) else type(opened.executor).__name__ if opened.executor else None
         call = {"executor": where, "workers": opened.number, "threads": threads, "rows": list(rows)}
-        folder.begin(environment() | call | {"categories": list(work), "pairs": left})
+        folder.add([{"call": environment() | call | {"categories": list(work), "pairs": left}}])
         done = total - left
 
-        def save(records: list[dict[str, Any]]) -> None:
+        def save(evaluated: list[dict[str, Any]]) -> None:
             nonlocal done
-            folder.add(records)
-            done += len(records)
+            folder.add(evaluated)
+            done += len(evaluated)
             if progress is not None:
                 progress(done, total)
 
@@ -116,7 +126,7 @@ def evaluate(
         size = max(1, min(CHUNK_SIZE, left // (4 * opened.number)))
         chunks = [chunk for found in todo.values() if found for chunk in make_chunks(found, size)]
         evaluate_chunks(setup, chunks, opened, save, extractors)
-        folder.finish(round(time.perf_counter() - start, 2))
+        folder.add([{"seconds": round(time.perf_counter() - start, 2)}])
         summary = results_of(settings, folder.read()).summary
         write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
     return summary
@@ -169,40 +179,18 @@ def _check_rows(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> No
                 raise InputError(f"method {name}: {error}") from error
 
 
-def _unfinished(
-    work: Mapping[str, Mapping[Pair, list[str]]], finished: set[tuple[str, str]]
-) -> dict[str, dict[Pair, list[str]]]:
-    """The part of the work that has no result yet."""
-    todo: dict[str, dict[Pair, list[str]]] = {}
+def _identity(row: Method, extractors: Mapping[str, Any]) -> str:
+    """What decides the results of a row, as text."""
+    return description(row) + ("" if row.features == "backbone" else f"; {fingerprint(extractors[row.features])}")
+
+
+def _labels(root: str | Path, work: Mapping[str, Mapping[Pair, Any]]) -> dict[str, str]:
+    """Hashes of the pose labels that the pairs need, by CATEGORY/SEQUENCE."""
+    found = {}
     for category, pairs in work.items():
-        left = {pair: [name for name in names if (pair.key, name) not in finished] for pair, names in pairs.items()}
-        todo[category] = {pair: names for pair, names in left.items() if names}
-    return todo
-
-
-def _settings(
-    root: str | Path,
-    backbone: Any,
-    extractors: Mapping[str, Any],
-    rows: Mapping[str, Method],
-    row_pairs: Mapping[str, Sequence[Pair]],
-    pairs: int,
-    targets: int,
-    seed: int,
-) -> dict[str, Any]:
-    """What decides a run's results (see `database.check_settings`)."""
-    used: dict[str, set[str]] = {}
-    for pair in (pair for found in row_pairs.values() for pair in found):
-        used.setdefault(pair.category, set()).update((pair.reference_sequence, pair.target_sequence))
-    labels = {
-        f"{category}/{name}": array_digest(label.trans, label.reference_seq)
-        for category, names in used.items() for name, label in read_labels(root, category).items() if name in names
-    }  # fmt: skip
-    methods = {
-        name: description(row) + ("" if row.features == "backbone" else f"; {fingerprint(extractors[row.features])}")
-        for name, row in rows.items()
-    }
-    return {
-        "data": str(root), "backbone": fingerprint(backbone), "pairs": pairs, "targets": targets, "seed": seed,
-        "library": library_version(), "methods": methods, "labels": labels,
-    }  # fmt: skip
+        labels = read_labels(root, category)
+        for name in sorted({name for pair in pairs for name in (pair.reference_sequence, pair.target_sequence)}):
+            if name not in labels:
+                raise InputError(f"{category}/{name}: no pose label, expected one for each sequence of a pair")
+            found[f"{category}/{name}"] = digest(labels[name].trans, labels[name].reference_seq)
+    return found

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.metrics import (
-    accuracy,
+from zsp_lite.benchmark.statistics import (
     bootstrap_ci,
     mean_category_median,
     object_draws,
@@ -15,6 +14,7 @@ from zsp_lite.metrics import (
     sign_test,
     summarise,
 )
+from zsp_lite.metrics import accuracy
 
 
 def summarise_run(
@@ -74,10 +74,10 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
             method flagged its estimate, and of solvers with hypotheses "second_error" and "one_of_two"}.
 
     Returns:
-        {"methods": by row, over all pairs and "per_category", the figures of `metrics.summarise`, and
+        {"methods": by row, over all pairs and "per_category", the figures of `benchmark.statistics.summarise`, and
         "mean_category_median": the paper's way of averaging medians, and of solvers with hypotheses "best_two": see
         `best_two_figures`; "against_ours": every other row that has the same
-        problems in the same order against "ours", see `metrics.paired_difference`; "intervals": their method}.
+        problems in the same order against "ours", see `benchmark.statistics.paired_difference`; "intervals": their method}.
         Intervals and p values come from resampled objects, except for "sign_test_p".
     """
     rows = {name: _ordered(row) for name, row in rows.items()}

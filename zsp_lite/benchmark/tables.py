@@ -48,7 +48,6 @@ class Cell:
         return f"{text} [{self.low:.{self.decimals}f}, {self.high:.{self.decimals}f}]"
 
 
-@dataclass(frozen=True)
 class PValue(Cell):
     """A p value; small ones are not printed as zero."""
 

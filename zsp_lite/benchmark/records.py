@@ -1,0 +1,158 @@
+"""A run's folder: its settings in run.json, its results in run.jsonl, whose lines are only ever added.
+
+A line of run.jsonl is one of
+
+    {"call": command, versions, machine, rows and categories of a call of `evaluate`}
+    what `evaluate_pair` returns for a pair
+    {"seconds": what the last call took}
+
+One process writes to a folder; others can read it meanwhile. A process killed at any moment loses no line but the one
+that it was writing.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import decode_json, read_bytes, write_atomic
+from zsp_lite.io.locks import writing
+
+SETTINGS, RECORDS = "run.json", "run.jsonl"
+_GROWING = {"methods": "method", "labels": "pose label"}  # parts of the settings that a later call may extend
+
+
+@dataclass(frozen=True)
+class Records:
+    """Lines of a run, by what they are about.
+
+    Attributes:
+        rows: By row and pair key, what the row found.
+        evaluations: By pair key, every evaluation as `evaluate_pair` returned it.
+        invocations: Calls of `evaluate`, the latest last.
+    """
+
+    rows: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    evaluations: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    invocations: list[dict[str, Any]] = field(default_factory=list)
+
+
+class _Line(msgspec.Struct):
+    call: dict[str, Any] | None = None
+    pair: str | None = None
+    results: dict[str, dict[str, Any]] = {}
+    seconds: float = 0.0
+    timings: dict[str, list[float]] = {}
+    saliency_iou: dict[str, float] = {}
+
+
+class _Settings(msgspec.Struct):
+    """What every run.json has."""
+
+    data: str
+    backbone: str
+    targets: int
+    seed: int
+    library: list[dict[str, str | None]]
+    methods: dict[str, str] = {}
+    labels: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder, open for writing (see `open_run`)."""
+
+    path: Path
+
+    def read(self) -> Records:
+        """Read all lines; none of a run that begins."""
+        return read_records(self.path) if (self.path / RECORDS).exists() else Records()
+
+    def add(self, lines: Iterable[Mapping[str, Any]]) -> None:
+        """Add lines to run.jsonl."""
+        text = "".join(f"{json.dumps(line, separators=(',', ':'))}\n" for line in lines)
+        try:
+            with open(self.path / RECORDS, "ab") as file:
+                file.write(text.encode())
+        except OSError as error:
+            raise InputError(f"{self.path / RECORDS} cannot be written: {error}") from error
+
+
+@contextmanager
+def open_run(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False) -> Iterator[RunFolder]:
+    """Be the only writer of a run's folder, which is new or holds a run with these settings."""
+    with writing(out):
+        folder = RunFolder(Path(out))
+        merged = merged_settings(out, settings, allow_other_version)
+        if (records := folder.path / RECORDS).exists():
+            complete = read_bytes(records, "results of a run").rfind(b"\n") + 1
+            os.truncate(records, complete)  # the rest is a line that a killed process was writing
+        write_atomic(folder.path / SETTINGS, json.dumps(merged, indent=1).encode())
+        yield folder
+
+
+def read_records(out: str | Path) -> Records:
+    """Read what a run has found, finished or interrupted."""
+    path, found = Path(out) / RECORDS, Records()
+    for number, text in enumerate(read_bytes(path, "results of a run").split(b"\n")[:-1], 1):
+        line = decode_json(text, _Line, f"results of a run {path}, line {number}")
+        if line.call is not None:
+            found.invocations.append(line.call)
+        elif line.pair is not None:
+            for row, result in line.results.items():
+                found.rows.setdefault(row, {})[line.pair] = result
+            cost = {"seconds": line.seconds, "timings": line.timings, "saliency_iou": line.saliency_iou}
+            found.evaluations.setdefault(line.pair, []).append(cost)
+        elif found.invocations:
+            found.invocations[-1]["seconds"] = line.seconds
+    return found
+
+
+def read_settings(out: str | Path) -> dict[str, Any]:
+    """Read run.json."""
+    data = read_bytes(Path(out) / SETTINGS, "settings of a run")
+    decode_json(data, _Settings, f"settings of a run {Path(out) / SETTINGS}")
+    return json.loads(data)
+
+
+def merged_settings(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool) -> dict[str, Any]:
+    """Return the settings to write: with all rows, labels and library versions of the run that the folder holds.
+
+    Raises:
+        InputError: The run cannot be continued with these settings.
+    """
+    out, library = Path(out), settings["library"]
+    if not os.path.lexists(out / SETTINGS):  # a broken link is no new run
+        if (out / RECORDS).exists():
+            raise InputError(f"{out} holds results in {RECORDS} without {SETTINGS}; choose another folder")
+        return dict(settings) | {"library": [library]}
+    before = read_settings(out)
+    if difference := _difference(before, settings):
+        raise InputError(f"{out} holds {difference}; choose another folder")
+    versions = before["library"] + [library] * (library not in before["library"])
+    if len(versions) > len(before["library"]) and not allow_other_version:
+        older, this = (f"zsp-lite {one.get('version')} (source {one.get('source')})" for one in versions[-2:])
+        raise InputError(
+            f"{out} was measured with {older}, this is {this}; choose another folder, or continue with "
+            "--allow-other-version"
+        )
+    grown = {group: before.get(group, {}) | settings.get(group, {}) for group in _GROWING}
+    return dict(settings) | grown | {"library": versions}
+
+
+def _difference(before: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """Say what keeps a run from being continued; "" for nothing."""
+    for key, value in settings.items():
+        if key not in (*_GROWING, "library") and before.get(key) != value:
+            return f"a run with other settings ({key})"
+    for group, what in _GROWING.items():
+        known, wanted = before.get(group, {}), settings.get(group, {})
+        if changed := sorted(name for name, value in wanted.items() if known.get(name, value) != value):
+            return f"other results of {', '.join(changed)}: the {what} has changed since"
+    return ""
