@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.samples import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
+from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
 from zsp_lite.demo import PHOTOGRAPH_SOLVERS, PhotographResult
 from zsp_lite.points import object_points
 from zsp_lite.viz import plots

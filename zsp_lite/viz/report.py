@@ -18,22 +18,22 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame, frame_defect
-from zsp_lite.data.samples import REPOSITORY
 from zsp_lite.demo import PhotographResult
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.points import coloured_cloud, object_cloud
+from zsp_lite.samples import REPOSITORY
 from zsp_lite.views import View, object_crop
 from zsp_lite.viz import plots
+from zsp_lite.viz.feature_plots import matches_of_estimate
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
+from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
 
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
@@ -46,7 +46,7 @@ _MEANINGS = {
 _DPI = 110
 _OVERVIEW_FRAMES = 4
 _OVERVIEW_POINTS = 1500
-_TWO_POSES_FRAMES = 3
+_TWO_POSES_VIEWS = 3
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 # Terms of the captions that are explained on hover.
 _TERMS = {
@@ -71,6 +71,7 @@ class StageFigure:
     alt: str = ""
     html: Markup = Markup()
     wide: bool = False  # spans both columns
+    note: str = ""  # reasons not to trust what is shown, in one line
 
 
 def write_report(
@@ -136,8 +137,9 @@ def render_page(
             "rows": table_rows(result),
             "reference": result.sources[0],
             "target": result.sources[1],
-            "answers": [_answer(solver, estimate, result) for solver, estimate in result.estimates.items()],
+            "answers": [_answer(solver, estimate) for solver, estimate in result.estimates.items()],
             "disagreement": result.disagreement,
+            "pictures": pose_pictures(result),
             "stages": stage_figures(result, f"scene-{index}"),
         }
         for index, result in enumerate(results, 1)
@@ -149,18 +151,16 @@ def render_page(
     )  # fmt: skip
 
 
-def _answer(solver: str, estimate: PoseEstimate, result: PairResult) -> dict:
+def _answer(solver: str, estimate: PoseEstimate) -> dict:
     """Collect what the page says of one solver's answer."""
     return {
         "solver": solver,
-        "error": result.errors.get(solver),
         "confidence": estimate.confidence,
         "matrix": estimate.sim3.matrix,
         "scale": estimate.sim3.scale,
         "view": estimate.view + 1,
         "turn": estimate.reference_turn,
         "alternatives": estimate.alternatives,
-        "flags": estimate.flags,
         "timings": estimate.timings,
     }
 
@@ -274,44 +274,54 @@ def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     return path
 
 
+def pose_pictures(result: PairResult) -> list[StageFigure]:
+    """Draw the picture of each solver's estimate, and both poses where its answer is one of two."""
+    pictures = []
+    for solver, estimate in result.estimates.items():
+        sure = "" if estimate.confidence is None else f": confidence {estimate.confidence:.2f}"
+        error = f", rotation error {result.errors[solver]:.1f}°" if solver in result.errors else ""
+        chosen = estimate.view + 1
+        pictures.append(
+            StageFigure(
+                f"{solver} solver{sure}{error}",
+                "The reference's points under the estimated pose, drawn over the target views. Their colour is the "
+                "position along the reference's longest axis: in a correct pose each colour is at the same part of "
+                "both objects. Below, the directions of the cameras from the target object, as seen from above."
+                + (" The score is that of eq. 3; the view with the highest is chosen." if solver == "paper" else ""),
+                "03_best_view" if solver == "paper" else "11_hypotheses_and_evidence",
+                _data_uri(pose_picture(result, solver)),
+                f"The reference, target view {chosen}, and the reference's points in the target views under the pose "
+                f"of the {solver} solver; below, the cameras around the target object from above.",
+                wide=True,
+                note=estimate.note,
+            )
+        )
+        if estimate.one_of_two:
+            angle = estimate.alternatives[0].angle
+            pictures.append(
+                StageFigure(
+                    f"One of two: both poses of the {solver} solver",
+                    "The solver cannot decide between these two poses, which explain the views about equally well. "
+                    "Arrows: the axes of the reference camera (x right, y down, z forward).",
+                    "11_hypotheses_and_evidence",
+                    _data_uri(_two_poses_figure(estimate)),
+                    f"The same target views with the reference's points under two poses of the {solver} solver: left "
+                    f"the estimate, right its first alternative, turned by {angle:.0f} degrees.",
+                    wide=True,
+                )
+            )
+    return pictures
+
+
 def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
-    """Draw the figures of one result, in the order of the method's stages, those of a single view by the first solver.
+    """Draw the method's stages for the chosen view of the first solver, in their order.
 
     `scene_id` is the HTML id of the 3D scene, unique on the page.
     """
-    estimate, title, chosen = result.estimate, result.title, f"target view {result.estimate.view + 1}"
-    inliers = int(estimate.inliers.sum())
-    paper = "paper" in result.estimates
-    scores = (
-        "The score is that of eq. 3; the paper's solver chooses the view with the highest."
-        if paper
-        else "The angle is that between the cameras of the reference and of the view under the estimated pose; the "
-        "view with the smallest is chosen."
-    )
-    stages = [
-        StageFigure(
-            f"One of two: both poses of the {solver} solver",
-            "The solver cannot decide between these two poses, which explain the views about equally well. Points: the "
-            "reference object under each pose, coloured along its longest axis. Arrows: the axes of the reference "
-            "camera (x right, y down, z forward).",
-            "11_hypotheses_and_evidence",
-            _data_uri(_two_poses_figure(result, one)),
-            f"The same frames of the target sequence with the reference cloud under two poses of the {solver} solver: "
-            f"left the estimate, right its first alternative, turned by {one.alternatives[0].angle:.0f} degrees.",
-            wide=True,
-        )
-        for solver, one in result.estimates.items()
-        if one.one_of_two
-    ]
-    stages += [
-        StageFigure(
-            "Reference and target views",
-            f"All views are cropped to the object. {scores}",
-            "03_best_view" if paper else "11_hypotheses_and_evidence",
-            _data_uri(_views_figure(result)),
-            f"The reference and the target views of {title}; {chosen} is framed.",
-            wide=True,
-        ),
+    estimate, chosen = result.estimate, f"target view {result.estimate.view + 1}"
+    inliers, matches = int(estimate.inliers.sum()), len(estimate.matches)
+    verified = "The verified solver starts from matches of all views; few need to agree with its pose."
+    return [
         StageFigure(
             "Saliency",
             "Attention of the CLS token to the patches. Patches above 0.05 are foreground.",
@@ -329,15 +339,10 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
         ),
         StageFigure(
             "Correspondences",
-            f"{len(estimate.matches)} matches: {inliers} inliers of the pose (solid), "
-            f"{len(estimate.matches) - inliers} outliers (dashed)."
-            + (
-                ""
-                if paper
-                else " The verified solver starts from matches of all views; few need to agree with its pose."
-            ),
+            f"{matches} matches: {inliers} inliers of the pose (solid), {matches - inliers} outliers (dashed). "
+            + ("" if "paper" in result.estimates else verified),
             "04_umeyama_ransac",
-            _data_uri(_matches_figure(result)),
+            _data_uri(matches_of_estimate(estimate, size=2.7)),
             f"Lines between matched patches of the reference and {chosen}; inliers solid, outliers dashed.",
         ),
         StageFigure(
@@ -349,43 +354,6 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
             html=_scene_html(result, scene_id),
         ),
     ]
-    for solver, one in result.estimates.items():
-        stages.append(
-            StageFigure(
-                f"The pose in the target sequence: {solver} solver",
-                "The estimate, propagated to other frames through the known cameras (sec. 5.6). Points: the reference "
-                "object, coloured along its longest axis. Arrows: the axes of the reference camera (x right, y down, "
-                "z forward).",
-                "06_end_to_end_demo" if solver == "paper" else "11_hypotheses_and_evidence",
-                _data_uri(_sequence_figure(result, one)),
-                f"The aligned reference cloud of the {solver} solver, drawn over {len(result.sequence)} frames of the "
-                "target sequence.",
-                wide=True,
-            )
-        )
-    return stages
-
-
-def _views_figure(result: PairResult) -> Figure:
-    estimate = result.estimate
-    views = [estimate.reference_view, *estimate.target_views]
-    titles = ["reference"]
-    for number, score in enumerate(estimate.view_scores, 1):
-        if not np.isfinite(score):
-            text = "left out"
-        elif "paper" in result.estimates:
-            text = f"score {score:.1f}"
-        else:
-            text = f"angle {-score:.0f}°"  # the verified solver's scores are negative angles
-        titles.append(f"target {number}\n{text}")
-    columns = len(views) if len(views) <= 6 else -(-len(views) // 2)
-    figure, axes = plots.show_images([view.frame.rgb for view in views], titles, columns=columns, size=1.9)
-    chosen: dict[int, list[str]] = {}
-    for solver, one in result.estimates.items():
-        chosen.setdefault(one.view, []).append(solver)
-    for view, solvers in chosen.items():
-        plots.mark(axes[1 + view], "chosen" if len(chosen) == 1 else " and ".join(solvers))
-    return figure
 
 
 def _saliency_figure(result: PairResult) -> Figure:
@@ -406,20 +374,6 @@ def _cycles_figure(result: PairResult) -> Figure:
     return figure
 
 
-def _matches_figure(result: PairResult) -> Figure:
-    estimate = result.estimate
-    first, second = _chosen_views(result)
-    return plots.draw_matches(
-        first.frame.rgb,
-        second.frame.rgb,
-        plots.patch_centres(estimate.matches.reference, first.features.grid, first.frame.camera.size),
-        plots.patch_centres(estimate.matches.target, second.features.grid, second.frame.camera.size),
-        estimate.inliers,
-        ("reference", "chosen target"),
-        size=2.7,
-    )
-
-
 def _scene_html(result: PairResult, scene_id: str) -> Markup:
     """Draw both clouds, with a menu of all poses and a choice of the colours; the page's script serves both."""
     first, second = _chosen_views(result)
@@ -427,9 +381,9 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     (cloud, colours), (target, target_colours) = coloured_cloud(first), coloured_cloud(second)
     poses = []
     for solver, estimate in result.estimates.items():
-        poses.append((f"{solver} solver", _in_camera(estimate, estimate.sim3, estimate.view, camera)))
+        poses.append((f"{solver} solver", estimate.propagate([camera])[0]))
         for one in estimate.alternatives:
-            pose = _in_camera(estimate, one.sim3, one.view, camera)
+            (pose,) = replace(estimate, sim3=one.sim3, view=one.view).propagate([camera])
             poses.append((f"{solver} solver, hypothesis {one.rank}", pose))
     scene = aligned_clouds(poses[0][1].apply(cloud), target, colours=(colours, target_colours))
     scene.update_layout(
@@ -461,23 +415,8 @@ _CLOSE = {
 }
 
 
-def _in_camera(estimate: PoseEstimate, sim3: Sim3, view: int, camera) -> Sim3:
-    """Express a pose in one of the target view's cameras in another camera of the same world."""
-    own = estimate.target_views[view].frame.camera
-    rotation = camera.R @ own.R.T
-    return Sim3(1.0, rotation, camera.t - rotation @ own.t) @ sim3
-
-
-def _sequence_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
-    frames = result.sequence
-    titles = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
-    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=3.3)
-    _draw_pose(axes, frames, estimate)
-    return figure
-
-
-def _two_poses_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
-    """Draw the estimate (left) and its first alternative (right) in some frames of the target sequence, a row each."""
+def _two_poses_figure(estimate: PoseEstimate) -> Figure:
+    """Draw the estimate (left) and its first alternative (right) in at most three target views, a row each."""
     second = estimate.alternatives[0]
     poses = {
         f"probability {estimate.confidence:.2f}": estimate,
@@ -485,19 +424,15 @@ def _two_poses_figure(result: PairResult, estimate: PoseEstimate) -> Figure:
             estimate, sim3=second.sim3, view=second.view
         ),
     }
-    frames = result.sequence[:: -(-len(result.sequence) // _TWO_POSES_FRAMES)]
-    titles = [title if row == 0 else "" for row in range(len(frames)) for title in poses]
-    images = [frame.rgb for frame in frames for _ in poses]
+    views = estimate.target_views[:: -(-len(estimate.target_views) // _TWO_POSES_VIEWS)]
+    cameras = [view.frame.camera for view in views]
+    titles = [title if row == 0 else "" for row in range(len(views)) for title in poses]
+    images = [view.frame.rgb for view in views for _ in poses]
     figure, axes = plots.show_images(images, titles, columns=2, size=4.2)
+    cloud = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
     for place, one in enumerate(poses.values()):
-        _draw_pose(axes[place::2], frames, one)
+        plots.draw_moved_cloud(axes[place::2], cameras, cloud, one.propagate(cameras), ("x", "y", "z"))
     return figure
-
-
-def _draw_pose(axes: Sequence[Axes], frames: Sequence[Frame], estimate: PoseEstimate) -> None:
-    """Draw the reference cloud and the axes of its camera under the pose over frames of the target sequence."""
-    cloud, cameras = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS), [frame.camera for frame in frames]
-    plots.draw_moved_cloud(axes, cameras, cloud, estimate.propagate(cameras), ("x", "y", "z"))
 
 
 def _chosen_views(result: PairResult) -> list[View]:

@@ -1,0 +1,178 @@
+"""One picture of an estimated pose: the reference in the target views, and where the cameras are, seen from above."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Arc, Wedge
+
+from zsp_lite.data.cameras import Camera, azimuths, ground_axes, view_span
+from zsp_lite.estimates import PairResult
+from zsp_lite.points import world_cloud
+from zsp_lite.viz.plots import BLUE, CHOSEN, VERMILLION, coordinate_colours, draw_points
+
+_OTHERS = 5  # target views that are shown beside the chosen one
+_POINTS = 1500
+_WIDTH = 10.0  # of the picture, inches
+_OBJECT = 0.45  # reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Directions from the target object to the cameras, seen from above with the reference camera below.
+
+    Attributes:
+        targets: (n, 2) unit vectors towards the target cameras, without their vertical part.
+        numbers: Number of each of these target views, counted from 1.
+        reference: (2,) the same of the reference camera under the estimated pose.
+        span: Angle that the target views span around the object in degrees (see `view_span`).
+        gap: Angles in degrees between which, counter-clockwise from the right, there is no target camera.
+        nearest: Number of the target view closest to the reference viewpoint.
+        angle: Angle in degrees between the directions of that view and of the reference.
+        centre: (3,) middle of the target object in the world.
+        axes: (2, 3) the drawing's axes to the right and up in the world.
+    """
+
+    targets: Float[np.ndarray, "n 2"]
+    numbers: tuple[int, ...]
+    reference: Float[np.ndarray, "2"]
+    span: float
+    gap: tuple[float, float]
+    nearest: int
+    angle: float
+    centre: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "2 3"]
+
+
+def coverage(
+    cameras: Mapping[int, Camera], reference: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]
+) -> Coverage:
+    """Compute where the target cameras, by number, and the centre of the reference camera are around an object."""
+    numbers, cameras = tuple(cameras), list(cameras.values())
+    places = np.stack([*(camera.centre for camera in cameras), reference])
+    directions = (places - centre) / np.linalg.norm(places - centre, axis=1, keepdims=True)
+    axes = ground_axes(cameras)
+    x, y = axes @ directions[-1]
+    turn = -np.pi / 2 - np.arctan2(y, x)
+    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
+    around = azimuths(cameras, centre)
+    around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
+    gap = (0.0, 360.0)
+    if len(around):
+        ends = np.append(around[1:], around[0] + 360)
+        widest = int((ends - around).argmax())
+        gap = float(around[widest]), float(ends[widest])
+    angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
+    return Coverage(
+        directions[:-1] @ axes.T, numbers, directions[-1] @ axes.T, view_span(cameras, centre), gap,
+        numbers[int(angles.argmin())], float(angles.min()), centre, axes,
+    )  # fmt: skip
+
+
+def pose_picture(result: PairResult, solver: str) -> Figure:
+    """Show the reference, the target and the reference's points in the target views, and the cameras from above.
+
+    The colour of a point is its position along the reference object.
+
+    Args:
+        result: Estimates of a pair.
+        solver: Name of the solver in `result.estimates`.
+    """
+    estimate = result.estimates[solver]
+    views, chosen = estimate.target_views, estimate.view
+    used = np.flatnonzero(np.isfinite(estimate.view_scores))  # others were left out
+    target_cloud = world_cloud(result.targets)[0]
+    # The reference camera is the origin of its own frame.
+    reference_place = estimate.target_camera.to_world(estimate.sim3.t)
+    cameras = {int(view) + 1: result.targets[view].camera for view in used}
+    seen = coverage(cameras, reference_place, np.median(target_cloud, axis=0))
+    titles = [f"view {number + 1}" for number in range(len(views))]
+    if solver == "paper":
+        titles = [f"{title}, score {score:.1f}" for title, score in zip(titles, estimate.view_scores)]
+    used = used[used != chosen]
+    shown = min(_OTHERS, len(used))
+    others = used[np.arange(shown) * len(used) // max(shown, 1)]
+    columns = max(shown, 4)
+    heights = [_WIDTH / 3, _WIDTH / columns, 0.3 * _WIDTH] if shown else [_WIDTH / 3, 0.3 * _WIDTH]
+    figure = plt.figure(figsize=(_WIDTH, sum(heights) + 0.25 * len(heights)), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.05, h_pad=0.06)
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights)
+    reference, target, moved = parts[0].subplots(1, 3)
+    _show(reference, estimate.reference_view.frame.rgb, "reference")
+    _show(target, views[chosen].frame.rgb, f"target {titles[chosen]}")
+    _show(moved, views[chosen].frame.rgb, f"reference in target view {chosen + 1}")
+    panels = {chosen: moved}
+    if shown:
+        panels |= dict(zip(others, parts[1].subplots(1, columns)))
+        for axis in parts[1].axes:
+            axis.set_axis_off()
+        for view in others:
+            _show(panels[view], views[view].frame.rgb, f"in {titles[view]}", 9)
+    cloud = _some(result.reference.camera.to_camera(world_cloud([result.reference])[0]))
+    colours = coordinate_colours(cloud)
+    _draw_points(reference, estimate.reference_view.frame.camera, cloud, colours, 5)
+    crops = [views[view].frame.camera for view in panels]
+    for axis, camera, pose in zip(panels.values(), crops, estimate.propagate(crops)):
+        _draw_points(axis, camera, pose.apply(cloud), colours, 5 if axis is moved else 3)
+    drawing, key = parts[-1].subplots(1, 2, width_ratios=(2, 3))
+    draw_coverage(drawing, seen, chosen + 1)
+    drawing.set_title("seen from above: target grey, reference coloured", fontsize=10)
+    moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
+    _draw_from_above(drawing, seen, _some(target_cloud), moved_cloud, colours)
+    key.set_axis_off()
+    key.legend(*drawing.get_legend_handles_labels(), loc="center left", fontsize=11, frameon=False, labelspacing=1)
+    return figure
+
+
+def draw_coverage(axis: Axes, seen: Coverage, chosen: int) -> None:
+    """Draw the cameras on a circle around the object, and shade the largest arc without a target camera."""
+    axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
+    axis.set_axis_off()
+    begin, end = seen.gap
+    several = seen.span > 0
+    axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
+    empty = f"no target view in these {360 - seen.span:.0f}°" if several else "only one target view"
+    axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
+    if several:
+        axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=BLUE, linewidth=4))
+        axis.plot([], [], color=BLUE, linewidth=4, label=f"the target views span {seen.span:.0f}°")
+    for number, place in zip(seen.numbers, seen.targets):
+        colour = CHOSEN if number == chosen else BLUE
+        axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
+        axis.text(
+            *(1.23 * place), str(number), color=colour, ha="center", va="center", fontsize=11, weight="bold", zorder=4
+        )
+    axis.plot(*seen.reference, "*", color=VERMILLION, markersize=20, markeredgecolor="white",
+              label=f"reference under this pose, {seen.angle:.0f}° from target view {seen.nearest}")  # fmt: skip
+
+
+def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, moved: np.ndarray, colours: np.ndarray) -> None:
+    """Draw the world points of the target, and of the reference under the pose, in the middle of the circle."""
+    flat = [(points - seen.centre) @ seen.axes.T for points in (target, moved)]
+    scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
+    for points, colour in zip(flat, ("0.6", colours)):
+        points, colour = points * scale, np.broadcast_to(colour, len(points)) if isinstance(colour, str) else colour
+        inside = np.linalg.norm(points, axis=1) < 0.9
+        axis.scatter(*points[inside].T, s=4, c=colour[inside], linewidths=0)
+
+
+def _draw_points(axis: Axes, camera: Camera, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+    """Draw points with a white outline, to be visible on dark images."""
+    draw_points(axis, camera, points, "white", size=3 * size)
+    draw_points(axis, camera, points, colours, size=size)
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    """Draw a random subset of points."""
+    return points[np.random.default_rng(0).permutation(len(points))[:_POINTS]]
+
+
+def _show(axis: Axes, image: np.ndarray, title: str, font: float = 10) -> None:
+    height, width = image.shape[:2]
+    axis.imshow(image, extent=(0, width, height, 0), interpolation="nearest")
+    axis.set_title(title, fontsize=font)
+    axis.set_axis_off()
