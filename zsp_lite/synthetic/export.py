@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsp_lite.data.co3d import Co3D, SequenceData
+from zsp_lite.data.co3d import SequenceData
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import read_json, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape
@@ -104,7 +104,7 @@ def export_categories(
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs):
         name = sequence_name(seed, category, index)
-        if name not in _complete_sequences(out, category):
+        if name not in read_poses(out, category):
             recorded = make_sequence(category, index, frames, seed, image_size, builders)
             write_sequence(out, category, make_object(category, index, seed, builders), recorded)
     for category in categories:
@@ -139,12 +139,3 @@ def _write_settings(out: Path, settings: dict[str, int]) -> None:
     if found != settings:
         raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
     write_atomic(path, json.dumps(settings).encode())
-
-
-def _complete_sequences(out: Path, category: str) -> set[str]:
-    """Return the names of the sequences with an object pose that are in both annotation files of the category."""
-    dataset = Co3D(out)
-    if category not in dataset.categories():
-        return set()
-    listed = {sequence.sequence_name for sequence in dataset.sequences(category)}
-    return listed & {key.sequence_name for key in dataset.frame_list(category)} & read_poses(out, category).keys()

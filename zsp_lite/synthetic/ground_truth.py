@@ -1,9 +1,5 @@
 """Ground-truth correspondences between views of synthetic objects, for evaluation only.
 
-The file `object_poses.json` of a category holds the pose of each sequence's object in its world. With the depth and
-the camera of a frame, it gives the point of the object that each patch shows (`patch_coordinates`), and for two views
-the patches that show the same point (`ground_truth_matches`). `ground_truth_pair` does both for an evaluation pair.
-
 Instances of a category have different proportions. Their points are therefore compared in box coordinates, from 0
 (rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
 """
@@ -32,21 +28,18 @@ _Row = tuple[float, float, float, float]
 class _Pose(msgspec.Struct):
     trans: tuple[_Row, _Row, _Row, _Row]
     scale: float
-    low: tuple[float, float, float]  # of the bounding box in object coordinates
+    low: tuple[float, float, float]
     high: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectPose:
-    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box.
-
-    `low` and `high` are the corners of the box in object coordinates.
-    """
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box."""
 
     R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]
     scale: float
-    low: Float[np.ndarray, "3"]
+    low: Float[np.ndarray, "3"]  # corners of the box in object coordinates
     high: Float[np.ndarray, "3"]
 
     def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -137,54 +136,50 @@ def _part(mesh, transform: np.ndarray) -> TexturedMesh:
 def _material(given) -> Material:
     """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
     if hasattr(given, "baseColorFactor"):
-        colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
-        colour = np.append(linear_to_srgb(colour[:3]), colour[3])  # glTF's factors are linear
-        metallic, roughness = (
-            1.0 if value is None else float(value) for value in (given.metallicFactor, given.roughnessFactor)
-        )
-        if given.metallicRoughnessTexture is not None:
-            mean = _image(given.metallicRoughnessTexture).reshape(-1, 4).mean(0) / 255
-            metallic, roughness = metallic * mean[2], roughness * mean[1]
-        texture = None if given.baseColorTexture is None else _image(given.baseColorTexture)
-        mode = (given.alphaMode or "OPAQUE").upper()
-        if mode == "OPAQUE":
-            colour[3] = 1
-            texture = (
-                None if texture is None else np.dstack([texture[..., :3], np.full(texture.shape[:2], 255, np.uint8)])
-            )
-        roughness = float(np.clip(roughness, 0.05, 1))
-        return Material(colour, texture, specular=0.04 + 0.36 * float(metallic), roughness=roughness)
-    colour = _rgba(given.diffuse)
-    texture = None if given.image is None else _image(given.image)
+        return _gltf_material(given)
+    colour, texture = _rgba(given.diffuse), _image(given.image)
     if texture is not None and colour[:3].max() < 0.02:
-        colour = np.append(np.ones(3), colour[3])  # some exporters write black beside a texture, and mean white
-    colour[3] = _opacity(given.kwargs)
-    specular = _rgba(given.specular)[:3].mean() if "ks" in given.kwargs else 0.2
-    glossiness = max(float(given.glossiness), 1.0)
+        colour[:3] = 1  # some exporters write black beside a texture, and mean white
+    keys = given.kwargs  # of the material file
+    opacity = keys["d"][-1] if "d" in keys else 1 - float(keys["tr"][-1]) if "tr" in keys else 1.0
+    colour[3] = np.clip(float(opacity), 0, 1)
+    specular = _rgba(given.specular)[:3].mean() if "ks" in keys else 0.2
     # Phong's exponent n as roughness: n = 2 / roughness^4 - 2.
-    roughness = (2 / (glossiness + 2)) ** 0.25
-    roughness = float(np.clip(roughness, 0.15, 1))
+    roughness = (2 / (max(float(given.glossiness), 1) + 2)) ** 0.25
     return Material(colour, texture, specular=0.02 + 0.12 * float(specular), roughness=roughness)
 
 
-def _opacity(keys: dict) -> float:
-    """Return the opacity of a material of an OBJ file: `d`, or 1 - `Tr`."""
-    value = keys["d"][-1] if keys.get("d") else 1 - float(keys["tr"][-1]) if keys.get("tr") else 1.0
-    return float(np.clip(float(value), 0, 1))
+def _gltf_material(given) -> Material:
+    colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
+    colour[:3] = linear_to_srgb(colour[:3])
+    texture = _image(given.baseColorTexture)
+    if (given.alphaMode or "OPAQUE").upper() == "OPAQUE":
+        colour[3] = 1
+        if texture is not None:
+            texture[..., 3] = 255
+    metallic, roughness = (
+        1.0 if value is None else float(value) for value in (given.metallicFactor, given.roughnessFactor)
+    )
+    if given.metallicRoughnessTexture is not None:
+        mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
+        metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
+    return Material(colour, texture, specular=0.04 + 0.36 * metallic, roughness=roughness)
 
 
-def _rgba(colour) -> np.ndarray:
-    """Return a colour as (4,) floats in [0, 1]; bytes are divided by 255."""
+def _rgba(colour) -> Float[np.ndarray, "4"]:
+    """Return a colour of three or four values in [0, 1]; bytes are divided by 255."""
     colour = np.asarray(colour)
     colour = colour / 255.0 if colour.dtype.kind in "ui" else colour.astype(float)
-    return np.clip(np.append(colour, 1.0)[:4] if len(colour) < 4 else colour[:4], 0, 1)
+    return np.clip(np.append(colour, 1.0)[:4], 0, 1)
 
 
-def _image(image) -> UInt8[np.ndarray, "h w 4"]:
+def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
     """Return a PIL image as RGBA bytes, reduced to at most `_TEXTURE_SIZE` pixels along its longer side."""
-    pixels = np.asarray(image.convert("RGBA"))
-    factor = _TEXTURE_SIZE / max(pixels.shape[:2])
-    return pixels if factor >= 1 else cv2.resize(pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    if image is None:
+        return None
+    image = image.convert("RGBA")
+    image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
+    return np.array(image)
 
 
 def _joined(parts: list[TexturedMesh]) -> TexturedMesh:

@@ -42,14 +42,14 @@ def write_sequence(
 ) -> None:
     """Add a recorded sequence, with the pose and the bounding box of its object, to a data folder.
 
-    Annotations are written last: a sequence with annotations is complete.
+    The pose is written last: a sequence with a pose is complete.
     """
     data, exact = recorded
+    write_co3d(out, category, [data], _JPEG_QUALITY)
     low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
     poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
     write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
-    write_co3d(out, category, [data], _JPEG_QUALITY)
 
 
 def read_poses(out: Path, category: str) -> dict:

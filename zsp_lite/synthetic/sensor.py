@@ -84,7 +84,7 @@ def fused_cloud(
         colours.append(view.rgb[row, col])
     points, normals, colours = (np.concatenate(values) for values in (points, normals, colours))
     chosen = np.sort(rng.choice(len(points), min(n_points, len(points)), replace=False))
-    return points[chosen], normals[chosen].astype(np.float64), colours[chosen]
+    return points[chosen], normals[chosen], colours[chosen]
 
 
 def simulate_capture(
