@@ -34,10 +34,6 @@ def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) ->
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye. The colour of a point is
     its position from the rear (dark) to the front (bright) of the synthetic motorcycle.
-
-    Args:
-        results: All results of one synthetic motorcycle, see `demo.run_photograph`.
-        size: Width of a panel in inches.
     """
     photograph, sequence = results[0].photograph, results[0].sequence
     view = results[0].estimate.target_views[results[0].estimate.view].frame.rgb
@@ -60,13 +56,7 @@ def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) ->
 
 
 def photograph_by_backbone(results: Mapping[str, PhotographResult], columns: int = 2, size: float = 4.0) -> Figure:
-    """Draw the aligned cloud and the estimated directions on the photograph, one panel per backbone.
-
-    Args:
-        results: A result by the name of its backbone.
-        columns: Panels per row.
-        size: Width of a panel in inches.
-    """
+    """Draw the aligned cloud and the estimated directions on the photograph, one panel per backbone."""
     pictures = [result.photograph.rgb for result in results.values()]
     figure, axes = plots.show_images(pictures, list(results), columns=columns, size=size)
     for axis, result in zip(axes, results.values()):

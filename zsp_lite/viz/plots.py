@@ -120,13 +120,7 @@ def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
 def patch_centres(
     cells: Integer[np.ndarray, "n 2"], grid: tuple[int, int], size: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the pixels (x, y) of patch centres.
-
-    Args:
-        cells: Patches (row, col).
-        grid: Size (rows, cols) of the patch grid.
-        size: Size (H, W) of the image.
-    """
+    """Return the pixels (x, y) of the centres of patches (row, col) of a grid over an image of `size` (H, W)."""
     scale = np.array([size[1] / grid[1], size[0] / grid[0]])
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
@@ -193,14 +187,8 @@ def pca_colours(
     """Map features to colours by their first three principal components, which all maps share.
 
     Each component is scaled to its range from the 2nd to the 98th percentile, which is robust to outliers. Similar
-    colours mean similar features, also between images.
-
-    Args:
-        maps: Feature maps.
-        foreground: Per map, the patches to fit the components to; other patches are white. Default all.
-
-    Returns:
-        Per map, an RGB image in [0, 1] with one pixel per patch.
+    colours mean similar features, also between images. The components are fitted to the `foreground` patches; others
+    are white. The result has an RGB image in [0, 1] for each map, with one pixel per patch.
     """
     features = [np.asarray(features, dtype=np.float64) for features in maps]
     if foreground is None:
@@ -223,15 +211,7 @@ def draw_points(
     colours: np.ndarray | str = BLUE,
     size: float = 5.0,
 ) -> None:
-    """Project points into the image of an axis and draw them, far ones first; points behind the camera are left out.
-
-    Args:
-        axis: Axis of the camera's image.
-        camera: Camera of the image.
-        points: Points in the camera's frame.
-        colours: One colour, or (N, 3) in [0, 1].
-        size: Marker size in points squared.
-    """
+    """Draw points of a camera's frame in its image, far ones first; those behind the camera are left out."""
     points = np.asarray(points, dtype=np.float64)
     order = np.argsort(-points[:, 2])
     order = order[points[order, 2] > 0]
@@ -249,15 +229,9 @@ def draw_axes(
     length: float,
     names: Sequence[str] = ("x", "y", "z"),
 ) -> None:
-    """Draw the three axes of a coordinate frame. Axes with an end behind the camera are left out.
+    """Draw the three axes of a coordinate frame in the image of a camera; `to_camera` maps the frame to the camera's.
 
-    Args:
-        axis: Axis of the camera's image.
-        camera: Camera of the image.
-        to_camera: Maps (n, 3) points of the frame to the camera's frame, for example `Sim3.apply`.
-        origin: Origin of the axes in the frame.
-        length: Length of the axes, in units of the frame.
-        names: Labels of the axes.
+    Axes with an end behind the camera are left out.
     """
     ends = np.asarray(to_camera(np.asarray(origin) + length * np.vstack([np.zeros(3), np.eye(3)])))
     pixels, depth = camera.project(camera.to_world(ends))
@@ -299,14 +273,9 @@ def draw_moved_cloud(
     poses: Sequence[Sim3],
     names: Sequence[str] | None = ("", "", ""),
 ) -> None:
-    """Draw a cloud of the reference, and the axes of its camera, under a pose over the image of each camera.
+    """Draw points of the reference camera's frame, and its axes, over the images of cameras, each with its own pose.
 
-    Args:
-        axes: Axes of the images.
-        cameras: Cameras of the images.
-        cloud: Points in the frame of the reference camera; see `coordinate_colours` for their colours.
-        poses: For each camera, the pose from the reference camera to it.
-        names: Labels of the axes; None to draw no axes.
+    `names` are the labels of the axes; None draws no axes.
     """
     colours, length = coordinate_colours(cloud), 2 * axis_deviation(cloud)
     for axis, camera, pose in zip(axes, cameras, poses):
@@ -319,9 +288,6 @@ def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     """Colour points by their position along the first principal axis of the cloud.
 
     Drawn over the image of another object, the gradient shows the orientation of the cloud.
-
-    Returns:
-        (N, 3) colours of viridis in [0, 1].
     """
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)

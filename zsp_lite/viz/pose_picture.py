@@ -77,10 +77,6 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     """Show the reference, the target and the reference's points in the target views, and the cameras from above.
 
     The colour of a point is its position along the reference object.
-
-    Args:
-        result: Estimates of a pair.
-        solver: Name of the solver in `result.estimates`.
     """
     estimate = result.estimates[solver]
     views, chosen = estimate.target_views, estimate.view

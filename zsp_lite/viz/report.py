@@ -82,19 +82,7 @@ def write_report(
     backbone: str,
     photograph: Sequence[PhotographResult] = (),
 ) -> Path:
-    """Write the page of the demo.
-
-    Args:
-        path: File to write; missing folders are created.
-        results: One result per pair.
-        data: Folder of the data.
-        data_note: Remark on the data, printed after the folder.
-        backbone: Name of the backbone.
-        photograph: Results on the photograph, with which the page begins; may be empty.
-
-    Returns:
-        The path.
-    """
+    """Write the page of the demo."""
     path = Path(path)
     page = render_page(results, backbone, path.parent, data, data_note, photograph=photograph)
     write_atomic(path, page.encode(errors="replace"))
@@ -102,15 +90,7 @@ def write_report(
 
 
 def write_pair_report(path: str | Path, result: PairResult) -> Path:
-    """Write the page of one pair of the user's own.
-
-    Args:
-        path: File to write; missing folders are created.
-        result: The result.
-
-    Returns:
-        The path.
-    """
+    """Write the page of one pair of the user's own."""
     path = Path(path)
     names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found from the depth"}
     note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
@@ -246,13 +226,6 @@ def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     """Write a JPEG with one row per result: reference, chosen target view, and the pose in the target sequence.
 
     The pose is that of the first solver.
-
-    Args:
-        path: File to write; missing folders are created.
-        results: One result per pair.
-
-    Returns:
-        The path.
     """
     path = Path(path)
     images, titles = [], []

@@ -24,12 +24,6 @@ def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, po
     """Draw the reference with its points, the chosen view, and the points in it after the estimated pose.
 
     The colour of a point is its position along the reference object.
-
-    Args:
-        estimate: Pose estimate.
-        title: Title of the whole figure.
-        size: Width of a panel in inches.
-        points: Largest number of points.
     """
     reference, chosen = estimate.reference_view, estimate.target_views[estimate.view].frame
     cloud = object_cloud(reference, most=points)
@@ -62,14 +56,7 @@ def stage_sheet(
     """Draw the stages of all views of a pair, a row each: crop, features, foreground, and cyclical distances.
 
     The features are coloured by principal components that all views share; the foreground shows the saliency; the maps
-    of cyclical distances lie on the reference.
-
-    Args:
-        views: The reference and the N target views.
-        maps: Cyclical distances (negated) of the reference's patches to each target, -inf off the foreground.
-        captions: Name of each row, N + 1.
-        chosen: Index of the chosen target.
-        size: Width of a panel in inches.
+    of (negated) cyclical distances lie on the reference, one for each target; -inf is off the foreground.
     """
     crops = [view.frame.rgb for view in views]
     keys = [np.asarray(view.features.keys) for view in views]
@@ -276,18 +263,8 @@ def landing_points(
 ) -> tuple[Figure, dict[str, float]]:
     """Draw pixels of a picture, and where they land in another picture under several readings of its pose and depth.
 
-    A point keeps its colour, which runs from left to right in the first picture.
-
-    Args:
-        picture: Picture that the points are taken from.
-        other: Picture that they land in.
-        pixels: Pixels (x, y) in the first picture.
-        cases: Pixels in the other picture by the name of the reading.
-        columns: Panels per row.
-        size: Width of a panel in inches.
-
-    Returns:
-        The figure, and for each reading the share of points inside the other picture.
+    A point keeps its colour, which runs from left to right in the first picture. The second result is the share of
+    points inside the other picture for each reading.
     """
     titles = ["where the points are taken", *cases]
     figure, axes = plots.show_images([picture] + [other] * len(cases), titles, columns=columns, size=size)

@@ -66,9 +66,7 @@ def smoothed(values: Sequence[float], window: int) -> tuple[Float[np.ndarray, " 
 def show_collapses(runs: Mapping[str, Sequence[Mapping[str, float]]], outputs: int) -> Figure:
     """Show the teacher's entropy, the divergence of the student and the information over the steps of several runs.
 
-    Args:
-        runs: The figures of every step (see `training.distillation`), by name of the run.
-        outputs: Number of outputs K; the entropy is at most log K.
+    A run is the list of what `training.distillation` measures in each step; the entropy is at most log `outputs`.
     """
     panels = {"teacher_entropy": "teacher's entropy", "kl": "divergence of the student", "information": "information"}
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.4), layout="constrained")
@@ -90,14 +88,9 @@ def show_query(
     views: Real[np.ndarray, "v h w 3"], query: tuple[int, int],
     targets: Real[np.ndarray, "v rows cols"], answers: Real[np.ndarray, "v rows cols"], least: float = 0.05,
 ) -> Figure:  # fmt: skip
-    """Show a query patch in the first view, and over the other views its target (above) and an answer (below).
+    """Show a query patch (row, col) in the first view, and over the others its target (above) and an answer (below).
 
-    Args:
-        views: Images of the v views.
-        query: Patch (row, col) of the first view.
-        targets: Weight of each patch of each view in the target.
-        answers: The same of the answer; the first view's are not shown.
-        least: Smaller weights are left out.
+    Weights of patches below `least` are left out.
     """
     columns = len(views)
     titles = ["query: framed", *["target"] * (columns - 1), "query: framed", *["answer"] * (columns - 1)]
@@ -119,12 +112,7 @@ def show_supervision(
 ) -> Figure:  # fmt: skip
     """Show what a renderer knows of each patch of a view: normals, relative depth and share of the object.
 
-    Args:
-        view: Image.
-        normals: Unit normals.
-        depth: Depth relative to the object's mean, in standard deviations.
-        coverage: Share of the patch that the object covers.
-        inside: Patches of the object; the others are white.
+    The depth is relative to the object's mean, in standard deviations; patches that are not `inside` are white.
     """
     pictures = [view, np.where(inside[..., None], normals / 2 + 0.5, 1), np.ones_like(view), view]
     titles = ["the view", "geometry: normals", "geometry: depth", "attention: the object"]
@@ -148,13 +136,7 @@ def show_losses(rows: Sequence[Mapping[str, float]], losses: Mapping[str, str], 
 def show_measurements(
     shares: Mapping[str, Sequence[float]], values: Mapping[str, Sequence[tuple[float, ...]]], labels: Sequence[str]
 ) -> Figure:
-    """Show several measurements over the course of several runs, one panel per measurement.
-
-    Args:
-        shares: For each run, the share of the run at which was measured.
-        values: For each run, the measurements at each of these times.
-        labels: Names of the measurements.
-    """
+    """Show several measurements over the course of several runs, one panel per measurement."""
     figure, axes = plt.subplots(1, len(labels), figsize=(4.4 * len(labels), 3.3), layout="constrained", squeeze=False)
     for index, (axis, label) in enumerate(zip(axes[0], labels)):
         for run, (colour, line, marker) in zip(values, _STYLES):
@@ -170,12 +152,9 @@ def show_keys_and_attention(
     pictures: Sequence[np.ndarray], rows: Sequence[tuple[str, Sequence[np.ndarray], Sequence[np.ndarray]]],
     size: float = 1.15,
 ) -> Figure:  # fmt: skip
-    """Show pictures above the colours of their keys (left) and their attention (right), one row per network.
+    """Show pictures above the colours of their keys (left) and their attention (right).
 
-    Args:
-        pictures: Images.
-        rows: Name of the network, colours of the keys of each picture, attention of each picture.
-        size: Width of an image in inches.
+    A row is the name of a network, and its keys' colours and its attention for each picture.
     """
     count = len(pictures)
     images = [*pictures, *pictures]

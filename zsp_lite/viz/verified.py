@@ -48,16 +48,9 @@ _AXIS_LENGTH = 1.2  # of the reference camera, in its units
 
 
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
-    """Classify each point in each view under one of the poses.
+    """Classify each point in each view under one of the poses, as indices into `POINT_CLASSES`.
 
     A point is on the surface if its surface weight is at least half of what it would be exactly on the surface.
-
-    Args:
-        terms: Point terms of m poses.
-        pose: Index of the pose.
-
-    Returns:
-        (v, n) indices into `POINT_CLASSES`.
     """
     projection = terms.projection
     distance, weight = projection.silhouette_distance[pose].numpy(), projection.weight[pose].numpy()
@@ -70,19 +63,9 @@ def draw_point_classes(
     axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, pose: int = 0, size: float = 16.0, legend: bool = True,
     views: Sequence[int] | None = None,
 ) -> Int[np.ndarray, "v classes"]:  # fmt: skip
-    """Draw every point over every view's image, marked by its class. Points outside an image are drawn at its border.
+    """Draw every point over the images of some views (None: all), marked by its class, and return the counts.
 
-    Args:
-        axes: One per drawn view, from `plots.show_images`.
-        terms: Point terms of m poses.
-        maps: Maps of the views that the points were projected into.
-        pose: Index of the pose.
-        size: Marker size in points squared.
-        legend: Whether to add a legend below the figure.
-        views: Indices of the views that are drawn; None for all.
-
-    Returns:
-        (v, classes) number of points of each class in each drawn view.
+    Points outside an image are drawn at its border.
     """
     views = range(len(maps)) if views is None else views
     classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
@@ -110,18 +93,9 @@ def draw_point_term(
     axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, name: str, pose: int = 0, size: float = 16.0,
     views: Sequence[int] | None = None,
 ) -> None:  # fmt: skip
-    """Draw one point term over every view's image, with a colour bar.
+    """Draw one of `_POINT_TERMS` over the images of some views (None: all), with a colour bar.
 
     Marker areas grow with the term; those of the similarity grow with the surface weight that multiplies it.
-
-    Args:
-        axes: One per view, from `plots.show_images`.
-        terms: Point terms of m poses.
-        maps: Maps of the views that the points were projected into.
-        name: "silhouette", "free_space", "surface" or "similarity".
-        pose: Index of the pose.
-        size: Marker size in points squared.
-        views: Indices of the views that are drawn; None for all.
     """
     views = range(len(maps)) if views is None else views
     label, (low, high) = _POINT_TERMS[name]
@@ -196,17 +170,10 @@ def show_moved_reference(
     marks: Mapping[int, tuple[str, str]],
     most: int = 2500,
 ) -> Figure:
-    """Show the reference and every target view with the points of the reference moved into it, in their own colours.
+    """Show the reference, and every target view with the points of the reference moved into it, in their own colours.
 
-    Args:
-        reference: Reference view.
-        targets: Target views.
-        poses: For each target view, the pose from the reference camera to its camera.
-        marks: Text and colour of a frame, by index of the target view.
-        most: Largest number of points.
-
-    Returns:
-        The figure; the first axis shows the reference.
+    `poses` lead from the reference camera to each target camera; `marks` are the text and the colour of a frame by the
+    index of the target view.
     """
     frame, cloud = reference.frame, object_cloud(reference, most=most)
     x, y = frame.camera.project(frame.camera.to_world(cloud))[0].astype(int).T

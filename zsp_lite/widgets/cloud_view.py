@@ -36,11 +36,7 @@ class ViewBox:
 
     @classmethod
     def around(cls, points: Real[np.ndarray, "n 3"]) -> "ViewBox":
-        """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers.
-
-        Raises:
-            InputError: The cloud is empty, not finite, or a single point.
-        """
+        """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers."""
         points = np.asarray(points, dtype=np.float64)
         if len(points) == 0 or not np.isfinite(points).all():
             raise InputError(f"point cloud of shape {points.shape} is empty or not finite, expected finite points")

@@ -38,11 +38,7 @@ _LABEL = {"description_width": "initial"}
 
 
 def load_package(name: str = "ipywidgets") -> Any:
-    """Import a package that only the notebooks need.
-
-    Raises:
-        InputError: It is not installed; the message has the command that installs it.
-    """
+    """Import a package that only the notebooks need; the error has the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -119,11 +115,7 @@ def interactive_figure(
 def patch_outline(
     axis: Axes, grid: tuple[int, int], size: tuple[int, int], label: str, label_left: bool = False
 ) -> Callable[[int, int], None]:
-    """Draw a labelled outline around one patch of an image, white on black so that it is visible on any image.
-
-    Returns:
-        Function that moves the outline to the patch (row, col).
-    """
+    """Draw a labelled outline around one patch of an image, and return the function that moves it to (row, col)."""
     height, width = size[0] / grid[0], size[1] / grid[1]
     outlines = [
         axis.add_patch(Rectangle((0, 0), width, height, fill=False, edgecolor=colour, linewidth=line, zorder=8))

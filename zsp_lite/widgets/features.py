@@ -27,11 +27,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, str], Float[Tensor, "batch tokens dim"]]:
-    """Compute the query, key, value and output of every token in every layer in one forward pass.
-
-    Returns:
-        (layer, facet) to features; the first token is CLS.
-    """
+    """Compute the query, key, value and output of every token (CLS first) in every layer, in one forward pass."""
     model = backbone.model
     if not isinstance(model, VisionTransformer):
         raise InputError(f"{backbone.name}: not in DINO's layout, expected zsp-tiny, a DINO model or a checkpoint file")

@@ -74,14 +74,6 @@ def rotated_distance(
 
     With the same cloud twice, this is the error for symmetric objects of Hinterstoisser et al. (ADD-S) of a pose with
     that rotation error.
-
-    Args:
-        cloud: Points to rotate.
-        other: Points of the other cloud, in the same unit.
-        degrees: Angles.
-
-    Returns:
-        Mean distance for each angle, in the unit of the clouds.
     """
     cloud, other = np.asarray(cloud, np.float64), np.asarray(other, np.float64)
     search = NearestNeighbors(n_neighbors=1).fit(other)

@@ -74,16 +74,6 @@ def viewpoints_from_above(
 
     The circle lies in the plane of the camera centres, which the singular value decomposition gives. Up is opposite
     to the mean y axis of the cameras.
-
-    Args:
-        cameras: Cameras around an object.
-        others: Further camera centres in the same world.
-
-    Returns:
-        Unit vectors from the mean camera centre towards the cameras, and towards the other centres.
-
-    Raises:
-        InputError: There are fewer than three cameras, or their centres are on a line.
     """
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
     mean = centres.mean(axis=0) if len(centres) else np.zeros(3)
