@@ -7,7 +7,7 @@ import numpy as np
 
 from zsp_lite.benchmark.results import Results
 from zsp_lite.benchmark.statistics import paired_test
-from zsp_lite.benchmark.summary import weights_of_pairs
+from zsp_lite.benchmark.summary import draws_of_pairs
 from zsp_lite.benchmark.tables import Cell, PValue, Table, make_table
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median
@@ -42,10 +42,9 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
     Raises:
         InputError: If there is no common row or pair.
     """
-    if rows is None:
-        rows = [(name, name) for name in first.rows if name in second.rows]
-        if not rows:
-            raise InputError(f"runs have no row in common: {', '.join(first.rows)} and {', '.join(second.rows)}")
+    rows = [(name, name) for name in first.rows if name in second.rows] if rows is None else rows
+    if not rows:
+        raise InputError(f"runs have no row in common: {', '.join(first.rows)} and {', '.join(second.rows)}")
     found = []
     for one, other in rows:
         a, b = first.errors(one), second.errors(other)
@@ -53,23 +52,21 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
         if not keys:
             raise InputError(f"rows {one} and {other} have no pair in common: other data, seed or number of views")
         errors = np.array([[run[key] for key in keys] for run in (a, b)])
-        test = paired_test(*errors, weights=weights_of_pairs(keys))
+        test = paired_test(*errors, weights=draws_of_pairs(keys))
         found.append(Difference(one, other, len(keys), tuple(accuracy(errors, 30)), tuple(median(errors)), test))
     return found
 
 
 def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
     """Split "A:B" into a row of each run; "A" stands for the row A of both. Names of rows may hold colons."""
-    if text in first.rows and text in second.rows:
-        return text, text
-    ends = [i for i, sign in enumerate(text) if sign == ":"]
-    found = [(text[:i], text[i + 1 :]) for i in ends if text[:i] in first.rows and text[i + 1 :] in second.rows]
-    if len(found) != 1:
-        raise InputError(
-            f"rows {text!r}: {'ambiguous' if found else 'not in the runs'}, expected A:B or A with A one of "
-            f"{', '.join(first.rows)} and B one of {', '.join(second.rows)}"
-        )
-    return found[0]
+    colons = [i for i, sign in enumerate(text) if sign == ":"]
+    for one, other in ((text, text), *((text[:i], text[i + 1 :]) for i in colons)):
+        if one in first.rows and other in second.rows:
+            return one, other
+    raise InputError(
+        f"rows {text!r}: not in the runs, expected A:B or A with A one of {', '.join(first.rows)} and B one of "
+        f"{', '.join(second.rows)}"
+    )
 
 
 def comparison_table(differences: Sequence[Difference], first: str, second: str) -> Table:

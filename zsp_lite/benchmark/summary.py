@@ -16,6 +16,8 @@ from zsp_lite.benchmark.statistics import (
 )
 from zsp_lite.metrics import accuracy
 
+_TIMED = {"backbone": "features_per_frame", "reading": "reading_each", "similarity": "similarity_each"}
+
 
 def summarise_run(
     rows: Mapping[str, Mapping[str, Mapping[str, Any]]],
@@ -27,43 +29,27 @@ def summarise_run(
 
     Args:
         rows: By row and pair key, what the row found (see `evaluate_pair`).
-        evaluations: By pair key, cost and foreground IoU of each evaluation (see `evaluate_pair`).
+        evaluations: By pair key, timings and foreground IoU of each evaluation (see `evaluate_pair`).
         data: What was evaluated.
         backbone: Its name.
 
     Returns:
         {"data", "backbone", "methods", "against_ours" and "intervals": see `summarise_rows`, "saliency_iou": mean over
         the frames, by category and "mean", "timings": median seconds per stage of the first row, per frame and per
-        comparison of two frames, "cost": seconds of all rows, of "ours" alone, and their ratio}.
+        comparison of two frames}.
     """
     keys = dict.fromkeys(key for row in rows.values() for key in row)
     used = {key: evaluations[key] for key in keys if key in evaluations}
-    summary = {"data": dict(data), "backbone": backbone, **summarise_rows(rows), "saliency_iou": _saliency_iou(used)}
-    seconds: dict[str, list[float]] = {}
-    for one in (one for found in used.values() for one in found):
-        for stage, values in one["timings"].items():
-            seconds.setdefault(stage, []).extend(values)
     first = [found["timings"] for found in next(iter(rows.values()), {}).values() if "timings" in found]
     timings = {stage: float(np.median([one.get(stage, 0.0) for one in first])) for stage in (first[0] if first else ())}
-    for stage, name in (
-        ("backbone", "features_per_frame"),
-        ("reading", "reading_each"),
-        ("similarity", "similarity_each"),
-    ):
-        if stage in seconds:
-            timings[name] = float(np.median(seconds[stage]))
-    summary["timings"] = timings
-    if "ours" in rows and {"backbone", "reading", "similarity"} <= seconds.keys():
-        mean = {stage: float(np.mean(values)) for stage, values in seconds.items()}
-        frames = {frame for key in rows["ours"] for frame in frames_of(key)}
-        views = sum(len(frames_of(key)) - 1 for key in rows["ours"])
-        alone = len(frames) * (mean["reading"] + mean["backbone"]) + views * mean["similarity"]
-        alone += sum(sum(found.get("timings", {}).values()) for found in rows["ours"].values())
-        total = sum(one["seconds"] for found in used.values() for one in found)
-        summary["cost"] = {
-            "all_rows": round(total, 3), "ours_alone": round(alone, 3), "ratio": round(total / alone, 3)
-        }  # fmt: skip
-    return summary
+    for stage, name in _TIMED.items():
+        seconds = [one for found in used.values() for once in found for one in once["timings"].get(stage, ())]
+        if seconds:
+            timings[name] = float(np.median(seconds))
+    return {
+        "data": dict(data), "backbone": backbone, **summarise_rows(rows), "saliency_iou": _saliency_iou(used),
+        "timings": timings,
+    }  # fmt: skip
 
 
 def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
@@ -74,21 +60,20 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
             method flagged its estimate, and of solvers with hypotheses "second_error" and "one_of_two"}.
 
     Returns:
-        {"methods": by row, over all pairs and "per_category", the figures of `benchmark.statistics.summarise`, and
+        {"methods": by row, over all pairs and "per_category", the figures of `statistics.summarise`, and
         "mean_category_median": the paper's way of averaging medians, and of solvers with hypotheses "best_two": see
-        `best_two_figures`; "against_ours": every other row that has the same
-        problems in the same order against "ours", see `benchmark.statistics.paired_difference`; "intervals": their method}.
-        Intervals and p values come from resampled objects, except for "sign_test_p".
+        `best_two_figures`; "against_ours": every other row that has the same problems in the same order against "ours",
+        see `statistics.paired_difference`; "intervals": their method}. Intervals and p values come from resampled
+        objects, except for "sign_test_p".
     """
     rows = {name: _ordered(row) for name, row in rows.items()}
-    weights: dict[tuple, np.ndarray] = {}
+    draws: dict[tuple, np.ndarray] = {}  # rows with the same objects share them
     methods, errors = {}, {}
     for name, row in rows.items():
         errors[name] = np.array([one["error"] for one in row.values()])
         objects = tuple(map(objects_of, row))
-        if objects not in weights:
-            weights[objects] = weights_of_pairs(row)
-        drawn, categories = weights[objects], np.array([category_of(key) for key in row])
+        drawn = draws[objects] = draws[objects] if objects in draws else draws_of_pairs(row)
+        categories = np.array([category_of(key) for key in row])
         average, interval = mean_category_median(errors[name], categories, drawn)
         methods[name] = summarise(errors[name], drawn) | {
             "mean_category_median": average,
@@ -105,7 +90,7 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
             methods[name]["best_two"] = best_two_figures(row, drawn)
     summary: dict[str, Any] = {"methods": methods, "intervals": {"level": 0.95, "resampled": "objects"}}
     if "ours" in rows:
-        problems, drawn = list(map(_problem, rows["ours"])), weights_of_pairs(rows["ours"])
+        problems, drawn = list(map(_problem, rows["ours"])), draws[tuple(map(objects_of, rows["ours"]))]
         summary["against_ours"] = {
             name: paired_difference(found, errors["ours"], weights=drawn)
             | {"sign_test_p": sign_test(found < 30, errors["ours"] < 30)}
@@ -115,25 +100,21 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
     return summary
 
 
-def best_two_figures(row: Mapping[str, Mapping[str, Any]], weights: Float[np.ndarray, "resamples n"]) -> dict[str, Any]:
+def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Float[np.ndarray, "resamples n"]) -> dict[str, Any]:
     """Compute how often one of the two best poses is right. These figures are not comparable with Acc30.
-
-    Args:
-        row: By pair key, {"error": degrees, and where the estimate has an alternative "second_error": that of its
-            first one; "one_of_two": whether the solver says that it cannot decide between them}.
-        weights: Bootstrap weights of the pairs.
 
     Returns:
         {"acc30" and "acc30_ci": percentage of pairs with the estimate or its first alternative below 30 degrees,
-        "one_of_two": number of estimates with that flag, and of these the percentages "one_of_two_acc30" with one of
-        the two poses below 30 degrees and "one_of_two_first_acc30" with the estimate itself; None without any}.
+        "one_of_two": number of estimates between which the solver cannot decide, and of these the percentages
+        "one_of_two_acc30" with one of the two poses below 30 degrees and "one_of_two_first_acc30" with the estimate
+        itself; None without any}.
     """
     first = np.array([one["error"] for one in row.values()])
     either = np.array([min(one["error"], one.get("second_error", 180.0)) for one in row.values()])
     flagged = np.array([one.get("one_of_two", False) for one in row.values()], dtype=bool)
     return {
         "acc30": float(accuracy(either, 30)),
-        "acc30_ci": list(bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), weights)),
+        "acc30_ci": list(bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), drawn)),
         "one_of_two": int(flagged.sum()),
         "one_of_two_acc30": float(accuracy(either[flagged], 30)) if flagged.any() else None,
         "one_of_two_first_acc30": float(accuracy(first[flagged], 30)) if flagged.any() else None,
@@ -151,14 +132,7 @@ def objects_of(key: str) -> tuple[str, str]:
     return f"{category}/{reference.rpartition(':')[0]}", f"{category}/{target.rpartition(':')[0]}"
 
 
-def frames_of(key: str) -> list[tuple[str, str]]:
-    """Return the frames in a pair's key, (CATEGORY/SEQUENCE, frame number), the reference first."""
-    reference, target = objects_of(key)
-    numbers = key.rpartition(":")[2].split(",")
-    return [(reference, key.split("/")[1].rpartition(":")[2]), *((target, number) for number in numbers)]
-
-
-def weights_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
+def draws_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
     """Draw bootstrap weights of the pairs with these keys, from resampled objects."""
     keys = list(keys)
     return object_draws([objects_of(key) for key in keys], [category_of(key) for key in keys])
@@ -176,6 +150,7 @@ def _problem(key: str) -> str:
 
 
 def _saliency_iou(evaluations: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, float]:
+    """Mean IoU of the frames' foregrounds, by category and over categories."""
     by_category: dict[str, dict[str, float]] = {}
     for key, found in evaluations.items():
         for one in found:
