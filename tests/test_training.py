@@ -35,12 +35,6 @@ def fourier(surface, seed=0):
     return torch.where(surface[..., :1].isnan(), noise, known)
 
 
-def test_an_object_is_always_rendered_the_same_and_differs_from_the_next(renders):
-    for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
-        np.testing.assert_array_equal(array, rows[1])
-    assert not np.array_equal(renders.rgb[1], renders.rgb[2])
-
-
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
     azimuths = []
     monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", lambda *a: azimuths.append(a[0]) or orbit_pose(*a))
@@ -55,6 +49,8 @@ def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypat
 
 
 def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
+    for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
+        np.testing.assert_array_equal(array, rows[1])  # a number stands for one object
     inside = ~np.isnan(renders.surface[..., 0])
     assert renders.rgb.shape == (4, VIEWS, SIZE, SIZE, 3) and inside.shape == (4, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
@@ -196,7 +192,7 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
         attention, iou = attention_loss(model(batch.images).cls_logits, batch.coverage)
     assert (float(attention), iou) == pytest.approx((figures["attention"], figures["iou"]))
     optimiser = torch.optim.AdamW(model.parameters(), 3e-3)
-    for _ in range(12):
+    for _ in range(24):
         optimiser.zero_grad()
         loss, last = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
         loss.backward()

@@ -19,8 +19,6 @@ def quadruped(a: Assembly) -> None:
     a.add(capsule(head, head + [a.u(0.2, 0.4), 0, -0.08], a.u(0.15, 0.24), a.u(0.09, 0.15)), 1)
     if a.chance(0.8):
         a.add(ellipsoid((0.05, a.u(0.06, 0.12), a.u(0.1, 0.22)), head + [-0.05, 0.15, 0.2]), 2, mirror=True)
-    if a.chance(0.3):
-        a.add(rod(head + [0, 0.08, 0.15], head + [-0.05, 0.2, 0.5], 0.04, 0.01), 3, mirror=True)
     a.add(ellipsoid((0.04, 0.03, 0.04), head + [0.1, 0.15, 0.08]), 3, mirror=True)
     tail = (-length / 2 - r - a.u(0.1, 0.5), 0, z + a.u(-0.4, 0.4))
     a.add(capsule((-length / 2 - r * 0.6, 0, z + 0.1), tail, 0.06, 0.04), 2)
@@ -35,7 +33,6 @@ def fish(a: Assembly) -> None:
     a.add(extrusion(fin, 0.05), 1)
     a.add(ellipsoid((0.06, 0.05, 0.06), (length * 0.72, 0.14, h * 0.2)), 3, mirror=True)
     a.add(ellipsoid((0.25, 0.04, 0.12)).rotated("z", -0.5).translated((0.15, 0.28, -0.1)), 2, mirror=True)
-    a.add(ellipsoid((0.1, 0.1, 0.05), (length * 0.95, 0, -0.05)), 2)
 
 
 def teapot(a: Assembly) -> None:
@@ -49,21 +46,6 @@ def teapot(a: Assembly) -> None:
     a.add(handle, 2)
 
 
-def table(a: Assembly) -> None:
-    length, width, h = a.u(0.9, 1.3), a.u(1.2, 2.2), a.u(0.6, 1.1)
-    a.add(box((length, width, a.u(0.05, 0.12)), (0, 0, h)), 0)
-    leg = a.u(0.03, 0.07)
-    for side in (-1, 1):
-        x, y = side * (length / 2 - 0.1), width / 2 - 0.1
-        a.add(rod((x, y, h), (x, y, 0), leg), 1, mirror=True)
-    a.add(box((length * 0.8, width * a.u(0.25, 0.4), h * a.u(0.3, 0.8)), (0, width * 0.27, h * 0.6)), 2)
-    for k in range(1 + a.choice(3)):
-        a.add(box((0.04, width * 0.15, 0.04), (length * 0.42, width * 0.27, h * (0.4 + 0.2 * k))), 3)
-    if a.chance(0.5):
-        a.add(box((0.06, width * 0.5, 0.5), (-0.2, -0.1 * width, h + 0.35)), 3)
-        a.add(rod((-0.2, -0.1 * width, h), (-0.2, -0.1 * width, h + 0.2), 0.05), 1)
-
-
 def guitar(a: Assembly) -> None:
     r, neck = a.u(0.4, 0.55), a.u(1.0, 1.5)
     a.add(cylinder(r, r, 0.22, 24).rotated("y", np.pi / 2), 0)
@@ -72,9 +54,6 @@ def guitar(a: Assembly) -> None:
     top = r * 1.6 + neck
     a.add(box((0.08, 0.12, neck), (0.1, 0, r * 1.6 + neck / 2)), 1)
     a.add(box((0.07, 0.22, 0.3), (0.07, 0, top + 0.12)), 2)
-    for k in range(3):
-        z = top + 0.03 + 0.09 * k
-        a.add(rod((0.07, 0.1, z), (0.07, 0.2, z), 0.025), 3, mirror=True)
     a.add(box((0.06, 0.3, 0.06), (0.14, 0, -r * 0.35)), 2)
 
 
@@ -87,8 +66,6 @@ def camera(a: Assembly) -> None:
     a.add(rod((front - lens * 0.1, y, 0), (front + 0.02, y, 0), r * 0.7), 4)
     a.add(box((depth * 0.7, a.u(0.3, 0.5), 0.2), (0, y, h / 2 + 0.08)), 2)
     a.add(rod((0, w * 0.35, h / 2), (0, w * 0.35, h / 2 + 0.1), 0.09), 3)
-    if a.chance(0.6):
-        a.add(box((depth * 1.3, 0.2, h * 0.9), (0.08, w * 0.45, 0)), 3)
     a.add(box((0.04, w * 0.5, h * 0.5), (-depth / 2, 0, -0.05)), 4)
 
 
@@ -144,8 +121,6 @@ def windmill(a: Assembly) -> None:
         a.add(extrusion(outline, 0.04, "yz").rotated("x", turn + k * TAU / vanes).translated(hub), 3)
     a.add(box((0.05, 0.2, 0.4), (r, 0, 0.2)), 4)
     a.add(box((0.04, 0.14, 0.14), (r * 0.95, 0.02, h * 0.5)), 4)
-    if a.chance(0.5):
-        a.add(rod((-r, 0, h * 0.9), (-r - a.u(0.2, 0.4), 0, h * 0.4), 0.03), 2)
 
 
 def shoe(a: Assembly) -> None:
@@ -160,9 +135,7 @@ def shoe(a: Assembly) -> None:
         a.add(box((0.05, w * 0.5, 0.04), (length * (0.0 + 0.08 * k), 0, 0.42 - 0.05 * k)), 2)
     if a.chance(0.6):
         a.add(box((0.25, w * 0.6, a.u(0.1, 0.3)), (-length * 0.36, 0, -0.08)), 3)
-    if a.chance(0.5):
-        a.add(torus(0.09, 0.02, (0, 1, 0), (-length * 0.48, 0, ankle * 0.9)), 4)
 
 
-BUILDERS = (quadruped, fish, teapot, table, guitar, camera, lamp, cart, rocket, windmill, shoe)
+BUILDERS = (quadruped, fish, teapot, guitar, camera, lamp, cart, rocket, windmill, shoe)
 TRAINING = {build.__name__: build for build in BUILDERS}

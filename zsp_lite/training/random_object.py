@@ -13,9 +13,9 @@ def build_random_object(a: Assembly) -> None:
     for _ in range(4 + a.choice(6)):
         parent, parent_size = nodes[a.choice(len(nodes))]
         direction, size = a.rng.normal(size=3), a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
-        centre = parent + direction / np.abs(direction).max() * (parent_size * 0.5 + size * 0.35)
+        centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
         mesh, mirror = _random_solid(a, size), a.chance(0.55)
-        centre[1] = abs(centre[1]) + 0.1 if mirror else 0
+        centre[1] = abs(centre[1]) if mirror else 0
         if mirror and a.chance(0.5):
             mesh = mesh.rotated("z", a.u(-0.7, 0.7)).rotated("x", a.u(-0.7, 0.7))
         a.add(mesh.translated(centre), a.choice(5), mirror)
