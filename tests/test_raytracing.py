@@ -13,7 +13,6 @@ from zsp_lite.synthetic.photography import CheapCamera
 from zsp_lite.synthetic.raytracing import MeshScene
 from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.room import random_room
-from zsp_lite.synthetic.sampling import look_up
 from zsp_lite.synthetic.textures import srgb_to_linear
 
 STUDIO = RoomLight(studio())
@@ -93,22 +92,14 @@ def test_a_deformed_copy_has_the_coordinates_and_the_pattern_of_the_original():
     assert (red == (original[:, 0] > 0))[clear].mean() > 0.98 and 0.2 < red.mean() < 0.8
 
 
-def test_the_zenith_of_a_panorama_does_not_blend_with_its_nadir():
-    panorama = np.zeros((16, 32, 3), np.float32)
-    panorama[:8] = np.linspace(1, 2, 32)[None, :, None]  # bright above the horizon, in all directions
-    panorama[:, [0, -1]] = panorama[:, [0, -1]].mean(1, keepdims=True)
-    up, tilted, down, azimuth_0 = look_up(panorama, np.float32([[0, 0, 1], [0.05, 0, 1], [0, 0, -1], [1, 0, 0.9]]))[
-        :, 0
-    ]
-    assert up == pytest.approx(1.5) and tilted == pytest.approx(1.5) and down == 0
-    assert azimuth_0 == pytest.approx(1.5)  # between the last and the first column
-
-
-def test_a_surface_that_faces_up_receives_the_light_of_the_room_on_its_floor():
-    room = RoomLight(random_room(0))
-    up, down = room.irradiance(np.float32([[0, 0, 1], [0, 0, -1]]))
-    shaded = room.on_the_floor(np.zeros(1, np.float32), np.ones(1, np.float32))[0]
-    assert up == pytest.approx(shaded, rel=0.1) and not np.allclose(down, up, rtol=0.1)
+def test_a_surface_receives_the_light_of_the_faces_of_the_room_that_it_faces():
+    images = [np.full((8, 8, 3), value, np.float32) for value in (0.1, 0.9, 0.5, 0.5, 0.0, 0.8)]
+    room = RoomLight(replace(studio(), images=tuple(images)))
+    towards = np.float32([[-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, -1]])
+    near, far, up, down = room.irradiance(towards)[:, 0]
+    assert near < up < far and down < up
+    assert up == pytest.approx(room.on_the_floor(np.zeros(1, np.float32), np.ones(1, np.float32))[0, 0])
+    assert room.reflection(towards, np.full(4, 0.1, np.float32))[:, 0] == pytest.approx([0.1, 0.9, 0.8, 0])
 
 
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):

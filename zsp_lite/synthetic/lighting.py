@@ -5,12 +5,11 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.synthetic.room import Room
-from zsp_lite.synthetic.sampling import look_up, pyramid, sample_pyramid
+from zsp_lite.synthetic.sampling import pyramid, sample_pyramid
 
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
-_FLOOR = 4  # index of the floor among the faces of a room
-_PANORAMA = (16, 32)  # rows and columns
-_GLOSS = 40  # exponent of the cosine over which glossy surfaces reflect
+_FLOOR, _CEILING = 4, 5  # among the faces of a room
+_MIDDLE = np.array([0, 0, 1.5])  # about the middle of an object
 
 
 class RoomLight:
@@ -19,36 +18,33 @@ class RoomLight:
     def __init__(self, room: Room):
         self.room = room
         self._images = [pyramid(image) for image in room.images]
-        rows, cols = _PANORAMA
-        polar = ((np.arange(rows) + 0.5) / rows * np.pi)[:, None]
-        azimuth = (np.arange(cols) + 0.5) / cols * 2 * np.pi
-        x, y = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
-        directions = np.dstack([x, y, np.broadcast_to(np.cos(polar), x.shape)]).reshape(-1, 3).astype(np.float32)
-        cosine, solid_angle = np.maximum(directions @ directions.T, 0), np.sqrt(1 - directions[:, 2] ** 2)
-        upwards = cosine[0] * solid_angle
-        self._ambient = np.zeros(3, np.float32)  # irradiance of walls and ceiling on the floor
-        self._ambient = upwards @ self._seen_from_the_object(directions) / upwards.sum()
-        around = self._seen_from_the_object(directions)
-        lobes = (cosine * solid_angle, cosine**_GLOSS * solid_angle)
-        self._matte, self._glossy = (
-            (lobe @ around / lobe.sum(1, keepdims=True)).reshape(rows, cols, 3) for lobe in lobes
-        )
+        faces = np.array([image.mean((0, 1)) for image in room.images])
+        # Irradiance of a surface that faces one of the six faces: half of it from there, half from the four beside it.
+        self._ambient = (faces[_CEILING] + faces[:_FLOOR].mean(0)) / 2
+        faces[_FLOOR] *= self.on_the_floor(*np.ones((2, 1), np.float32))[0]
+        opposite = faces.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
+        self._irradiance = (faces + (faces.sum(0) - faces - opposite) / 4) / 2
 
     def irradiance(self, normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the irradiance of the room, without its key light, at unblocked points with these normals."""
-        return look_up(self._matte, normal)
+        face = 2 * np.arange(3) + (normal > 0)
+        return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
-    def reflection(self, direction: Float[np.ndarray, "n 3"], roughness: Float[np.ndarray, " n"]) -> np.ndarray:
-        """Return the radiance (n, 3) of the room from these directions, blurred by the roughness."""
-        rough = roughness[:, None]
-        return (1 - rough) * look_up(self._glossy, direction) + rough * look_up(self._matte, direction)
+    def reflection(
+        self, direction: Float[np.ndarray, "n 3"], roughness: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Return the radiance that an object receives from these directions, blurred by the roughness."""
+        radiance, reach = self.radiance(_MIDDLE, direction, roughness)
+        floor = np.flatnonzero(reach)
+        radiance[floor] *= self.on_the_floor(*np.ones((2, len(floor)), np.float32))
+        return radiance
 
     def radiance(
-        self, eye: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"], pixel: float
+        self, eye: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"], blur: float | Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
         """Return the radiance of walls and ceiling and the albedo of the floor along rays, and the reach of the floor.
 
-        Rays start at `eye`, which is moved into the room; `pixel` is the angle between neighbours in radians. The reach
+        Rays start at `eye`, which is moved into the room; `blur` is the angle that a ray covers, in radians. The reach
         is the ray parameter where a ray meets the floor, 0 where it does not.
         """
         low, high = (corner[:, None].astype(np.float32) for corner in (self.room.low, self.room.high))
@@ -58,7 +54,7 @@ class RoomLight:
         nearest, axis = reach.min(0), reach.argmin(0)
         face = 2 * axis + (np.take_along_axis(rays, axis[None], 0)[0] > 0)
         x, y, z = (eye + nearest * rays - low) / (high - low)
-        texels = nearest * np.sqrt((rays**2).sum(0)) * pixel
+        texels = nearest * np.sqrt((rays**2).sum(0)) * blur
         radiance = np.empty((len(nearest), 3), np.float32)
         for index, image in enumerate(self._images):
             on = np.flatnonzero(face == index)
@@ -71,10 +67,3 @@ class RoomLight:
         """Return the irradiance of the floor, from the visible shares of the key light and of the room."""
         direct = max(float(self.room.light[2]), 0) * self.room.light_colour.astype(np.float32)
         return key[:, None] * direct + around[:, None] * self._ambient
-
-    def _seen_from_the_object(self, directions: np.ndarray) -> np.ndarray:
-        """Return the radiance of the empty room in directions (n, 3)."""
-        radiance, reach = self.radiance(np.array([0, 0, 1.5]), directions, pixel=np.pi / _PANORAMA[0])
-        floor = reach > 0
-        radiance[floor] *= self.on_the_floor(*np.ones((2, floor.sum()), np.float32))
-        return radiance

@@ -1,4 +1,4 @@
-"""Sampling: images between their pixels, panoramas by direction, and vectors."""
+"""Sampling: images between their pixels, random directions, and vectors."""
 
 from collections.abc import Sequence
 
@@ -66,12 +66,3 @@ def sample_image(image: np.ndarray, u: np.ndarray, v: np.ndarray, border: int) -
         return np.empty((0, image.shape[2]), np.float32)
     found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0, 1.0, 1.0, 1.0))
     return found.reshape(-1, image.shape[2])[: len(u)].astype(np.float32, copy=False)
-
-
-def look_up(panorama: np.ndarray, directions: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Return the value of a panorama (rows from +z down) in directions (n, 3)."""
-    x, y, z = directions.T
-    u, v = np.arctan2(y, x) / np.float32(2 * np.pi), np.arctan2(np.hypot(x, y), z) / np.float32(np.pi)
-    half = 0.5 / len(panorama)
-    v = np.clip(v, half, 1 - half)  # only the azimuth wraps: the zenith does not blend with the nadir
-    return sample_image(panorama, u, v, cv2.BORDER_WRAP)
