@@ -139,9 +139,8 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     )  # fmt: skip
     assert verified.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
     assert list(verified.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
-    _, axes = plots.show_images([IMAGE])
-    assert verified.draw_point_classes(axes, terms, maps).tolist() == [[1, 1, 1, 1, 1]]
-    drawn = np.concatenate([collection.get_offsets() for collection in axes[0].collections])
+    figure = verified.show_point_classes([IMAGE], terms, maps, [0], ["view"], ["pose"])
+    drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).
     np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
 

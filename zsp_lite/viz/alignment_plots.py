@@ -130,20 +130,6 @@ def choices_and_scores_over_angle(
     return figure
 
 
-def scores_of_views(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
-    """Show the scores of the same views, in the order of the camera's path, for several references.
-
-    The ticks are labelled with the angle of each view to the first reference.
-    """
-    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    views = np.arange(1, len(angles) + 1)
-    draw_curves(axis, views, scores)
-    axis.set_xticks(views, [f"{view}\n{angle:.0f}°" for view, angle in zip(views, angles)])
-    axis.set(xlabel=f"view, and its angle to the {next(iter(scores))}", ylabel="score")
-    figure.legend(ncols=len(scores), loc="outside upper center")
-    return figure
-
-
 def winning_scores(near: Real[np.ndarray, " n"], far: Real[np.ndarray, " m"]) -> Figure:
     """Show histograms of the winning views' scores: of winners near the reference, and where only far views compete."""
     figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
@@ -437,16 +423,6 @@ def errors_by_category(errors: Real[np.ndarray, " n"], categories: Sequence[str]
     axis.set_yticks(range(len(names)), names)
     axis.set(xlim=(-3, 183), xticks=range(0, 181, 30))
     axis.set_xlabel("rotation error (degrees); bar: median; dashed: 30°")
-    return figure
-
-
-def distances_over_turn(turns: Real[np.ndarray, " n"], distances: Mapping[str, Real[np.ndarray, " n"]]) -> Figure:
-    """Show closest-point distances of objects to themselves over the angle by which they are turned."""
-    figure, axis = plt.subplots(figsize=(7.5, 3.5), layout="constrained")
-    draw_curves(axis, turns, distances)
-    axis.set(xlabel="turned about the vertical by (degrees)", xticks=range(0, 181, 30))
-    axis.set_ylabel("closest-point distance (scene units)")
-    axis.legend(fontsize=9)
     return figure
 
 

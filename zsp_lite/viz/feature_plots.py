@@ -16,13 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
 from zsp_lite.points import object_cloud
 from zsp_lite.synthetic.ground_truth import GroundTruthPair
-from zsp_lite.views import View
 from zsp_lite.viz import plots
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -66,17 +64,6 @@ def matches_of_estimate(estimate: PoseEstimate, size: float = 3.6) -> Figure:
     ]
     pictures = [view.frame.rgb for view in views]
     return plots.draw_matches(*pictures, *ends, estimate.inliers, ("reference", "chosen target"), size=size)
-
-
-def moved_points_in_frames(
-    reference: View, frames: Sequence[Frame], poses: Sequence[Sim3], size: float = 3.0
-) -> Figure:
-    """Show frames of the target sequence, three in a row, under the reference's points and camera axes."""
-    titles = [f"frame {frame.name.split('/')[-1]}" for frame in frames]
-    figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=3, size=size)
-    cloud = object_cloud(reference, most=_POINTS)
-    plots.draw_moved_cloud(axes, [frame.camera for frame in frames], cloud, poses)
-    return figure
 
 
 def image_in_patches(image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int]) -> Figure:
@@ -177,26 +164,6 @@ def rows_of_pictures(rows: Mapping[str, Sequence[np.ndarray]], size: float = 2.0
     return plots.show_images(pictures, titles, columns=columns, size=size)[0]
 
 
-def cls_attention_and_saliency(
-    image: Image, attention: Float[np.ndarray, "heads rows cols"], saliency: Float[np.ndarray, "rows cols"]
-) -> Figure:
-    """Show what CLS attends to in each head, relative to the largest weight of the head, and the saliency."""
-    titles = [*(f"CLS, head {head}" for head in range(len(attention))), "saliency"]
-    figure, axes = plots.show_images([image] * len(titles), titles, columns=4, size=2.4)
-    for axis, values in zip(axes, [*(head / head.max() for head in attention), saliency]):
-        plots.overlay_map(axis, values, alpha=0.8, limits=(0, 1))
-    return figure
-
-
-def foreground_above(image: Image, saliency: Float[np.ndarray, "rows cols"], thresholds: Sequence[float]) -> Figure:
-    """Show the patches whose saliency is above each of some thresholds."""
-    titles = [f"saliency above {threshold}" for threshold in thresholds]
-    figure, axes = plots.show_images([image] * len(titles), titles, size=3.0)
-    for axis, threshold in zip(axes, thresholds):
-        plots.overlay_map(axis, np.where(saliency > threshold, saliency, np.nan), limits=(0, 1))
-    return figure
-
-
 def overlap_by_threshold(thresholds: Float[np.ndarray, " t"], overlap: Float[np.ndarray, "n t"], used: float) -> Figure:
     """Draw the overlap (IoU) of foreground and mask over the threshold, thin for each image, bold for the mean."""
     figure, axis = plt.subplots(figsize=(5.6, 3.6), layout="constrained")
@@ -265,14 +232,6 @@ def cyclical_map(reference: Image, distances: Real[np.ndarray, "rows cols"], tar
     return figure
 
 
-def cyclical_maps(pictures: Sequence[Image], maps: Mapping[str, Real[np.ndarray, "rows cols"]]) -> Figure:
-    """Show several cyclical distance maps, each over its picture, two per row."""
-    figure, axes = plots.show_images(list(pictures), list(maps), columns=2, size=3.2)
-    for axis, values in zip(axes, maps.values()):
-        plots.overlay_map(axis, values, **_MAP)
-    return figure
-
-
 def cycles_between(
     reference: Image,
     target: Image,
@@ -337,15 +296,6 @@ def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[
         style = {"cmap": "cividis_r", "vmin": 0, "vmax": 3, "s": 50, "edgecolors": "white"}
         dots = axis.scatter(*centres, c=some.distance, **style)
     figure.colorbar(dots, ax=axes, label="d(u, u') in patches", shrink=0.8)
-    return figure
-
-
-def accuracy_by_number(curves: pd.DataFrame) -> Figure:
-    """Draw the share of correct matches against the number of matches kept (index), one line for each matcher."""
-    figure, axis = plt.subplots(figsize=(7.4, 4), layout="constrained")
-    plots.draw_curves(axis, curves.index, (100 * curves).to_dict("list"))
-    axis.set(xlabel="matches kept per pair, best first", ylabel="right of those known (%)", ylim=(0, None))
-    axis.legend(loc="upper right", ncols=2)
     return figure
 
 

@@ -6,6 +6,7 @@ distinguishable with colour-vision deficiencies.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -178,6 +179,29 @@ def draw_curves(axis: Axes, x: ArrayLike, curves: Mapping[str, ArrayLike]) -> No
     """Draw up to four curves over x that differ in colour, line and marker, each with its name for the legend."""
     for (name, values), colour, line, marker in zip(curves.items(), COLOURS, LINES, MARKERS):
         axis.plot(x, values, line, marker=marker, color=colour, label=name, markersize=5)
+
+
+def show_curves(x: ArrayLike, curves: Mapping[str, ArrayLike], **labels: Any) -> Figure:
+    """Show up to four curves over x; `labels` is what `Axes.set` takes, such as xlabel, ylabel and ylim."""
+    figure, axis = plt.subplots(figsize=(7, 3.5), layout="constrained")
+    draw_curves(axis, x, curves)
+    axis.set(**labels)
+    figure.legend(ncols=len(curves), fontsize=9, loc="outside upper center")
+    return figure
+
+
+def show_maps(
+    images: Sequence[np.ndarray],
+    maps: Mapping[str, Real[np.ndarray, "rows cols"]],
+    columns: int | None = None,
+    size: float = 3.0,
+    **style: Any,
+) -> Figure:
+    """Show each map, by its title, over its image; `style` is what `overlay_map` takes."""
+    figure, axes = show_images(images, list(maps), columns, size)
+    for axis, values in zip(axes, maps.values()):
+        overlay_map(axis, values, **style)
+    return figure
 
 
 def pca_colours(

@@ -179,14 +179,6 @@ def points_on_images(
     return figure
 
 
-def foregrounds(views: Sequence[View], titles: Sequence[str], columns: int | None = None, size: float = 2.9) -> Figure:
-    """Draw the saliency of foreground patches over each crop, dark (0) to bright (1)."""
-    figure, axes = plots.show_images([view.frame.rgb for view in views], titles, columns=columns, size=size)
-    for axis, view in zip(axes, views):
-        plots.overlay_map(axis, np.where(view.foreground, view.features.saliency, np.nan), limits=(0, 1))
-    return figure
-
-
 def errors_against_viewpoint(angles: Sequence[float], errors: Sequence[float], groups: Sequence[str]) -> Figure:
     """Draw rotation errors over the angle between the reference and the chosen view, a marker for each group.
 
@@ -241,15 +233,6 @@ def cloud_overlays(
         axis.scatter(*moved[:, shown].T, s=6, c=BLUE, marker="x", linewidths=0.5)
         axis.set(aspect="equal", xticks=[], yticks=[], xlim=(-3.7, 3.7), ylim=(low, 2.3))
         axis.set_title(plots.plain_text(title), fontsize=9)
-    return figure
-
-
-def accuracy_of_wrong_labels(label_errors: Sequence[float], shares: Mapping[str, Sequence[float]]) -> Figure:
-    """Draw the accuracy that a benchmark measures over the error of its labels."""
-    figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
-    plots.draw_curves(axis, label_errors, shares)
-    axis.set(xlabel="error of the labels (degrees)", ylabel="accuracy that is measured (%)", ylim=(0, None))
-    axis.legend()
     return figure
 
 

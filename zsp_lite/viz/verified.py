@@ -1,8 +1,4 @@
-"""Plots for the verified solver: the point terms of a pose in every view, its score, and the reliability diagram.
-
-`draw_point_classes` and `draw_point_term` draw into axes from `plots.show_images`, one per view of the scene. Functions
-whose names begin with `show_` return whole figures.
-"""
+"""Plots for the verified solver: the point terms of a pose in every view, its score, and the reliability diagram."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
+from scipy.stats import binomtest
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
@@ -43,7 +39,6 @@ _POINT_TERMS = {
 }
 _HATCHES = ("", "///", "...", "xx")
 _COLOURS = (BLUE, ORANGE, "0.6", VERMILLION)
-_NORMAL_95 = 1.96
 _AXIS_LENGTH = 1.2  # of the reference camera, in its units
 
 
@@ -59,59 +54,64 @@ def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     return np.select(conditions, [_OUTSIDE, _UNKNOWN, _SURFACE, _FREE_SPACE], _OCCLUDED)
 
 
-def draw_point_classes(
-    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, pose: int = 0, size: float = 16.0, legend: bool = True,
-    views: Sequence[int] | None = None,
-) -> Int[np.ndarray, "v classes"]:  # fmt: skip
-    """Draw every point over the images of some views (None: all), marked by its class, and return the counts.
+def show_point_classes(
+    images: Sequence[np.ndarray],
+    terms: PointTerms,
+    maps: ViewMaps,
+    views: Sequence[int],
+    names: Sequence[str],
+    poses: Sequence[str],
+    size: float = 3.0,
+) -> Figure:
+    """Show the points of each pose by their classes: one row per pose, one column per view (a single view: one row).
 
-    Points outside an image are drawn at its border.
+    `images` and `names` are those of the `views` of the maps. Points outside an image are drawn at its border.
     """
-    views = range(len(maps)) if views is None else views
-    classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
-    # Violations are drawn last, so that no other point covers them.
-    for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
-        colour, marker = list(POINT_CLASSES.values())[index]
-        for axis, view_classes, view_pixels in zip(axes, classes, pixels):
-            x, y = _clip_to_image(axis, view_pixels[view_classes == index]).T
-            axis.scatter(
-                x, y, s=size * (0.4 if index == _UNKNOWN else 1), c=colour, marker=marker, edgecolors="black",
-                linewidths=0.4, zorder=3,
-            )  # fmt: skip
-    if legend:
-        handles = [
-            plt.Line2D([], [], marker=marker, linestyle="", color=colour, markeredgecolor="black", label=name)
-            for name, (colour, marker) in POINT_CLASSES.items()
-        ]
-        axes[0].figure.legend(
-            handles=handles, loc="outside lower center", ncols=len(POINT_CLASSES), fontsize=9, handletextpad=0.1
-        )
-    return np.stack([np.bincount(view_classes, minlength=len(POINT_CLASSES)) for view_classes in classes])
+    figure, rows = _show_poses(images, names, poses, len(images) if len(images) > 1 else len(poses), size)
+    for pose, axes in enumerate(rows):
+        classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
+        # Violations are drawn last, so that no other point covers them.
+        for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
+            colour, marker = list(POINT_CLASSES.values())[index]
+            style = {"s": 6 if index == _UNKNOWN else 14, "c": colour, "marker": marker, "linewidths": 0.4}
+            for axis, view_classes, view_pixels in zip(axes, classes, pixels):
+                at = _clip_to_image(axis, view_pixels[view_classes == index])
+                axis.scatter(*at.T, edgecolors="black", zorder=3, **style)
+    handles = [
+        plt.Line2D([], [], marker=marker, linestyle="", color=colour, markeredgecolor="black", label=name)
+        for name, (colour, marker) in POINT_CLASSES.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, handletextpad=0.1)
+    return figure
 
 
-def draw_point_term(
-    axes: Sequence[Axes], terms: PointTerms, maps: ViewMaps, name: str, pose: int = 0, size: float = 16.0,
-    views: Sequence[int] | None = None,
-) -> None:  # fmt: skip
-    """Draw one of `_POINT_TERMS` over the images of some views (None: all), with a colour bar.
+def show_point_term(
+    images: Sequence[np.ndarray],
+    terms: PointTerms,
+    maps: ViewMaps,
+    term: str,
+    views: Sequence[int],
+    names: Sequence[str],
+    poses: Sequence[str],
+) -> Figure:
+    """Show one of `_POINT_TERMS` of every point: one row per pose, one column per view (see `show_point_classes`).
 
     Marker areas grow with the term; those of the similarity grow with the surface weight that multiplies it.
     """
-    views = range(len(maps)) if views is None else views
-    label, (low, high) = _POINT_TERMS[name]
-    values = getattr(terms, name)[pose].numpy()[views]
-    weights = terms.surface[pose].numpy()[views] if name == "similarity" else values
-    drawn: PathCollection | None = None
-    for axis, value, weight, pixels in zip(axes, values, weights, _image_pixels(terms, maps, pose)[views]):
-        order = np.argsort(weight, kind="stable")
-        x, y = _clip_to_image(axis, pixels[order]).T
-        drawn = axis.scatter(
-            x, y, s=size * (0.15 + 1.2 * weight[order]), c=value[order], cmap="viridis", vmin=low, vmax=high,
-            edgecolors="black", linewidths=0.3, zorder=3,
-        )  # fmt: skip
-    bar = axes[0].figure.colorbar(drawn, ax=list(axes), location="right", shrink=0.8, pad=0.01)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+    figure, rows = _show_poses(images, names, poses, len(images), 3.0)
+    label, (low, high) = _POINT_TERMS[term]
+    for pose, axes in enumerate(rows):
+        values = getattr(terms, term)[pose].numpy()[views]
+        weights = terms.surface[pose].numpy()[views] if term == "similarity" else values
+        for axis, value, weight, pixels in zip(axes, values, weights, _image_pixels(terms, maps, pose)[views]):
+            order = np.argsort(weight, kind="stable")
+            style = {"s": 16 * (0.15 + 1.2 * weight[order]), "c": value[order], "vmin": low, "vmax": high}
+            at = _clip_to_image(axis, pixels[order])
+            drawn = axis.scatter(*at.T, cmap="viridis", edgecolors="black", linewidths=0.3, zorder=3, **style)
+        bar = figure.colorbar(drawn, ax=axes, location="right", shrink=0.8, pad=0.01)
+        bar.set_label(label, fontsize=8)
+        bar.ax.tick_params(labelsize=8)
+    return figure
 
 
 def score_contributions(terms: Mapping[str, float], weights: ScoreCoefficients) -> dict[str, float]:
@@ -146,8 +146,9 @@ def draw_reliability(axis: Axes, reliability: Reliability) -> None:
     On the dashed diagonal confidences are calibrated; below it they are too high.
     """
     accuracy, count = reliability.accuracy, reliability.count
-    low, high = _wilson_interval(accuracy, count)
-    bars = np.maximum([accuracy - low, high - accuracy], 0)
+    right = np.rint(accuracy * count).astype(int)
+    ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(right.tolist(), count.tolist())]
+    bars = np.maximum([accuracy - [end.low for end in ends], [end.high for end in ends] - accuracy], 0)
     axis.plot([0, 1], [0, 1], color="0.4", linestyle="--", label="calibrated")
     axis.errorbar(
         reliability.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
@@ -200,33 +201,6 @@ def show_proposal_errors(errors: Float[np.ndarray, " m"], sources: Sequence[str]
     axis.set_yticks(range(len(rows)), rows)
     axis.set_ylim(len(rows) - 0.4, -0.6)
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
-    return figure
-
-
-def show_point_classes(
-    images: Sequence[np.ndarray], terms: PointTerms, maps: ViewMaps, views: Sequence[int], names: Sequence[str],
-    poses: Sequence[str], size: float = 3.0,
-) -> Figure:  # fmt: skip
-    """Show the points of each pose by their classes: one row per pose, one column per view (a single view: one row)."""
-    titles = [f"{pose}: {name}" for pose in poses for name in names]
-    columns = len(images) if len(images) > 1 else len(poses)
-    figure, axes = show_images(list(images) * len(poses), titles, columns=columns, size=size)
-    for index in range(len(poses)):
-        row = axes[index * len(images) : (index + 1) * len(images)]
-        draw_point_classes(row, terms, maps, index, size=14, legend=not index, views=views)
-    return figure
-
-
-def show_point_term(
-    images: Sequence[np.ndarray], terms: PointTerms, maps: ViewMaps, term: str, views: Sequence[int],
-    names: Sequence[str], poses: Sequence[str], size: float = 3.0,
-) -> Figure:  # fmt: skip
-    """Show one term of every point: one row per pose, one column per view (arguments as in `show_point_classes`)."""
-    titles = [f"{pose}: {name}" for pose in poses for name in names]
-    figure, axes = show_images(list(images) * len(poses), titles, columns=len(images), size=size)
-    for index in range(len(poses)):
-        row = axes[index * len(images) : (index + 1) * len(images)]
-        draw_point_term(row, terms, maps, term, index, views=views)
     return figure
 
 
@@ -310,13 +284,13 @@ def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarr
     return figure
 
 
-def _wilson_interval(
-    share: Float[np.ndarray, " bins"], count: Int[np.ndarray, " bins"]
-) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
-    square = _NORMAL_95**2 / count
-    centre = (share + square / 2) / (1 + square)
-    half = np.sqrt(share * (1 - share) * square + square**2 / 4) / (1 + square)
-    return centre - half, centre + half
+def _show_poses(
+    images: Sequence[np.ndarray], names: Sequence[str], poses: Sequence[str], columns: int, size: float
+) -> tuple[Figure, list[list[Axes]]]:
+    """Show the images of some views once for each pose; return the axes by pose."""
+    titles = [f"{pose}: {name}" for pose in poses for name in names]
+    figure, axes = show_images(list(images) * len(poses), titles, columns=columns, size=size)
+    return figure, [axes[start : start + len(images)] for start in range(0, len(axes), len(images))]
 
 
 def _image_pixels(terms: PointTerms, maps: ViewMaps, pose: int) -> Float[np.ndarray, "v n 2"]:
