@@ -16,7 +16,6 @@ from zsp_lite.training.distillation import (
     Distillation,
     DistillationConfig,
     Head,
-    cosine,
     distillation_loss,
     multi_crop,
 )
@@ -88,12 +87,6 @@ def test_both_trivial_solutions_have_no_divergence_and_no_information():
     assert figures["information"] == pytest.approx(math.log(4), abs=1e-5)
 
 
-def test_no_gradient_reaches_the_teacher():
-    student, teacher = (torch.randn(n, 3, 5, requires_grad=True) for n in (3, 2))
-    distillation_loss(student, teacher, torch.zeros(5), 0.1, 0.04)[0].backward()
-    assert student.grad.abs().sum() > 0 and teacher.grad is None
-
-
 def test_logits_are_cosines():
     torch.manual_seed(0)
     head = Head(12, 20)
@@ -118,11 +111,6 @@ def test_crops_come_from_their_own_image_and_differ(pictures):
     assert multi_crop(pictures[:3, 0], rng(5), replace(TINY, local_crops=0))[1].shape == (0, 3, 3, 16, 16)
 
 
-def test_schedules_run_from_end_to_end():
-    assert cosine((0.99, 1.0), 0.0) == 0.99 and cosine((0.99, 1.0), 1.0) == 1.0
-    assert cosine((0.0, 2.0), 0.5) == pytest.approx(1.0)
-
-
 def test_centre_and_teacher_are_running_averages(pictures, backbone):
     run = Distillation(TINY, backbone, pictures)
     run.step()  # the first has no learning rate yet
@@ -134,7 +122,8 @@ def test_centre_and_teacher_are_running_averages(pictures, backbone):
         said = before(large)
     run.step()
     torch.testing.assert_close(run.centre, centre.lerp(said.mean((0, 1)), 1 - CENTRE_MOMENTUM))
-    momentum = cosine(TEACHER_MOMENTUM, 1 / 45)
+    start, end = TEACHER_MOMENTUM
+    momentum = end + (start - end) * (1 + math.cos(math.pi / 45)) / 2
     triples = zip(before.parameters(), run.student.parameters(), run.teacher.parameters(), strict=True)
     for slow, fast, after in triples:
         torch.testing.assert_close(after, momentum * slow + (1 - momentum) * fast.detach())

@@ -44,14 +44,12 @@ class TrainingTokens:
         keys: Keys of the patches in one block, heads concatenated.
         key_input: Normalised patch tokens of that block; the keys are a linear function of them.
         cls_logits: Scaled attention logits of the last block from CLS to all tokens, float32.
-        grid: (rows, columns) of the patch grid.
     """
 
     tokens: Float[Tensor, "batch tokens dim"]
     keys: Float[Tensor, "batch n dim"]
     key_input: Float[Tensor, "batch n dim"]
     cls_logits: Float[Tensor, "batch heads tokens"]
-    grid: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -244,8 +242,8 @@ class VisionTransformer(nn.Module):
 
     def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
-        x, grid = self.embed(images)
+        x, _ = self.embed(images)
         activations = list(self.run_blocks(x))
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
-        return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits, grid)
+        return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits)

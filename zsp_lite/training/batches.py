@@ -36,10 +36,9 @@ class Batch:
 def crop_grids(
     rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
 ) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
-    """Draw random, slightly rotated crops; each group of `per_object` crops is mirrored as a whole, or not at all.
+    """Draw slightly rotated crops as grids for `grid_sample`; each group of `per_object` is mirrored as a whole or not.
 
-    Returns:
-        Sampling grids for `grid_sample`, and the matrices that map directions in the image to directions in the crop.
+    The second result maps directions in the image to directions in the crop.
     """
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
@@ -84,16 +83,10 @@ def sample_batch(
     scale: tuple[float, float],
     members: np.ndarray | None = None,
 ) -> Batch:
-    """Draw a batch of random crops.
+    """Draw random crops of `side` pixels, whose widths are between the two of `scale` as a fraction of the image's.
 
-    Args:
-        renders: Objects to draw from.
-        rng: Random generator.
-        objects: Number of objects.
-        views: Views per object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one pair).
-        side: Side of the crops in pixels.
-        scale: Smallest and largest width of a crop as a fraction of the image's.
-        members: Indices of the objects. Default: random.
+    The objects are random or the `members`; of each there are 8 views (all), 4 (two pairs, a quarter turn apart) or 2
+    (one pair).
     """
     index = rng.integers(0, len(renders), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)

@@ -117,11 +117,8 @@ def distillation_loss(
 ) -> tuple[Tensor, dict[str, float]]:
     """Compute the cross-entropy between the teacher's and the student's distributions of different crops (eq. 3).
 
-    Args:
-        student: Logits of all crops; the first two are the global ones.
-        teacher: Logits of the global crops.
-        centre: Average of the teacher's logits, which is subtracted.
-        student_temperature, teacher_temperature: Temperatures of the softmax.
+    The arguments are logits; the first two crops of the student are the global ones. `centre`, the average of the
+    teacher's logits, is subtracted.
 
     Returns:
         The loss, and figures in nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl",
@@ -142,13 +139,7 @@ def distillation_loss(
 
 
 class Distillation:
-    """A run of DINO; the teacher's backbone is its result.
-
-    Args:
-        config: Configuration.
-        backbone: Initial backbone; it is copied.
-        rgb: Images, several views of each of n objects.
-    """
+    """A run of DINO on images of several views of each of n objects; the teacher's backbone is its result."""
 
     def __init__(
         self, config: DistillationConfig, backbone: VisionTransformer, rgb: UInt8[np.ndarray, "n views size size 3"]

@@ -23,17 +23,9 @@ def correspondence_loss(
 ) -> tuple[Tensor, float]:  # fmt: skip
     """Compute InfoNCE between the views of each object, with soft targets by distance on its surface.
 
-    The target of a query patch is a distribution over the patches of the object's other views. It is a Gaussian of the
-    distance between the surface points, and 0 beyond 2.4 standard deviations.
-
-    Args:
-        descriptors: Unit vectors, ordered by object and view.
-        surface: Surface point of each patch in object coordinates, NaN on the background.
-        objects: Number of objects.
-        radius: Standard deviation of the Gaussian, in object units.
-        temperature: Temperature of the softmax over similarities.
-        queries: Largest number of query patches per object.
-        generator: Source of the random queries.
+    The target of a query patch is a distribution over the patches of the object's other views: a Gaussian of the
+    distance between the surface points with standard deviation `radius` (object units), 0 beyond 2.4 of these. At most
+    `queries` random patches of an object are queries. The descriptors are unit vectors, ordered by object and view.
 
     Returns:
         The loss, as the divergence from the targets, so that 0 is its minimum; and the fraction of queries whose
@@ -80,14 +72,11 @@ def geometry_loss(
 def attention_loss(
     cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
 ) -> tuple[Tensor, float]:
-    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask.
+    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask; and an IoU.
 
     The target is uniform on the object and zero elsewhere. The loss is the divergence between the normalised mask and
     the attention over patches, plus a cross-entropy that separates object and background at 0.12 times the mean
-    attention on the object.
-
-    Returns:
-        The loss, and the mean IoU of the mask with the patches of min-max normalised attention above 0.05.
+    attention on the object. The mean IoU is that of the mask with min-max normalised attention above 0.05.
     """
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
@@ -111,14 +100,8 @@ def losses(
 ) -> tuple[Tensor, dict[str, float]]:
     """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one batch.
 
-    Args:
-        model: Network to train; its running mean of the keys is updated.
-        batch: Crops with their geometry.
-        generator: Draws the queries of the correspondence loss.
-        helpers: Weight of the geometry and attention losses.
-
-    Returns:
-        The sum, and the value of each loss with the match accuracy ("accuracy") and the IoU of the saliency ("iou").
+    The figures are the value of each loss, the match accuracy and the IoU of the saliency. The model's running mean of
+    the keys is updated.
     """
     out = model(batch.images)
     on_object = ~batch.surface[..., 0].isnan()

@@ -16,11 +16,8 @@ from zsp_lite.training.renders import VIEWS, RenderSet
 class Trainee(nn.Module):
     """A transformer with two linear heads, which only training uses, and the running mean of its keys.
 
-    The heads predict geometry (see `geometry_loss`) from the output tokens and from the input of the keys' projection.
-
-    Args:
-        backbone: The transformer.
-        layer: Block whose keys are trained, counted from 0.
+    The heads predict geometry (see `geometry_loss`) from the output tokens and from the input of the keys' projection
+    in block `layer` (from 0), whose keys are trained.
     """
 
     def __init__(self, backbone: VisionTransformer, layer: int):
