@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
-from test_importers import METRES, write_lists, write_tum
+from test_importers import METRES, write_lists
 
 from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
@@ -50,7 +50,7 @@ def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
 def test_a_capture_is_imported(root, tmp_path, capsys):
     source = tmp_path / "scan"
     source.mkdir()
-    exact = make_sequence("hairdryer", 0, 4, 3, 64)[1]
+    exact = make_sequence("hairdryer", 0, 8, 3, 64)[1]
     frames = []
     for number, view in enumerate(exact.views):
         camera = replace(view.camera, t=view.camera.t * METRES)
@@ -60,11 +60,11 @@ def test_a_capture_is_imported(root, tmp_path, capsys):
     write_lists(source, frames)
     arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
     assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
-    assert "4 frames" in capsys.readouterr().out
-    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 4
+    assert "8 frames" in capsys.readouterr().out
+    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 8
 
 
-def test_options_of_transfer_and_import_reach_the_library(tmp_path, monkeypatch):
+def test_options_of_transfer_and_import_reach_the_library(monkeypatch, capsys):
     given = []
 
     def transfer(*arguments, replace):
@@ -78,15 +78,15 @@ def test_options_of_transfer_and_import_reach_the_library(tmp_path, monkeypatch)
 
     def import_capture(*arguments):
         given.append(arguments)
-        return ImportResult(1, 0, 1, 1.0)
+        return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
 
-    for layout in ("tum", "lists"):
+    for layout in READERS:
         monkeypatch.setitem(READERS, layout, lambda folder, **options: (folder, options))
     monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
     words = "--root mine --category cup --sequence one --frames 7".split()
-    assert main(["data", "import", "tum", "scan", *words, "--intrinsics", "5,6,7,8", "--box", "1,2,3,4"]) == 0
-    capture = (Path("scan"), {"intrinsics": (5, 6, 7, 8)})
-    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
+    assert given.pop() == ((Path("scan"), {}), Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert "flag: the masks may be wrong: why\n" in capsys.readouterr().out
     assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
     capture = (Path("scan"), {"depth_unit": 0.5})
     assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
@@ -97,18 +97,16 @@ def test_the_help_of_the_import_lists_what_every_format_holds(capsys):
     text = capsys.readouterr().out
     table = text[text.index("which holds:") : text.index("The object is given by")]
     assert re.findall(r"^ {4}(\w+) ", table, re.MULTILINE) == list(READERS)
-    for name in ("groundtruth.txt", "transforms.json", "trajectory.log", "poses.txt", "--intrinsics", "--depth-unit"):
+    for name in ("transforms.json", "poses.txt", "--depth-unit"):
         assert name in table, name
 
 
 def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
     folder = tmp_path / "scan"
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, 30.0), np.array([16.0, 12.0]), (24, 32))
-    write_tum(folder, [Frame(np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32), None, camera)])
-    words = ["data", "import", "tum", str(folder), "--root", str(tmp_path / "mine"), "--category", "cup"]
+    write_lists(folder, [Frame(np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32), None, camera, "0")])
+    words = ["data", "import", "lists", str(folder), "--root", str(tmp_path / "mine"), "--category", "cup"]
     assert main([*words, "--sequence", "one"]) == 2
-    assert "expected --intrinsics FX,FY,CX,CY" in capsys.readouterr().err
-    assert main([*words, "--sequence", "one", "--intrinsics", "30,30,16,12"]) == 2
     error = capsys.readouterr().err
     assert "(--box TOP,LEFT,HEIGHT,WIDTH)" in error and "(--masks DIR)" in error
     assert not (tmp_path / "mine").exists()
@@ -121,9 +119,9 @@ def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
         (["data", "check", "/nowhere"], "does not exist"),
         (["data", "labels", "/nowhere", "--root", "."], "cannot be read"),
         (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
-        (["data", "import", "tum", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
-        (["data", "import", "tum", "/x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit", "1"],
-         "--depth-unit does not go with the format tum"),
+        (["data", "import", "lists", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
+        (["data", "import", "nerfstudio", "x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit=2"],
+         "--depth-unit does not go with the format nerfstudio"),
     ],
 )  # fmt: skip
 def test_bad_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
