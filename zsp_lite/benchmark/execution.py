@@ -40,25 +40,15 @@ _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 @dataclass(frozen=True)
 class Setup:
-    """What all chunks of a run have in common; picklable.
+    """What all chunks of a run have in common; picklable."""
 
-    Attributes:
-        root: The data.
-        methods: The rows by name.
-        backbone: What `load_backbone` takes, or an extractor.
-        fingerprint: Of the backbone that a worker must find under the name; None for any.
-        cache: Folder of feature maps, or None.
-        threads: Threads of torch during feature extraction.
-        keep_hypotheses: See `evaluate_pair`.
-    """
-
-    root: str
+    root: str  # of the data
     methods: Mapping[str, Method]
-    backbone: Any
-    fingerprint: str | None = None
-    cache: str | Path | None = None
-    threads: int | None = None
-    keep_hypotheses: bool = False
+    backbone: Any  # what `load_backbone` takes, or an extractor
+    fingerprint: str | None = None  # of the backbone that a worker must find under the name; None for any
+    cache: str | Path | None = None  # folder of feature maps
+    threads: int | None = None  # of torch during feature extraction
+    keep_hypotheses: bool = False  # see `evaluate_pair`
 
     def extractors(self) -> dict[str, Any]:
         """Make the extractors of the rows. Raises InputError if the backbone's name stands for another one here."""

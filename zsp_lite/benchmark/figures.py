@@ -50,9 +50,8 @@ def accuracy_against_views(results: Results) -> Figure:
     """
     methods, views = results.summary["methods"], results.summary["data"]["targets"]
     lines = {}
-    for label, row, printed in (
-        ("full method", "ours", "full"), ("best view only", "ours-bv", "bv"), ("verified solver", "verified", None),
-    ):  # fmt: skip
+    shown = {"full method": ("ours", "full"), "best view only": ("ours-bv", "best view")}
+    for label, (row, printed) in (shown | {"verified solver": ("verified", None)}).items():
         found = {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in _VIEWS}
         lines[label] = {n: one for n, one in found.items() if one is not None}, printed
     if max(len(found) for found, printed in lines.values() if printed) < 2:
@@ -60,16 +59,16 @@ def accuracy_against_views(results: Results) -> Figure:
     if len(lines["verified solver"][0]) < 2:
         del lines["verified solver"]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
-    for axis, name, title in zip(axes, ("acc30", "acc15"), ("Acc30 (%)", "Acc15 (%)"), strict=True):
+    for axis, name, title in zip(axes, ("acc30", "acc15"), published.ACCURACIES, strict=True):
         for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN, VERMILLION)):
             numbers = list(found)
             low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
             axis.fill_between(numbers, low, high, color=colour, alpha=0.18, lw=0)
-            style = {"full": "o-", "bv": "s-", None: "D--"}[printed]
+            style = {"full": "o-", "best view": "s-", None: "D--"}[printed]
             axis.plot(numbers, [found[n][name] for n in numbers], style, color=colour, label=label)
             if printed is None:
                 continue
-            column = published.TARGETS.columns.index(f"{printed}_{name}")
+            column = published.TARGETS.columns.index(f"{printed}: {title}")
             values = [published.TARGETS.rows[str(n)][column] for n in _VIEWS]
             axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=f"{label}, published on CO3D")
         axis.set(xlabel="target views N", ylabel=title, xticks=_VIEWS, ylim=(0, None))

@@ -43,7 +43,7 @@ _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning"
 _VERIFIED = {"solver": "verified"}
 
 
-def _by_number_of_views(row: str, method: Method, numbers: Sequence[int]) -> dict[str, Method]:
+def _by_number_of_views(row: str, method: Method, *numbers: int) -> dict[str, Method]:
     """Return a row at fixed numbers of target views: ROW-n1, ROW-n3 and so on."""
     return {f"{row}-n{n}": replace(method, targets=n) for n in numbers}
 
@@ -82,13 +82,13 @@ METHODS: dict[str, Method] = {
     "swav": Method("swav", settings=_MUTUAL),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
     # Table 2 and supplement, "Number of target views".
-    **_by_number_of_views("ours", Method(), (1, 3, 5, 10, 20)),
-    **_by_number_of_views("ours-bv", Method(answer="best view"), (1, 3, 5, 10, 20)),
+    **_by_number_of_views("ours", Method(), 1, 3, 5, 10, 20),
+    **_by_number_of_views("ours-bv", Method(answer="best view"), 1, 3, 5, 10, 20),
     # Beyond the paper.
     "verified": Method(settings=_VERIFIED),
     "verified-mask": Method(settings=_VERIFIED | _MASK),
-    **_by_number_of_views("verified", Method(settings=_VERIFIED), (1, 3, 10)),
-    **_by_number_of_views("verified-mask", Method(settings=_VERIFIED | _MASK), (1, 3, 10)),
+    **_by_number_of_views("verified", Method(settings=_VERIFIED), 1, 3, 10),
+    **_by_number_of_views("verified-mask", Method(settings=_VERIFIED | _MASK), 1, 3, 10),
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {

@@ -1,8 +1,7 @@
 """Results published in the paper (Goodwin et al., ECCV 2022), for comparison only.
 
 They were measured on CO3D (20 categories with 100 pairs each) with DINO ViT-S/8. These are other data than those of the
-synthetic benchmark, so the tables show them in separate columns. "med" is the median rotation error in degrees, "acc30"
-and "acc15" are percentages; the columns of single categories in Table 1 are Acc30 in percent.
+synthetic benchmark, so the tables show them in separate columns.
 """
 
 from dataclasses import dataclass
@@ -16,11 +15,12 @@ class PublishedTable:
     rows: dict[str, tuple[float, ...]]
 
 
-_FIGURES = ("med", "acc30", "acc15")
-_CATEGORIES = ("bike", "hydrant", "mcycle", "teddy", "toaster")
+ACCURACIES = ("Acc30 (%)", "Acc15 (%)")
+FIGURES = ("Med. err. (°)", *ACCURACIES)
+CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster")  # of Table 1, with their Acc30
 
 TABLE_1 = PublishedTable(
-    (*_FIGURES, *_CATEGORIES),
+    (*FIGURES, *(f"{category} Acc30" for category in CATEGORIES)),
     {
         "ICP": (111.8, 3.8, 0.7, 3.0, 6.0, 1.0, 1.0, 7.0),
         "SIFT": (129.4, 4.0, 1.5, 3.0, 11.0, 1.0, 1.0, 0.0),
@@ -33,7 +33,7 @@ TABLE_1 = PublishedTable(
 )
 
 TABLE_2 = PublishedTable(
-    _FIGURES,
+    FIGURES,
     {
         "Ours-BV (N=1)": (92.8, 12.6, 3.7),
         "Ours-BV (N=3)": (69.5, 26.1, 8.0),
@@ -45,7 +45,7 @@ TABLE_2 = PublishedTable(
 )
 
 TABLE_3 = PublishedTable(
-    _FIGURES,
+    FIGURES,
     {
         "CyclicalDistIoU": (94.7, 22.3, 13.1),
         "GlobalSim": (71.9, 36.8, 23.7),
@@ -55,7 +55,7 @@ TABLE_3 = PublishedTable(
 )
 
 TARGETS = PublishedTable(
-    ("bv_acc30", "bv_acc15", "full_acc30", "full_acc15"),
+    tuple(f"{method}: {figure}" for method in ("best view", "full") for figure in ACCURACIES),
     {
         "1": (12.6, 3.7, 23.8, 13.4),
         "3": (26.1, 8.0, 38.9, 26.2),
@@ -66,7 +66,7 @@ TARGETS = PublishedTable(
 )
 
 MATCHERS = PublishedTable(
-    _FIGURES,
+    FIGURES,
     {
         "Optimal transport": (54.6, 44.8, 29.1),
         "Dual softmax": (54.0, 44.5, 30.1),
@@ -75,12 +75,12 @@ MATCHERS = PublishedTable(
 )
 
 CORRESPONDENCES = PublishedTable(
-    ("no_kmeans_acc30", "no_kmeans_acc15", "kmeans_acc30", "kmeans_acc15"),
+    tuple(f"{method}: {figure}" for method in ("without k-means", "with k-means") for figure in ACCURACIES),
     {"30": (38.7, 25.2, 43.5, 29.0), "50": (42.0, 28.6, 46.3, 31.1), "70": (43.4, 30.4, 47.1, 30.8)},
 )
 
 DEPTH = PublishedTable(
-    _FIGURES,
+    FIGURES,
     {
         "No depth (essential matrix)": (81.7, 23.6, 6.8),
         "Ours-BV": (61.1, 35.4, 10.6),
@@ -88,4 +88,4 @@ DEPTH = PublishedTable(
     },
 )
 
-TRIALS = PublishedTable(("acc30",), {"500": (45.8,), "1000": (46.3,), "2000": (46.6,)})
+TRIALS = PublishedTable(("Acc30 (%)",), {"500": (45.8,), "1000": (46.3,), "2000": (46.6,)})

@@ -19,6 +19,7 @@ from zsp_lite.views import IMAGE_SIZE, View, crop_size, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
+_POINTS = ("patch_points", "measured_points")  # cached properties of a View
 
 
 @dataclass
@@ -52,7 +53,6 @@ class FrameStore:
     timings: dict[str, list[float]] = field(default_factory=dict)
     _entries: dict[FrameKey, _Entry] = field(default_factory=dict)
     _similarities: dict[tuple, Float[torch.Tensor, "n1 n2"]] = field(default_factory=dict)
-    _first_cameras: dict[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self):
         backbone = self.extractors.get("backbone")  # rows such as "icp" and "sift" need none
@@ -68,9 +68,7 @@ class FrameStore:
 
     def first_camera(self, sequence: str) -> Camera:
         """Return the camera of a sequence's first frame."""
-        if sequence not in self._first_cameras:
-            self._first_cameras[sequence] = self.dataset.camera(self.dataset.frames(self.category, sequence)[0])
-        return self._first_cameras[sequence]
+        return self.dataset.camera(self.dataset.frames(self.category, sequence)[0])
 
     def describe(self, features: str, key: FrameKey) -> Any:
         """Return what an extractor computes from a frame's crop."""
@@ -93,10 +91,7 @@ class FrameStore:
         # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
         for other in views.values():
             if other.features.grid == view.features.grid:
-                points = {
-                    part: vars(other)[part] for part in ("patch_points", "measured_points") if part in vars(other)
-                }
-                vars(view).update(points)
+                vars(view).update({part: vars(other)[part] for part in _POINTS if part in vars(other)})
         return view
 
     def similarity(

@@ -24,12 +24,8 @@ TABLE_1_NOTE = (
     "ICP, ICP+BV, SIFT and SWaV use the true object mask, the other rows do not. SWaV and PoseContrast need their "
     "published checkpoints. The paper trained PoseContrast on ObjectNet3D, without its evaluation categories."
 )
-_TITLES = {"med": "Med. err. (°)", "acc30": "Acc30 (%)", "acc15": "Acc15 (%)"}
-_FIGURES = tuple(_TITLES)
-# Categories of Table 1 by the names of its columns.
-_FEATURED = {
-    "bike": "bicycle", "hydrant": "hydrant", "mcycle": "motorcycle", "teddy": "teddybear", "toaster": "toaster",
-}  # fmt: skip
+_FIGURES = ("med", "acc30", "acc15")
+_TITLES = dict(zip(_FIGURES, published.FIGURES))
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,7 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
             return
         shown.update(used)
         columns = [(group, _TITLES.get(figure, f"{figure} Acc30")) for group in blocks for figure in figures]
-        columns += [(PUBLISHED, _printed_title(column)) for column in (printed.columns if printed else ())]
+        columns += [(PUBLISHED, title) for title in (printed.columns if printed else ())]
         rows = {}
         for label in dict.fromkeys(label for block in blocks.values() for label in block):
             found = [methods.get(block.get(label)) for block in blocks.values()]
@@ -126,7 +122,7 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
 
     table_1 = {"ICP": "icp", "SIFT": "sift", "SWaV": "swav", "ICP+BV": "icp-bv", "PoseContrast": "posecontrast"}
     table_1 |= {"Ours (K=30)": "ours-k30", "Ours (K=50)": "ours"}
-    featured = [name for name in _FEATURED.values() if name in summary["data"]["categories"]]
+    featured = [name for name in published.CATEGORIES if name in summary["data"]["categories"]]
     add("table_1", f"Table 1. Baselines and our method, N = {views}", {THIS_RUN: table_1}, (*_FIGURES, *featured),
         published.TABLE_1, note=f"{NOTE} {TABLE_1_NOTE}")  # fmt: skip
     table_2 = {f"{label} (N={n})": at(row, n) for label, row in (("Ours-BV", "ours-bv"), ("Ours", "ours"))
@@ -248,13 +244,3 @@ def _cell(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
     if figure == "med":
         name = "mean_category_median" if "mean_category_median" in row else "median"
     return Cell(row[name], *row.get(f"{name}_ci", ()))
-
-
-def _printed_title(column: str) -> str:
-    if column in _FEATURED:
-        return f"{_FEATURED[column]} Acc30"
-    for prefix, title in (("no_kmeans_", "without k-means: "), ("kmeans_", "with k-means: "), ("bv_", "best view: "),
-                          ("full_", "full: ")):  # fmt: skip
-        if column.startswith(prefix):
-            return title + _TITLES[column.removeprefix(prefix)]
-    return _TITLES[column]
