@@ -9,8 +9,9 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.synthetic.photography import CheapCamera
 from zsp_lite.synthetic.primitives import Mesh, box
-from zsp_lite.synthetic.render import framed_camera, orbit_pose
 from zsp_lite.synthetic.room import Room
+from zsp_lite.synthetic.sequences import orbit_pose
+from zsp_lite.training.renders import framed_camera
 
 # Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
 _QUAD = """mtllib {stem}.mtl

@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.open3d import load_open3d
 from zsp_lite.synthetic.lighting import FLOOR_REACH, RoomLight
 from zsp_lite.synthetic.meshes import Material, TexturedMesh
-from zsp_lite.synthetic.render import Rendering
 from zsp_lite.synthetic.sampling import dot, pyramid, sample_image, sample_pyramid, spread_directions, unit
 from zsp_lite.synthetic.textures import srgb_to_linear
 
@@ -27,6 +26,18 @@ _BLOCKED = 0.25  # light from parts of the object that block the room, relative 
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
 
 
+@dataclass(frozen=True)
+class Rendering:
+    """One rendered view with its exact geometry."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]  # z in the camera frame, 0 where the ray hits neither the object nor the floor
+    mask: Bool[np.ndarray, "h w"]  # pixels of the object
+    canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
+    normals: Float[np.ndarray, "h w 3"]  # unit normals of the object pixels in the camera frame, 0 elsewhere
+    camera: Camera
+
+
 class _Hits(NamedTuple):
     """Surface points of rays: indices of the rays that hit, distances in ray parameters, faces and corner weights."""
 
@@ -34,20 +45,6 @@ class _Hits(NamedTuple):
     distance: np.ndarray
     face: np.ndarray
     weights: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class _FloorShadow:
-    """Visible shares of the key light and of the room on a square grid, whose centre is below the object."""
-
-    light: Float[np.ndarray, "n n 2"]
-    half: float  # half the width of the grid, in units
-
-    def at(self, point: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the visible shares (n,) of the key light and of the room at floor points."""
-        u, v = (point / (2 * self.half) + 0.5).T
-        sample = sample_image(self.light, u, v, cv2.BORDER_CONSTANT)
-        return sample[:, 0], sample[:, 1]
 
 
 class MeshScene:
@@ -85,7 +82,7 @@ class MeshScene:
         area = np.linalg.norm(np.cross(one, two), axis=1)
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
         self._texture_scale = np.sqrt(uv_area / np.maximum(area, 1e-12))  # lengths of the texture per unit, by face
-        self.shadow = self._shadow_on_the_floor()
+        self._shadow, self._shadow_width = self._shadow_on_the_floor()
         self._gain: float | None = None
 
     def render(self, camera: Camera) -> Rendering:
@@ -96,16 +93,14 @@ class MeshScene:
         area = np.s_[top:bottom, left:right]
         hits = self._cast_from(camera, centres[area])
         exact = self._exact(camera, (top, left), centres[area], hits, depth)
-        if bottom > top and right > left:
-            samples = centres[area]
-            if self._samples > 1:
-                samples = _pixel_rays(camera, box, self._samples)
-                hits = self._cast_from(camera, samples)
-            colour, opacity = self._shade(camera, samples, hits)
-            size = (right - left, bottom - top)
-            colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
-            opacity = cv2.resize(opacity, size, interpolation=cv2.INTER_AREA)
-            radiance[area] = colour + (1 - opacity[..., None]) * radiance[area]
+        samples = centres[area]
+        if self._samples > 1:
+            samples = _pixel_rays(camera, box, self._samples)
+            hits = self._cast_from(camera, samples)
+        shaded = cv2.resize(
+            self._shade(camera, samples, hits), (right - left, bottom - top), interpolation=cv2.INTER_AREA
+        )
+        radiance[area] = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance[area]
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
@@ -191,8 +186,8 @@ class MeshScene:
 
     # Shading
 
-    def _shade(self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits) -> tuple[np.ndarray, np.ndarray]:
-        """Return the radiance (h, w, 3) of the object along rays, weighted by its opacity (h, w)."""
+    def _shade(self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits) -> Float[np.ndarray, "h w 4"]:
+        """Return the radiance of the object along rays, multiplied by its opacity, and the opacity."""
         size = rays.shape[:2]
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)  # width of a sample, in units
@@ -230,9 +225,9 @@ class MeshScene:
         mirrored = self.lighting.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
         colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
 
-        picture, covered = np.zeros((np.prod(size), 3), np.float32), np.zeros(np.prod(size), np.float32)
-        picture[hits.ray], covered[hits.ray] = opacity[:, None] * colour, opacity
-        return picture.reshape(*size, 3), covered.reshape(size)
+        shaded = np.zeros((*size, 4), np.float32)
+        shaded.reshape(-1, 4)[hits.ray] = opacity[:, None] * np.column_stack([colour, np.ones(len(colour))])
+        return shaded
 
     def _albedo(self, hits: _Hits, footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return the linear colours of surface points; `footprint` is the width of a sample, in units."""
@@ -259,22 +254,24 @@ class MeshScene:
 
     # Background
 
-    def _shadow_on_the_floor(self) -> _FloorShadow:
-        extent = np.ptp(self.mesh.vertices, axis=0)
-        light = self.room.light
+    def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
+        """Return the visible shares of the key light and of the room on a grid below the object, and the grid's width."""
+        extent, light = np.ptp(self.mesh.vertices, axis=0), self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
-        half = float(extent[:2].max() / 2 + min(length, 5.0))
-        n = _SHADOW_CELLS
-        x, y = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) * (2 * half / n) - half] * 2)
+        n, width = _SHADOW_CELLS, float(extent[:2].max()) + 2 * min(length, 5.0)
+        line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
+        x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
-        up = np.float32([0, 0, 1])
-        towards_room = unit(up + 0.99 * spread_directions(self._rng, len(point), _RAYS))
-        key, around = (
-            self._visible_share(point, towards).reshape(n, n)
-            for towards in (self._towards_light(len(point), _RAYS), towards_room)
-        )
-        light = np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)])
-        return _FloorShadow(light, half)
+        towards_light = self._towards_light(len(point), _RAYS)
+        towards_room = unit(np.float32([0, 0, 1]) + 0.99 * spread_directions(self._rng, len(point), _RAYS))
+        key = self._visible_share(point, towards_light).reshape(n, n)
+        around = self._visible_share(point, towards_room).reshape(n, n)
+        return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
+
+    def shadow(self, point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 n"]:
+        """Return the visible shares of the key light and of the room at floor points, relative to the room's origin."""
+        u, v = (point / self._shadow_width + 0.5).T
+        return sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT).T
 
     def _background(
         self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
@@ -283,7 +280,7 @@ class MeshScene:
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
         radiance, reach = self.lighting.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
-        shares = self.shadow.at((eye + reach[floor, None] * flat_rays[floor])[:, :2])
+        shares = self.shadow((eye + reach[floor, None] * flat_rays[floor])[:, :2])
         radiance[floor] *= self.lighting.on_the_floor(*shares)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
-from zsp_lite.synthetic.render import Rendering
+from zsp_lite.synthetic.raytracing import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
 from zsp_lite.synthetic.textures import smooth_noise
 

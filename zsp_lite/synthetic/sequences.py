@@ -10,8 +10,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
-from zsp_lite.synthetic.raytracing import MeshScene
-from zsp_lite.synthetic.render import Rendering, orbit_pose
+from zsp_lite.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.synthetic.room import random_room
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
@@ -32,11 +31,19 @@ class RenderedSequence:
         return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
 
 
-def image_shape(image_size: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Draw (height, width) of a square, portrait or landscape picture whose shorter side has `image_size` pixels."""
-    tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
-    unit = image_size / min(tall, wide)
-    return round(tall * unit), round(wide * unit)
+def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a camera on a sphere around `target` (3,) that looks at its centre; angles in radians.
+
+    The azimuth is the angle about z, 0 in front of the object at +x; the elevation is the angle above the horizontal
+    plane, the roll the rotation about the optical axis. Returns world-to-camera rotation (3, 3) and translation (3,).
+    """
+    away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    forward = -away
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    c, s = np.cos(roll), np.sin(roll)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.stack([right, np.cross(forward, right), forward])
+    return R, -R @ (np.asarray(target, float) + away * distance)
 
 
 def handheld_sweep(
@@ -79,7 +86,9 @@ def render_sequence(mesh: TexturedMesh, rng: np.random.Generator, frames: int, i
 
     The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
     """
-    cameras = handheld_sweep(mesh.vertices, rng, frames, image_shape(image_size, rng))
+    tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
+    size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
+    cameras = handheld_sweep(mesh.vertices, rng, frames, size)
     scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)

@@ -15,8 +15,7 @@ from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.raytracing import MeshScene
-from zsp_lite.synthetic.render import Rendering
+from zsp_lite.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.synthetic.room import random_room
 from zsp_lite.training.random_object import build_random_object
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.synthetic.render import framed_camera, orbit_pose
+from zsp_lite.data.cameras import Camera
+from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training.instances import make_instance, render_instance
 
 VIEWS = 8  # per object
@@ -69,3 +70,19 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         maps = image.canonical[every], np.dstack([image.normals[every], relative])
         views.append((image.rgb, *(one.astype(np.float16) for one in maps)))
     return tuple(map(np.stack, zip(*views, strict=True)))
+
+
+def framed_camera(vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarray, size: int, margin: float = 1.1,
+                  shift: Float[np.ndarray, "2"] | None = None) -> Camera:  # fmt: skip
+    """Return a camera at pose R, t with a square image of `size` pixels that contains all vertices.
+
+    The bounding square of the object is enlarged by the factor `margin` and shifted by `shift`, a fraction of its
+    width.
+    """
+    in_camera = vertices @ R.T + t
+    plane = in_camera[:, :2] / in_camera[:, 2:]
+    low, high = plane.min(0), plane.max(0)
+    width = (high - low).max() * margin
+    centre = (low + high) / 2 + (0 if shift is None else np.asarray(shift) * width)
+    focal_length = size / width
+    return Camera(R, t, np.full(2, focal_length), size / 2 - centre * focal_length, (size, size))
