@@ -21,7 +21,7 @@ from safetensors.numpy import save
 from zsp_lite.backbones.checkpoints import read_checkpoint
 from zsp_lite.benchmark.results import read_results
 from zsp_lite.benchmark.summary import summarise_rows
-from zsp_lite.data.annotations import SEQUENCES_FILE, SequenceAnnotation, decode, decompress, read_frame_index
+from zsp_lite.data.annotations import SEQUENCES_FILE, read_frame_index, read_sequences
 from zsp_lite.data.frames import read_depth, read_image
 from zsp_lite.data.labels import parse_label
 from zsp_lite.errors import InputError
@@ -77,11 +77,10 @@ def _capture(layout: str, name: str, others: dict[str, bytes]):
     cv2.imwrite(str(root / "depth/0.png"), np.full((24, 32), 1000, np.uint16))
     for other, content in others.items():
         (root / other).write_bytes(content)
-    options = {"intrinsics": (30.0, 30.0, 16.0, 12.0)} if layout == "tum" else {}
 
     def run(data: bytes):
         (root / name).write_bytes(data)
-        for frame in READERS[layout](root, **options)[:3]:
+        for frame in READERS[layout](root)[:3]:
             frame.load()
 
     return run
@@ -127,12 +126,12 @@ def _text(content: object) -> bytes:
 TARGETS: dict[str, Target] = {
     "frame annotations": Target(_file("frames.jgz", _frames, _gzip), _text([_FRAME]), True),
     "sequence annotations": Target(
-        _file(SEQUENCES_FILE, lambda path: decode(decompress(path), list[SequenceAnnotation], path), _gzip),
+        _file(SEQUENCES_FILE, read_sequences, _gzip),
         _text([_SEQUENCE]), True,
     ),
     "gzip": Target(_file("annotations.jgz", _frames), _gzip(_text([_FRAME]))),
     "label": Target(
-        lambda data: parse_label(data, "label"), _text({"trans": _EYE, "seq": "b", "reference_seq": "a"}), True
+        lambda data: parse_label(data, Path("b.json")), _text({"trans": _EYE, "seq": "b", "reference_seq": "a"}), True
     ),
     "point cloud": Target(_file("ascii.ply", read_ply), (_PLY.format("ascii") + "0 0 0\n1 0 0\n0 1 0\n").encode()),
     "binary point cloud": Target(
@@ -148,9 +147,11 @@ TARGETS: dict[str, Target] = {
         True,
     ),
     "checkpoint": Target(_file("whole.safetensors", read_checkpoint), _TENSORS),
-    "tum": Target(
-        _capture("tum", "groundtruth.txt", {"rgb.txt": b"0.0 rgb/0.png\n", "depth.txt": b"0.0 depth/0.png\n"}),
-        b"# time tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n",
+    "lists": Target(
+        _capture("lists", "poses.txt", {
+            "rgb.txt": b"rgb/0.png\n", "depth.txt": b"depth/0.png\n", "intrinsics.txt": b"30 0 16\n0 30 12\n0 0 1\n",
+        }),
+        b"# camera to world\n1 0 0 0 0 1 0 0 0 0 1 0\n",
     ),
     "nerfstudio": Target(_capture("nerfstudio", "transforms.json", {}), _text(_NERF), True),
     "results": Target(_file("r.json.gz", read_results, _gzip), _text(_RESULTS), True),

@@ -22,7 +22,7 @@ from zsp_lite.benchmark.figures import (
 )
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, insert_tables, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
-from zsp_lite.benchmark.records import open_run
+from zsp_lite.benchmark.records import add_lines, open_run
 from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
 from zsp_lite.benchmark.statistics import bootstrap_ci, object_draws, paired_test
@@ -67,16 +67,17 @@ def made_up_run(out, rows=ROWS, seed=0, objects=PAIRS):
         "data": "made up", "seed": seed, "targets": 5, "methods": dict.fromkeys(rows, "x"), "backbone": "none",
         "library": {"version": "0"},
     }  # fmt: skip
-    with open_run(out, settings) as folder:
-        folder.add([{"call": {"command": ["zsp-lite", "benchmark"], "rows": rows, "categories": list(CATEGORIES)}}])
-        folder.add(
+    call = {"command": ["zsp-lite", "benchmark"], "rows": rows, "categories": list(CATEGORIES)}
+    with open_run(out, settings):
+        add_lines(out, [{"call": call}])
+        add_lines(out, (
             {
                 "pair": pair.key, "seconds": 1.0, "timings": {}, "saliency_iou": {},
                 "results": {name: {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "",
                                    "inliers": 9}},
             }
             for name in rows for pair in pairs[name]
-        )  # fmt: skip
+        ))  # fmt: skip
     return read_results(out).summary
 
 
@@ -398,13 +399,13 @@ def made_up_answers(out):
         "data": "made up", "seed": 0, "targets": 1, "methods": {"ours": "x", "verified": "x"}, "backbone": "none",
         "library": {"version": "0"},
     }  # fmt: skip
-    with open_run(out, settings) as folder:
-        folder.add([{"call": {"command": [], "rows": ["ours", "verified"], "categories": ["chair"]}}])
-        folder.add(
+    with open_run(out, settings):
+        add_lines(out, [{"call": {"command": [], "rows": ["ours", "verified"], "categories": ["chair"]}}])
+        add_lines(out, (
             {"pair": Pair("chair", f"a{i}", 0, f"b{i}", (0,)).key, "seconds": 1.0, "timings": {}, "saliency_iou": {},
              "results": {"ours": {"error": 40.0}, "verified": one}}
             for i, one in enumerate(answers)
-        )  # fmt: skip
+        ))  # fmt: skip
     return read_results(out)
 
 

@@ -150,7 +150,7 @@ def test_points_come_in_batches_of_any_shape(points):
         ({"R": np.full((3, 3), np.nan)}, "R holds nan"),
         ({"t": [0, 0, np.inf]}, "t holds inf"),
         ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
-        ({"focal_length": [500, 0]}, "expected at least 0.001 pixels"),
+        ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
         ({"principal_point": [np.nan, 0]}, "principal_point holds nan"),
         ({"size": (0, 5)}, "expected .height, width., integers from 1"),
         ({"size": (np.inf, 5)}, "image size is .*inf"),
@@ -159,17 +159,6 @@ def test_points_come_in_batches_of_any_shape(points):
 def test_invalid_cameras_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         view(**changes)
-
-
-def test_an_unknown_intrinsics_format_is_refused():
-    with pytest.raises(InputError, match="'pixels'"):
-        view().to_pytorch3d("pixels")
-
-
-def test_the_repr_has_five_lines_with_the_intrinsics_and_the_pose():
-    camera = Camera(np.eye(3), np.array([0.0, 0, 2]), np.full(2, 500.0), np.array([320.0, 240]), SIZE)
-    lines = repr(camera).splitlines()
-    assert len(lines) == 5 and "size=(480, 640), focal_length=[500. 500.]" in lines[0] and "t=[0. 0. 2.]" in lines[1]
 
 
 @pytest.mark.parametrize("roll", [0, 1])

@@ -9,7 +9,7 @@ from zsp_lite.cli.main import main
 from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import sample_pairs, upstream_pairs_path, write_upstream_pairs
+from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError
 
 
@@ -27,7 +27,7 @@ def frame_file(root, part, sequence="a"):
 
 def test_a_complete_folder_has_no_problems(root):
     dataset = Co3D(root)
-    write_upstream_pairs(upstream_pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
+    write_published_pairs(pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
     (check,) = check_folder(root, deep=True)
     assert not check.problems
     assert (check.category, check.layout, check.sequences, check.frames) == ("chair", "v1", 2, 8)
@@ -80,7 +80,7 @@ def test_labels_of_unknown_sequences_and_of_two_references_are_named(root):
     (check,) = check_folder(root)
     assert check.labelled == 3 and check.usable == 2
     assert any("z.json is of a sequence that is not in the annotations" in line for line in check.problems)
-    assert any("references a, q, expected one" in line for line in check.problems)
+    assert any("reference sequences a, q, expected one" in line for line in check.problems)
 
 
 def test_a_folder_without_categories_is_refused(tmp_path):

@@ -1,12 +1,8 @@
 """Import of published labels and pairs, and transfer of labels between data sets."""
 
-import functools
-import hashlib
-import http.server
 import json
 import shutil
 import tarfile
-import threading
 import zipfile
 from dataclasses import replace
 
@@ -17,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.label_import import align_worlds, import_labels, transfer_labels
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.data.pairs import sample_pairs, shipped_pairs, write_upstream_pairs
+from zsp_lite.data.pairs import sample_pairs, shipped_pairs, write_published_pairs
+from zsp_lite.data.published import import_labels
+from zsp_lite.data.transfer import align_worlds, transfer_labels
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 
@@ -40,7 +37,7 @@ def clone(tmp_path, root):
     shutil.copytree(folder / "data" / "class_labels", root / "class_labels")
     dataset = Co3D(root)
     path = folder / "data" / "determ_eval" / "200samples_2tgt" / "chair.pt"
-    write_upstream_pairs(path, sample_pairs(dataset, "chair", 3, 2), dataset)
+    write_published_pairs(path, sample_pairs(dataset, "chair", 3, 2), dataset)
     shutil.rmtree(root / "class_labels")
     (folder / "README.md").write_text("code")
     return folder
@@ -59,7 +56,7 @@ def packed(clone, kind):
     else:
         with tarfile.open(path, "w:gz") as archive:
             archive.add(clone, "code-main")
-    return path, hashlib.sha256(path.read_bytes()).hexdigest()
+    return path
 
 
 def check_arrived(root):
@@ -88,43 +85,15 @@ def test_an_import_replaces_other_labels_only_on_request(clone, root):
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar.gz"])
-def test_labels_and_pairs_come_from_an_archive_with_its_checksum(clone, root, kind):
-    path, digest = packed(clone, kind)
-    with pytest.raises(InputError, match=f"has SHA-256 {digest}, expected 00"):
-        import_labels(path, root, "00" * 32)
-    assert not (root / "class_labels").exists()
-    import_labels(path, root, digest.upper())
-    check_arrived(root)
-
-
-def test_labels_and_pairs_come_from_a_url_with_its_checksum(clone, root, monkeypatch, tmp_path):
-    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
-    path, digest = packed(clone, "zip")
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *args):
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=path.parent))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    url = f"http://127.0.0.1:{server.server_port}/{path.name}"
-    try:
-        with pytest.raises(InputError, match="needs its SHA-256"):
-            import_labels(url, root)
-        with pytest.raises(InputError, match="expected 00"):
-            import_labels(url, root, "00" * 32)
-        assert not list((tmp_path / "cache").iterdir()), "a wrong file is not kept"
-        import_labels(url, root, digest)
-    finally:
-        server.shutdown()
-        server.server_close()
+def test_labels_and_pairs_come_from_an_archive(clone, root, kind):
+    import_labels(packed(clone, kind), root)
     check_arrived(root)
 
 
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("data/class_labels/chair/b.json", b"{", "not valid JSON"),
+        ("data/class_labels/chair/b.json", b"{", "Input data was truncated"),
         ("data/class_labels/chair/b.json", json.dumps({"trans": np.diag([2.0, 2, 2, 1]).tolist(), "seq": "b",
                                                        "reference_seq": "a"}).encode(), "expected a rigid transform"),
         ("data/class_labels/chair/c.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "b",
@@ -159,9 +128,9 @@ def locked(data):
     ids=["password", "unknown compression"],
 )
 def test_an_archive_that_cannot_be_unpacked_is_an_input_error(clone, root, damage):
-    path, _ = packed(clone, "zip")
+    path = packed(clone, "zip")
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(InputError, match="is damaged, encrypted or of another format"):
+    with pytest.raises(InputError, match="is damaged or encrypted"):
         import_labels(path, root)
     assert not (root / "class_labels").exists()
 
@@ -169,12 +138,12 @@ def test_an_archive_that_cannot_be_unpacked_is_an_input_error(clone, root, damag
 def test_a_category_cannot_get_labels_of_two_reference_sequences(clone, root, tmp_path):
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
     before = everything(root)
-    with pytest.raises(InputError, match="would have reference sequences a, z, expected one; nothing was written"):
+    with pytest.raises(InputError, match="have reference sequences a, z, expected one"):
         import_labels(clone, root)
     assert everything(root) == before
     two_layouts(tmp_path)
     write_label(tmp_path / "v2", "chair", PoseLabel(np.eye(4), "z", "z"))
-    with pytest.raises(InputError, match="would have reference sequences a, z"):
+    with pytest.raises(InputError, match="have reference sequences a, z"):
         transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert list(read_labels(tmp_path / "v2", "chair")) == ["z"]
 
@@ -191,7 +160,7 @@ def test_sources_without_labels_are_refused(root, tmp_path):
     for source, message in (
         (tmp_path / "empty", "holds no class_labels"),
         (tmp_path / "none.zip", "cannot be read"),
-        (tmp_path / "text.zip", "of 4 bytes is damaged, encrypted or of another format, expected .zip or .tar.gz"),
+        (tmp_path / "text.zip", "is damaged or encrypted, expected .zip or .tar.gz"),
     ):
         with pytest.raises(InputError, match=message):
             import_labels(source, root)
@@ -245,21 +214,19 @@ def test_labels_are_transferred_between_worlds(tmp_path):
 def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
     two_layouts(tmp_path, noise=0.5)
     old, new = Co3D(tmp_path / "v1"), Co3D(tmp_path / "v2")
-    residual = align_worlds(old, new, "chair", "a")[1]
-    assert 0.02 < residual < 0.5
-    with pytest.raises(InputError, match="camera centres differ by .* nothing was written"):
-        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=0.01)
+    assert 0.05 < align_worlds(old, new, "chair", "a")[1] < 0.5
+    with pytest.raises(InputError, match="chair/a: camera centres differ by .*, expected at most 0.05"):
+        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert read_labels(tmp_path / "v2", "chair") == {}
-    assert transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", max_residual=1.0)["a"] == residual
 
 
 def test_missing_labels_and_sequences_are_input_errors(tmp_path):
     two_layouts(tmp_path)
     with pytest.raises(InputError, match="has no labels of category stool"):
         transfer_labels(tmp_path / "v1", tmp_path / "v2", "stool")
-    write_co3d(tmp_path / "v2b", "chair", [sequence_data("a")])
+    write_co3d(tmp_path / "v2b", "chair", [sequence_data("a", frames=6)])
     with pytest.raises(InputError, match="no frames of a sequence 'b'"):
-        transfer_labels(tmp_path / "v1", tmp_path / "v2b", "chair", max_residual=10)
+        transfer_labels(tmp_path / "v1", tmp_path / "v2b", "chair")
 
 
 def test_a_transfer_replaces_other_labels_only_on_request(tmp_path):

@@ -118,14 +118,3 @@ def test_patches_need_not_divide_the_image():
     points, known = patch_points(depth, frontal((5, 7)), (2, 3))
     assert points.shape == (2, 3, 3) and known.all()
     assert points[1, 2, 2] == np.sort(depth[2:, 4:].ravel())[2]
-
-
-def test_inconsistent_sizes_are_refused():
-    with pytest.raises(InputError, match="expected the camera's image size"):
-        unproject_depth(np.ones((4, 5)), frontal((5, 4)))
-    with pytest.raises(InputError, match="patch grid"):
-        patch_points(np.ones((4, 4)), frontal((4, 4)), (5, 2))
-    with pytest.raises(InputError, match="no known pixel"):
-        patch_points(np.zeros((4, 4)), frontal((4, 4)), (2, 2))
-    with pytest.raises(InputError, match="no known pixel"):
-        patch_points(np.zeros((4, 4)), frontal((4, 4)), (2, 2), inpaint=False)

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from co3d_folders import random_camera, sequence_data
+from co3d_folders import sequence_data
 from safetensors.torch import save
 
 from zsp_lite.backbones.checkpoints import read_checkpoint
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.frames import Frame, read_depth, read_image, read_mask, resize_frame
+from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import parse_label
 from zsp_lite.data.pairs import parse_published_pairs, read_published_pairs
 from zsp_lite.data.published import import_labels
@@ -88,14 +88,14 @@ BAD_FILES = [
           "JPEG without a frame": b"\xff\xd8\xff\xd9", "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
           "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
       }.items()),
-    ("x.png", read_image, "huge", _huge_png(), "30000 x 30000 pixels, expected at most 67108864"),
+    ("x.png", read_image, "huge", _huge_png(), "expected at most 67108864 pixels, not 30000 x 30000"),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
-    ("frame_annotations.jgz", read_frame_index, "empty", b"", "annotations .* are not"),
-    ("frame_annotations.jgz", read_frame_index, "no gzip", b"text", "are not complete gzip data"),
-    ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "are not complete gzip data"),
+    ("frame_annotations.jgz", read_frame_index, "empty", b"", "Input data was truncated"),
+    ("frame_annotations.jgz", read_frame_index, "no gzip", b"text", "not complete gzip data"),
+    ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "not complete gzip data"),
     ("frame_annotations.jgz", read_frame_index, "bytes behind", gzip.compress(b"[]") + b"x", "not complete gzip data"),
-    ("frame_annotations.jgz", read_frame_index, "bomb", gzip.compress(bytes(growth_limit(0) + 1), 1), "grow from"),
-    ("frame_annotations.jgz", read_frame_index, "no JSON", gzip.compress(b"[{]"), "are not valid JSON"),
+    ("frame_annotations.jgz", read_frame_index, "bomb", gzip.compress(bytes(growth_limit(0) + 1), 1), "grow to more than"),
+    ("frame_annotations.jgz", read_frame_index, "no JSON", gzip.compress(b"[{]"), "JSON is malformed"),
     ("frame_annotations.jgz", read_frame_index, "nested", gzip.compress(b"[" * 100_000), "annotations"),
     ("frame_annotations.jgz", read_frame_index, "not UTF-8", gzip.compress(b'["\xff"]'), "annotations"),
     ("frame_annotations.jgz", read_frame_index, "another structure", gzip.compress(b"[1, 2]"), "Expected `object`"),
@@ -122,10 +122,10 @@ BAD_FILES = [
     ("x.safetensors", read_checkpoint, "cut", save({"a": torch.zeros(9)})[:-1], "damaged, or contains"),
     ("x.safetensors", read_checkpoint, "giant header", struct.pack("<Q", 2**63) + b"{}", "damaged, or contains"),
     ("cup.pt", _pairs, "code", _torch([Code()]), "damaged, or contains more than tensors"),
-    ("cup.pt", _pairs, "a dictionary", _torch({}), "hold a dict, expected a list of dicts"),
-    ("cup.pt", _pairs, "another structure", _torch([{}]), "pair 0: missing class"),
-    ("x.zip", _archive, "text", b"text", "is damaged, encrypted or of another format"),
-    ("x.tar.gz", _archive, "cut", gzip.compress(bytes(9999))[:-9], "are not complete gzip data|is damaged"),
+    ("cup.pt", _pairs, "a dictionary", _torch({}), "Expected `array`, got `object`"),
+    ("cup.pt", _pairs, "another structure", _torch([{}]), "missing required field `class` - at"),
+    ("x.zip", _archive, "text", b"text", "is damaged or encrypted"),
+    ("x.tar.gz", _archive, "cut", gzip.compress(bytes(9999))[:-9], "not complete gzip data"),
     ("transforms.json", _capture, "no frames", b"{}", "missing required field `frames`"),
     ("transforms.json", _capture, "nested", b"[" * 100_000, "transforms.json"),
 ]  # fmt: skip
@@ -177,7 +177,7 @@ def test_names_that_are_no_plain_names_are_refused(name):
 def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, read):
     with open(tmp_path / name, "wb") as file:
         file.truncate(5 << 30)
-    with pytest.raises(InputError, match=f"{name} is {5 << 30} bytes long, expected at most"):
+    with pytest.raises(InputError, match=f"{name} cannot be read: {5 << 30} bytes, expected at most"):
         read(tmp_path / name)
 
 
@@ -192,17 +192,10 @@ def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, 
     path = tmp_path / f"x{extension}"
     path.write_bytes(JPEG if extension == ".jpg" else PNG)
     monkeypatch.setattr(images, "MAX_PIXELS", 14_399)
-    with pytest.raises(InputError, match="90 x 160 pixels, expected at most 14399"):
+    with pytest.raises(InputError, match="expected at most 14399 pixels, not 90 x 160"):
         read_image(path)
     monkeypatch.setattr(images, "MAX_PIXELS", 14_400)
     assert read_image(path).shape == (90, 160, 3)
-
-
-def test_the_limit_on_pixels_holds_for_resizing():
-    whole = Frame(np.zeros((8, 8, 3), np.uint8), None, None, random_camera(0, (8, 8)))
-    assert resize_frame(whole, (9, 11)).camera.size == (9, 11)
-    with pytest.raises(InputError, match=r"\(10000, 10000\), expected at most 67108864 pixels"):
-        resize_frame(whole, (10_000, 10_000))
 
 
 def test_a_jpeg_with_a_preview_in_its_header_is_read_and_refused_if_it_is_cut(tmp_path):
@@ -223,9 +216,12 @@ def test_a_long_message_keeps_its_beginning_and_end():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"target_seq_name": "a"}, "'a' is compared with itself"),
-        ({"all_target_id": [3, 4]}, "2 targets, expected 1 as in the name of its folder"),
-        ({"reference_frame_id": True}, "frame id is True"),
+        ({"target_seq_name": "a"}, "a is compared with 1 targets of a"),
+        (
+            {"all_target_id": [3, 4]},
+            "2 targets of b, expected another .*, and as many targets as the name of the folder",
+        ),
+        ({"reference_frame_id": True}, "Expected `int`, got `bool`"),
     ],
 )
 def test_a_pair_that_cannot_be_evaluated_as_its_set_says_is_refused(tmp_path, change, message):

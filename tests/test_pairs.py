@@ -1,4 +1,3 @@
-import os
 
 import numpy as np
 import pytest
@@ -9,11 +8,11 @@ from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import (
     Pair,
-    read_upstream_pairs,
+    pairs_path,
+    read_published_pairs,
     sample_pairs,
     shipped_pairs,
-    upstream_pairs_path,
-    write_upstream_pairs,
+    write_published_pairs,
 )
 from zsp_lite.errors import InputError
 
@@ -101,8 +100,6 @@ def test_a_generator_is_drawn_from_as_it_is(dataset):
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
     with pytest.raises(InputError, match="has 12 frames, expected at least 13"):
         sample_pairs(dataset, "chair", 1, 13)
-    with pytest.raises(InputError, match="number of pairs is 0, expected an integer from 1"):
-        sample_pairs(dataset, "chair", 0, 5)
     write_co3d(tmp_path, "chair", [sequence_data("s1")])
     with pytest.raises(InputError, match="has 0 labelled sequences"):
         sample_pairs(Co3D(tmp_path), "chair", 1, 1)
@@ -118,27 +115,27 @@ def test_a_pairs_seed_is_a_function_of_its_key(dataset):
 
 def test_pairs_are_read_back_from_the_published_format(dataset, tmp_path):
     pairs = sample_pairs(dataset, "chair", 10, 5)
-    path = upstream_pairs_path(tmp_path, "chair", 10, 5)
+    path = pairs_path(tmp_path, "chair", 10, 5)
     assert path == tmp_path / "determ_eval" / "10samples_5tgt" / "chair.pt"
-    write_upstream_pairs(path, pairs, dataset)
-    assert read_upstream_pairs(path, dataset) == pairs
+    write_published_pairs(path, pairs, dataset)
+    assert read_published_pairs(path, dataset) == pairs
     before = path.read_bytes()
-    write_upstream_pairs(path, pairs, dataset)
+    write_published_pairs(path, pairs, dataset)
     assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("form", [list, torch.tensor])
-def test_upstream_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
+def test_published_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
     frames = dataset.frame_list("chair")
     given = item(dataset)
     path = save(tmp_path / "chair.pt", [given | {"all_target_id": form(given["all_target_id"])}])
-    (pair,) = read_upstream_pairs(path, dataset)
+    (pair,) = read_published_pairs(path, dataset)
     assert pair.reference_frame == frames[given["reference_frame_id"]].frame_number
     assert pair.target_frames == tuple(frames[position].frame_number for position in given["all_target_id"])
 
 
 @pytest.mark.parametrize("place", ["", "data"])
-def test_a_folders_own_pairs_are_found_where_this_library_and_upstream_keep_them(tmp_path, place):
+def test_a_folders_own_pairs_are_found_in_both_layouts(tmp_path, place):
     names = ("a", "b")
     write_co3d(tmp_path, "chair", [sequence_data(name) for name in names])
     for name in names:
@@ -147,32 +144,27 @@ def test_a_folders_own_pairs_are_found_where_this_library_and_upstream_keep_them
     assert shipped_pairs(dataset, "chair", 2) == []
     pairs = sample_pairs(dataset, "chair", 5, 2, seed=8)
     for n in (3, 5):
-        write_upstream_pairs(upstream_pairs_path(tmp_path / place, "chair", n, 2), pairs[:n], dataset)
+        write_published_pairs(pairs_path(tmp_path / place, "chair", n, 2), pairs[:n], dataset)
     assert shipped_pairs(dataset, "chair", 2) == pairs[:3]
     assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs
     assert shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
 
 
-class Dangerous:
-    def __reduce__(self):
-        return os.system, ("echo executed > executed",)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"reference_frame_id": 48}, "frame id is 48, expected 0 to 47"),
-        ({"reference_frame_id": -1}, "frame id is -1"),
-        ({"reference_frame_id": "3"}, "frame id is '3'"),
+        ({"reference_frame_id": 48}, "frame id 48 is not of s1, expected a position in the list of 48 frames"),
+        ({"reference_frame_id": -1}, "frame id -1"),
+        ({"reference_frame_id": "3"}, "Expected `int`, got `str` - at `..0..reference_frame_id`"),
         ({"all_target_id": []}, "all_target_id"),
         ({"all_target_id": 3}, "all_target_id"),
         ({"all_target_id": torch.tensor(3)}, "all_target_id"),
-        ({"all_target_id": torch.tensor([[1, 2]])}, r"frame id is \[1, 2\]"),
-        ({"target_seq_name": "s3"}, "expected s3"),
+        ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
+        ({"target_seq_name": "s3"}, "is not of s3"),
         ({"class": "sofa"}, "category 'sofa'"),
     ],
 )
 def test_ids_of_other_data_are_refused(dataset, tmp_path, changes, message):
     path = save(tmp_path / "chair.pt", [item(dataset, **changes)])
     with pytest.raises(InputError, match=message):
-        read_upstream_pairs(path, dataset)
+        read_published_pairs(path, dataset)

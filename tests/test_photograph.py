@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsp_lite.data import samples
+from zsp_lite import samples
+from zsp_lite.data import photograph
 from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.photograph import fit_plane, motorcycle_frame
+from zsp_lite.data.geometry import fit_plane
+from zsp_lite.data.photograph import motorcycle_frame
 from zsp_lite.errors import InputError
 from zsp_lite.points import axis_deviation, object_points
 
@@ -56,18 +58,18 @@ def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_b
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
     floor = frame.depth[CLEAR_OF_THE_FLOOR] > 0
     normal, _ = fit_plane(unproject_depth(frame.depth, frame.camera)[CLEAR_OF_THE_FLOOR][floor], 0.01)
-    assert angle(-np.sign(normal[1]) * normal, samples.PHOTOGRAPH_UP) < 2
-    assert abs(angle(samples.PHOTOGRAPH_FRONT, samples.PHOTOGRAPH_UP) - 90) < 1
+    assert angle(-np.sign(normal[1]) * normal, photograph.PHOTOGRAPH_UP) < 2
+    assert abs(angle(photograph.PHOTOGRAPH_FRONT, photograph.PHOTOGRAPH_UP) - 90) < 1
 
 
 def test_front_is_the_direction_from_the_rear_to_the_front_along_the_longest_axis(frame):
     points = unproject_depth(frame.depth, frame.camera)[frame.mask > 0]
     longest = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
-    assert angle(np.sign(longest[0]) * longest, samples.PHOTOGRAPH_FRONT) < 10
+    assert angle(np.sign(longest[0]) * longest, photograph.PHOTOGRAPH_FRONT) < 10
 
 
 def test_the_photograph_is_scaled_as_scenes_of_co3d_and_is_the_same_at_every_call(frame):
-    first, second = samples.motorcycle_photograph(), samples.motorcycle_photograph()
+    first, second = photograph.motorcycle_photograph(), photograph.motorcycle_photograph()
     assert axis_deviation(object_points(first)) == pytest.approx(1, abs=1e-4)
     unit = axis_deviation(object_points(frame))
     assert unit == pytest.approx(0.22, abs=0.005)  # metres, as the documentation says
@@ -105,8 +107,8 @@ def test_no_file_of_the_photograph_is_in_the_repository():
             assert len(digests) == 2, f"{path} is {same.name} of scikit-image"
 
 
-def test_the_doctor_can_import_the_module_without_any_package():
-    code = "import sys; import zsp_lite.data.samples; assert not {'numpy', 'cv2', 'skimage'} & set(sys.modules)"
+def test_the_module_is_imported_without_any_package():
+    code = "import sys; import zsp_lite.samples; assert not {'numpy', 'cv2', 'skimage'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -120,8 +122,6 @@ def test_a_plane_is_found_among_outliers():
     assert angle(sign * found, normal) < 0.1 and sign * found_offset == pytest.approx(offset, abs=0.002)
 
 
-def test_too_few_and_collinear_points_span_no_plane():
-    with pytest.raises(InputError, match="got 2 points, expected at least 3"):
-        fit_plane(np.zeros((2, 3)), 0.01)
+def test_collinear_points_span_no_plane():
     with pytest.raises(InputError, match="no plane"):
         fit_plane(np.arange(9.0)[:, None] * np.ones(3), 0.01)

@@ -19,9 +19,8 @@ from pathlib import Path
 
 import msgspec
 
-from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.synthetic.models import MODELS_FILE, ModelInfo
 
 try:
@@ -108,7 +107,7 @@ class Catalogue(msgspec.Struct, frozen=True):
 
 def read_catalogue(path: Path) -> Catalogue:
     """Return the catalogue. Raises InputError if it is damaged."""
-    return decode(read_bytes(path, "catalogue"), Catalogue, path)
+    return read_json(path, Catalogue, "catalogue")
 
 
 def build(packages: Path, out: Path, catalogue: Catalogue) -> None:

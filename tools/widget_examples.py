@@ -13,17 +13,16 @@ import torch
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.data.pairs import Pair
-from zsp_lite.data.samples import sample_data
 from zsp_lite.demo import demo_pairs
 from zsp_lite.estimates import match_points
 from zsp_lite.labelling.session import Labelling
 from zsp_lite.matching import match, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.samples import sample_data
 from zsp_lite.synthetic.ground_truth import GroundTruthPair, ground_truth_pair
 from zsp_lite.verified import Solution, VerifiedSolver
 from zsp_lite.views import View, extract_views

@@ -57,6 +57,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
         own_objects,
         pipeline,
         points,
+        samples,
         synthetic,
         training,
         verified,
@@ -68,7 +69,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
     from zsp_lite.backbones import checkpoints, facets, huggingface, vit
     from zsp_lite.backbones.backbone import Backbone
     from zsp_lite.backbones.load import load_backbone
-    from zsp_lite.data import annotations, cameras, check, co3d, depth, frames, labels, pairs, samples
+    from zsp_lite.data import annotations, cameras, check, co3d, depth, frames, labels, pairs
     from zsp_lite.data.cameras import Camera
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.frames import Frame
@@ -85,13 +86,13 @@ if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HO
 # which `zsp-lite --help` does not need.
 _HOMES = {
     "": "alignment best_view choices demo errors estimates features matchers matching metrics minimal own_objects "
-    "pipeline points views backbones baselines benchmark cli data importers io labelling synthetic training "
+    "pipeline points samples views backbones baselines benchmark cli data importers io labelling synthetic training "
     "verified viz widgets",
     "alignment": "Sim3",
     "backbones": "checkpoints facets huggingface vit",
     "backbones.backbone": "Backbone",
     "backbones.load": "load_backbone",
-    "data": "annotations cameras check co3d depth frames labels pairs samples",
+    "data": "annotations cameras check co3d depth frames labels pairs",
     "data.cameras": "Camera",
     "data.co3d": "Co3D",
     "data.frames": "Frame",

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import Pair, labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.data.samples import (
+from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
+from zsp_lite.data.photograph import (
     PHOTOGRAPH_CATEGORY,
     PHOTOGRAPH_FRONT,
     PHOTOGRAPH_TARGET,
@@ -103,7 +103,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """Pose of the motorcycle of `samples.motorcycle_photograph`, estimated from views of a synthetic one.
+    """Pose of the motorcycle of `motorcycle_photograph`, estimated from views of a synthetic one.
 
     All points and directions are in the frame of the photograph's camera.
 
@@ -150,7 +150,7 @@ def run_photograph(
     Args:
         dataset: Data folder. Without a category of synthetic motorcycles there is no result.
         backbone: Computes the features.
-        sequence: Sequence of the synthetic motorcycle; by default `samples.PHOTOGRAPH_TARGET`, or the first of other
+        sequence: Sequence of the synthetic motorcycle; by default `PHOTOGRAPH_TARGET`, or the first of other
             data. Both are independent of the results.
         foregrounds: Settings `foreground` of `ZeroShotPose`.
         solvers: Settings `solver` of `ZeroShotPose`.

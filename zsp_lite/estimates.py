@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, relative_pose
-from zsp_lite.data.pairs import Pair
 from zsp_lite.io.html import picture_html
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error

@@ -10,14 +10,13 @@ import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import msgspec
 
 from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
-from zsp_lite.errors import InputError
-from zsp_lite.io.files import decompress as decompress_gzip
-from zsp_lite.io.files import read_bytes
+from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.io.files import decode_json, decompress, read_bytes
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
 
@@ -31,7 +30,7 @@ class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    scale_adjustment: float
+    scale_adjustment: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]  # factor from stored depth to depth
     mask_path: str | None = None
 
 
@@ -47,7 +46,7 @@ class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     T: Triple
     focal_length: tuple[float, float]
     principal_point: tuple[float, float]
-    intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS
+    intrinsics_format: Literal["ndc_norm_image_bounds", "ndc_isotropic"] = NDC_NORM_IMAGE_BOUNDS
 
 
 class FrameAnnotation(msgspec.Struct, frozen=True):
@@ -101,27 +100,23 @@ class FrameIndex:
     by_sequence: dict[str, list[int]]
 
     def positions(self, sequence: str) -> list[int]:
-        """Return the positions of a sequence's frames in `entries`. InputError if the sequence is unknown."""
+        """Return the positions of a sequence's frames in `entries`; InputError if the sequence is unknown."""
         if sequence not in self.by_sequence:
-            raise InputError(f"annotations {self.path} have no frames of a sequence {sequence!r}")
+            raise InputError(f"frame annotations {self.path} have no frames of a sequence {sequence!r}")
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
         """Decode the entry at a position; InputError, which names file, frame and field, if a field is invalid."""
         key = self.keys[position]
-        where = f"{self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
-        return decode(self.entries[position], FrameAnnotation, where)
+        where = f"(entry {position}: frame {key.frame_number} of {key.sequence_name})"
+        return decode_json(self.entries[position], FrameAnnotation, f"frame annotations {self.path} {where}")
 
 
 def read_frame_index(path: Path) -> FrameIndex:
-    """Read the frame annotations of a category.
-
-    Raises:
-        InputError: The file is missing or truncated, a frame has no sequence name or number, or two have the same.
-    """
-    data = decompress(path)
+    """Read the frame annotations of a category; InputError if they are damaged, or have a frame twice."""
+    data = read_annotations(path)
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
-    keys = decode(data, list[FrameKey], path)
+    keys = decode_json(data, list[FrameKey], f"frame annotations {path}")
     entries = msgspec.json.decode(data, type=list[msgspec.Raw])  # views into `data`, not copies
     by_sequence: dict[str, list[int]] = {}
     for position, key in enumerate(keys):
@@ -131,25 +126,20 @@ def read_frame_index(path: Path) -> FrameIndex:
         for first, second in itertools.pairwise(positions):
             if keys[first].frame_number == keys[second].frame_number:
                 raise InputError(
-                    f"annotations {path}: entries {first} and {second} are both frame {keys[first].frame_number} of "
-                    f"{keys[first].sequence_name}, expected each frame once"
+                    f"frame annotations {path}: entries {first} and {second} are both frame "
+                    f"{keys[first].frame_number} of {keys[first].sequence_name}, expected each frame once"
                 )
     return FrameIndex(path, entries, keys, by_sequence)
 
 
-def decode(data: bytes | msgspec.Raw, kind: Any, where: str | Path) -> Any:
-    """Decode JSON of the file `where` as a type of msgspec; InputError if it is invalid or lacks a field."""
-    try:
-        return msgspec.json.decode(data, type=kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"annotations {where}: {error}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"annotations {where} are not valid JSON: {error}") from error
+def read_sequences(path: Path) -> list[SequenceAnnotation]:
+    """Read the sequence annotations of a category, in file order."""
+    return decode_json(read_annotations(path), list[SequenceAnnotation], f"sequence annotations {path}")
 
 
-def decompress(path: Path) -> bytes:
+def read_annotations(path: Path) -> bytes:
     """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity."""
-    data = decompress_gzip(read_bytes(path, "annotations"), f"annotations {path}")
+    data = decompress(read_bytes(path, "annotations"), f"annotations {path}")
     # Python's json writes NaN and Infinity, which are not valid JSON. Null is then accepted by optional fields, and
     # refused by the others with the name of the field.
     if b"NaN" in data or b"Infinity" in data:

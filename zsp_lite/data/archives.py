@@ -9,21 +9,19 @@ import functools
 import io
 import os
 import shutil
-import stat
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import msgspec
 
-from zsp_lite.data.annotations import decode
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import fetch
-from zsp_lite.io.files import ARCHIVE_ERRORS, path_inside, read_bytes, write_atomic
+from zsp_lite.io.download import RemoteFile, fetch, remote_size
+from zsp_lite.io.files import path_inside, read_json, write_atomic
 from zsp_lite.io.locks import writing
-from zsp_lite.io.remote import RemoteFile, remote_size
 
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
@@ -62,68 +60,58 @@ class _Unpacked(msgspec.Struct):
 def list_archives(
     dataset: str, category: str, single_sequence: bool = False, chunks: int | None = None
 ) -> list[Archive]:
-    """List the archives of a category.
+    """List the archives of a category; the first one holds the annotations.
 
     Args:
         dataset: "co3d" (v2) or "co3d-v1".
         category: Name of the category.
         single_sequence: The single-sequence subset of v2: a few sequences of each category.
-        chunks: Number of archives, from the first; None for all.
-
-    Returns:
-        The archives; the one with the annotations is the first. InputError if there are not so many.
+        chunks: Largest number of archives, from the first; None for all.
     """
-    if dataset not in URL_VARIABLES:
-        raise InputError(f"data set is {dataset!r}, expected one of {', '.join(URL_VARIABLES)}")
-    subset = "single-sequence" if single_sequence else "full"
-    digests = _catalogue(CATALOGUE)[dataset].get(subset)
-    if digests is None:
-        raise InputError(f"{dataset} has no {subset} subset, expected co3d")
+    subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
+    digests = _catalogue(CATALOGUE)[dataset].get(subset, {})
     if category not in digests:
-        raise InputError(f"category {category!r} is not in {dataset} ({subset}), which has {', '.join(digests)}")
-    count = len(digests[category])
-    if chunks is not None and not 1 <= chunks <= count:
-        raise InputError(f"chunks are {chunks}, expected 1 to {count} for {category} of {dataset} ({subset})")
-    suffix = "_singlesequence" if single_sequence else ""
-    endings = [f"_{number:03d}{suffix}" for number in range(count)] if dataset == "co3d" else [""]
-    return [
-        Archive(dataset, category, subset, number, f"{category}{ending}.zip", sha256)
-        for number, (ending, sha256) in enumerate(zip(endings, digests[category], strict=True))
-    ][:chunks]
+        has = ", ".join(digests) or "no such subset"
+        raise InputError(f"category {category!r} is not in {dataset} ({subset}), which has {has}")
+    archives = []
+    for number, sha256 in enumerate(digests[category][:chunks]):
+        name = f"{category}_{number:03d}{suffix}.zip" if dataset == "co3d" else f"{category}.zip"
+        archives.append(Archive(dataset, category, subset, number, name, sha256))
+    return archives
 
 
-def missing_archives(root: str | Path, archives: Sequence[Archive]) -> list[Archive]:
+def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
     """Return the archives that are not unpacked yet; InputError if the folder has a category from elsewhere."""
-    root, record = Path(root), _read_record(root)
+    record, missing = _read_record(root), []
     for archive in archives:
-        place = root / archive.category
-        if (found := record.get(archive.category)) is None:
-            if place.is_dir() and any(place.iterdir()):
-                raise InputError(f"{place} exists and is not from this command, expected another folder (--root)")
-        elif (found.dataset, found.subset) != (archive.dataset, archive.subset):
+        place, found = root / archive.category, record.get(archive.category)
+        origin = (found.dataset, found.subset) if found else ("elsewhere",)
+        is_there = found is not None or (place.is_dir() and any(place.iterdir()))
+        if is_there and origin != (archive.dataset, archive.subset):
             raise InputError(
-                f"{place} is from {found.dataset} ({found.subset}), expected another folder (--root) for "
-                f"{archive.dataset} ({archive.subset})"
+                f"{place} is from {' '.join(origin)}, expected another folder (--root) for {archive.dataset} "
+                f"{archive.subset}"
             )
-    return [one for one in archives if one.category not in record or one.name not in record[one.category].archives]
+        if found is None or archive.name not in found.archives:
+            missing.append(archive)
+    return missing
 
 
-def missing_sequences(root: str | Path, archive: Archive, sequences: Iterable[str]) -> list[str]:
+def missing_sequences(root: Path, archive: Archive, sequences: Iterable[str]) -> list[str]:
     """Return the sequences of an archive that are not unpacked in a data folder yet."""
     if not missing_archives(root, [archive]):
         return []
-    record = _read_record(Path(root))
-    there = record[archive.category].sequences if archive.category in record else []
-    return sorted(set(sequences) - set(there))
+    found = _read_record(root).get(archive.category)
+    return sorted(set(sequences) - set(found.sequences if found else ()))
 
 
 def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
     """Return the size of sequences and of the annotations in an archive on the server, bytes."""
     with _remote_archive(archive) as zipped:
-        return sum(member.compress_size for member in _members(zipped, archive.category, archive.url, sequences))
+        return sum(member.compress_size for member in _members(zipped, archive.category, sequences))
 
 
-def check_disk(root: str | Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
+def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
     """Return the number of bytes that missing archives need on the disk; InputError if it has less.
 
     These are the unpacked archives, which are about as large as the archives, and one archive, as an archive is removed
@@ -132,99 +120,77 @@ def check_disk(root: str | Path, missing: Sequence[Archive], sizes: Sequence[int
     known = [size for size in sizes if size is not None]
     needed = sum(known) + (max(known, default=0) if whole else 0)
     for archive in missing:
-        for path in (_archive_path(root, archive), _part_path(root, archive)):
+        for path in (root / _WORK / archive.name, root / _WORK / f"{archive.name}.part"):
             needed -= path.stat().st_size if path.is_file() else 0
-    _check_free(Path(root), max(0, needed))
+    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    if needed > (free := shutil.disk_usage(existing).free):
+        raise InputError(
+            f"disk of {root} has {free / 1e9:.1f} GB free, expected at least {needed / 1e9:.1f} GB; choose another "
+            "folder, or fewer chunks"
+        )
     return max(0, needed)
 
 
-def download_archives(
-    root: str | Path, archives: Sequence[Archive], progress: Callable[..., Iterable] | None = None
-) -> None:
+def download_archives(root: Path, archives: Sequence[Archive], progress: Callable[..., Iterable] | None = None) -> None:
     """Download archives, verify their SHA-256 and unpack them into a data folder.
 
     An interrupted download is continued by the next call. The annotations of a category are unpacked last, so that the
     category is read only if it is complete. `progress` wraps the list of an archive's files, such as `tqdm`.
-
-    Raises:
-        InputError: A download fails or has another digest, an archive is damaged or holds a path that leads out of the
-            folder or a link, the disk is too small, or another process writes to the folder.
     """
-    root = Path(root)
     with writing(root / _WORK):
         missing = missing_archives(root, archives)
         # The chunk with the annotations comes last.
         for archive in sorted(missing, key=lambda one: (one.category, one.number == 0, one.number)):
-            path = _fetch(root, archive)
+            path = root / _WORK / archive.name
+            if not path.exists():
+                fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
             with _recorded(root, archive) as category, open(path, "rb") as file, _zip(file, str(path)) as zipped:
-                unpack(zipped, root, archive.category, str(path), progress=progress)
+                unpack(zipped, root, _members(zipped, archive.category), progress)
                 category.archives.append(archive.name)
             path.unlink()
 
 
 def download_sequences(
-    root: str | Path,
-    archive: Archive,
-    sequences: Collection[str],
-    progress: Callable[..., Iterable] | None = None,
+    root: Path, archive: Archive, sequences: Collection[str], progress: Callable[..., Iterable] | None = None
 ) -> None:
     """Read sequences and the annotations out of an archive on the server, without downloading the rest of it.
 
     Each file is verified by the CRC-32 in the archive. The SHA-256 is that of the whole archive and cannot be verified.
-    Raises as `download_archives`, and if the server does not send parts of files or the archive lacks a sequence.
     """
-    root = Path(root)
     with writing(root / _WORK):
         if missing := missing_sequences(root, archive, sequences):
             with _recorded(root, archive) as category, _remote_archive(archive) as zipped:
-                unpack(zipped, root, archive.category, archive.url, missing, progress)
+                unpack(zipped, root, _members(zipped, archive.category, missing), progress)
                 category.sequences += missing
 
 
 def unpack(
     zipped: zipfile.ZipFile,
     root: Path,
-    category: str,
-    where: str,
-    sequences: Collection[str] | None = None,
+    members: Sequence[zipfile.ZipInfo],
     progress: Callable[..., Iterable] | None = None,
 ) -> None:
-    """Unpack the folder of a category, or the given sequences of it with its annotations, from the zip archive `where`.
+    """Unpack members of a zip archive, annotations last; no path leads out of the folder, and no link is made.
 
-    All members are checked before the first is written. A file that exists with the same size is not written again,
-    except the annotations. Members that are not in the folder of the category are left out.
+    All paths are checked before the first file is written. A file that exists with the same size is not written again,
+    except the annotations.
     """
-    targets = {one: path_inside(root, one.filename) for one in _members(zipped, category, where, sequences)}
-    wanted = [member for member, target in targets.items() if not _is_there(member, target)]
-    wanted.sort(key=lambda one: (_is_annotation(one.filename), one.header_offset))
-    _check_free(root, sum(one.file_size for one in wanted))
+    targets = {member: path_inside(root, member.filename) for member in members}
+    wanted = [one for one in members if _is_annotation(one) or not _is_there(one, targets[one])]
+    wanted.sort(key=lambda one: (_is_annotation(one), one.header_offset))
     for member in progress(wanted) if progress else wanted:
         _write_member(zipped, member, targets[member])
 
 
-def _members(
-    zipped: zipfile.ZipFile, category: str, where: str, sequences: Collection[str] | None
-) -> list[zipfile.ZipInfo]:
-    """List the files of a category, or of some sequences of it, after all members were checked."""
-    members = [member for member in zipped.infolist() if not member.is_dir()]
-    for member in members:
-        _check_member(member, where)
-    members = [one for one in members if PurePosixPath(one.filename).parts[0] == category]
-    if not members:
-        raise InputError(f"archive {where} has no folder {category}, expected one as in CO3D")
+def _members(zipped: zipfile.ZipFile, category: str, sequences: Collection[str] | None = None) -> list[zipfile.ZipInfo]:
+    """List the files of a category, or its annotations and the files of some sequences."""
+    members = [one for one in zipped.infolist() if one.filename.startswith(f"{category}/") and not one.is_dir()]
     if sequences is None:
         return members
-    found = {one.filename.split("/")[1] for one in members if not _is_annotation(one.filename)}
-    if absent := sorted(set(sequences) - found):
-        raise InputError(f"archive {where} has no sequence {absent[0]!r}, expected {len(sequences)} sequences")
-    return [one for one in members if _is_annotation(one.filename) or one.filename.split("/")[1] in sequences]
-
-
-def _fetch(root: Path, archive: Archive) -> Path:
-    """Download an archive unless it is there, up to the size that the server tells."""
-    if (path := _archive_path(root, archive)).exists():
-        return path
-    return fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
+    sequence_of = {one: one.filename.split("/")[1] for one in members if not _is_annotation(one)}
+    if absent := sorted(set(sequences) - set(sequence_of.values())):
+        raise InputError(f"archive of {category} has no sequence {absent[0]!r}, expected all that are labelled")
+    return [one for one in members if _is_annotation(one) or sequence_of[one] in sequences]
 
 
 @contextmanager
@@ -243,9 +209,7 @@ def _zip(file: io.BufferedReader, where: str) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(file) as zipped:
             yield zipped
-    except InputError:
-        raise
-    except (NotImplementedError, *(kind for kind in ARCHIVE_ERRORS if kind is not OSError)) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise InputError(f"archive {where} is damaged or encrypted: {error}") from error
 
 
@@ -255,57 +219,28 @@ def _remote_archive(archive: Archive) -> Iterator[zipfile.ZipFile]:
         yield zipped
 
 
-def _check_member(member: zipfile.ZipInfo, where: str) -> None:
-    """Raise InputError for anything that is not a plain file at a relative path without dots."""
-    name = member.filename
-    mode = member.external_attr >> 16
-    if mode and stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-        raise InputError(f"archive {where} holds {name!r}, which is a link or a device, expected plain files")
-    parts = name.split("/")
-    if any(part in ("", ".", "..") for part in parts) or any(character in name for character in "\\:\0"):
-        raise InputError(f"archive {where} holds the path {name!r}, expected paths inside the data folder")
-
-
-def _is_annotation(name: str) -> bool:
-    return name.count("/") == 1
+def _is_annotation(member: zipfile.ZipInfo) -> bool:
+    return member.filename.count("/") == 1
 
 
 def _is_there(member: zipfile.ZipInfo, target: Path) -> bool:
-    return not _is_annotation(member.filename) and target.is_file() and target.stat().st_size == member.file_size
+    return target.is_file() and target.stat().st_size == member.file_size
 
 
-def _write_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> None:
+def _write_member(zipped: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(target.name + ".part")  # renamed when complete, so that sizes tell what is there
     try:
-        with archive.open(member) as source, open(part, "wb") as file:
+        with zipped.open(member) as source, open(part, "wb") as file:
             shutil.copyfileobj(source, file, 1 << 20)
         os.replace(part, target)
     finally:
         part.unlink(missing_ok=True)
 
 
-def _check_free(folder: Path, needed: int) -> None:
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    free = shutil.disk_usage(existing).free
-    if needed > free:
-        raise InputError(
-            f"disk of {folder} has {free / 1e9:.1f} GB free, expected at least {needed / 1e9:.1f} GB; choose another "
-            "folder, or fewer chunks"
-        )
-
-
-def _archive_path(root: str | Path, archive: Archive) -> Path:
-    return Path(root) / _WORK / archive.name
-
-
-def _part_path(root: str | Path, archive: Archive) -> Path:
-    return _archive_path(root, archive).with_name(archive.name + ".part")
-
-
 def _read_record(root: Path) -> dict[str, _Unpacked]:
     path = root / _WORK / "unpacked.json"
-    return decode(read_bytes(path, "list"), dict[str, _Unpacked], path) if path.is_file() else {}
+    return read_json(path, dict[str, _Unpacked], "list") if path.is_file() else {}
 
 
 def _write_record(root: Path, record: dict[str, _Unpacked]) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import InputError, check_magnitude, real_array
+from zsp_lite.errors import InputError, check_magnitude, check_number, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 
@@ -57,18 +57,22 @@ class Camera:
 
     def __post_init__(self):
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal_length", (2,)), ("principal_point", (2,))):
-            object.__setattr__(self, name, _finite(getattr(self, name), shape, f"camera {name}"))
+            array = np.array(real_array(f"camera {name}", getattr(self, name)))
+            if array.shape != shape:
+                raise InputError(f"camera {name} has shape {array.shape}, expected {shape}")
+            check_magnitude(f"camera {name}", array)
+            object.__setattr__(self, name, array)
         deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
         if deviation > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
             raise InputError(f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
         if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        if (self.focal_length < _MIN_FOCAL_LENGTH).any():
-            raise InputError(
-                f"camera focal_length is {self.focal_length.tolist()}, expected at least {_MIN_FOCAL_LENGTH} pixels"
-            )
-        object.__setattr__(self, "size", _image_size(self.size))
+        check_number("camera focal_length", self.focal_length.min(), above=_MIN_FOCAL_LENGTH)
+        sides = tuple(self.size)
+        if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
+            raise InputError(f"image size is {sides}, expected (height, width), integers from 1 to {MOST_PIXELS}")
+        object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
 
     def __repr__(self) -> str:
         rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
@@ -101,12 +105,9 @@ class Camera:
                 shorter side does).
 
         Raises:
-            InputError: The format is unknown, or a value is not valid for a `Camera`.
+            InputError: A value is not valid for a `Camera`.
         """
-        R, T = _finite(R, (3, 3), "viewpoint R"), _finite(T, (3,), "viewpoint T")
-        focal_length = _finite(focal_length, (2,), "viewpoint focal_length")
-        principal_point = _finite(principal_point, (2,), "viewpoint principal_point")
-        size = _image_size(size)
+        R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)
         # NDC axes point left and up, pixel axes right and down: hence the minus.
         return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
@@ -151,16 +152,9 @@ class Camera:
     def project(
         self, points: Real[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
-        """Project world points to pixels.
+        """Project world points (..., 3) to pixels (..., 2) as (x, y), and depths (...) along +z.
 
-        Check the depth before using a pixel: points at depth 0 have pixels that are not finite, and points at
-        negative depth are behind the camera.
-
-        Args:
-            points: (..., 3) points in world coordinates.
-
-        Returns:
-            Pixels (..., 2) as (x, y), and depths (...) along +z.
+        Points at depth 0 have pixels that are not finite, and points at negative depth are behind the camera.
         """
         in_camera = self.to_camera(points)
         depth = in_camera[..., 2]
@@ -189,7 +183,6 @@ class Camera:
 
     def resize(self, size: Sequence[int]) -> "Camera":
         """Return the camera of the image resized to (height, width): the intrinsics are scaled per axis."""
-        size = _image_size(size)
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
         return replace(
             self, focal_length=self.focal_length * scale, principal_point=self.principal_point * scale, size=size
@@ -211,33 +204,12 @@ class Camera:
         return camera
 
 
-def _ndc(size: tuple[int, int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
+def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels per NDC unit and the pixel of the NDC origin, each (2,) as (x, y)."""
     height, width = size
     half = np.array([width, height]) / 2
-    if intrinsics_format == NDC_NORM_IMAGE_BOUNDS:
-        return half, half
-    if intrinsics_format == NDC_ISOTROPIC:
-        return np.full(2, half.min()), half
-    raise InputError(
-        f"intrinsics_format is {intrinsics_format!r}, expected {NDC_NORM_IMAGE_BOUNDS!r} or {NDC_ISOTROPIC!r}"
-    )
-
-
-def _finite(value: np.ndarray | Sequence, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert to a float64 array of the given shape; InputError naming `what` if that fails or a value is too large."""
-    array = np.array(real_array(what, value))
-    if array.shape != shape:
-        raise InputError(f"{what} has shape {array.shape}, expected {shape}")
-    check_magnitude(what, array)
-    return array
-
-
-def _image_size(size: Sequence[int]) -> tuple[int, int]:
-    sides = tuple(size)
-    if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
-        raise InputError(f"image size is {size!r}, expected (height, width), integers from 1 to {MOST_PIXELS}")
-    return int(sides[0]), int(sides[1])
+    scales = {NDC_NORM_IMAGE_BOUNDS: half, NDC_ISOTROPIC: np.full(2, half.min())}
+    return scales[intrinsics_format], half
 
 
 def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:

@@ -4,13 +4,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
 from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import frame_defect
-from zsp_lite.data.labels import label_folder, read_label_files
-from zsp_lite.data.pairs import read_upstream_pairs
+from zsp_lite.data.labels import check_one_reference, label_folder, read_label_files
+from zsp_lite.data.pairs import read_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 
@@ -50,6 +51,14 @@ class CategoryCheck:
     size: int = 0
     problems: list[str] = field(default_factory=list)
 
+    def attempt(self, function: Callable, *values: object) -> Any:
+        """Call a function; if it raises InputError, its message becomes a problem, and the result is None."""
+        try:
+            return function(*values)
+        except InputError as error:
+            self.problems.append(str(error))
+            return None
+
 
 def check_folder(
     root: str | Path,
@@ -72,60 +81,43 @@ def check_folder(
         One result per category, sorted by name.
 
     Raises:
-        InputError: `root` is not a folder or has no such category. All other problems are in the results.
+        InputError: `root` is not a folder or has no category. All other problems are in the results.
     """
     dataset = Co3D(root)
-    found = dataset.categories()
-    if not found:
+    chosen = sorted(set(dataset.categories() if categories is None else categories))
+    if not chosen:
         raise InputError(f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz")
-    if unknown := sorted(set(categories or ()) - set(found)):
-        raise InputError(f"category {unknown[0]!r} is not in {root}, which has {', '.join(found)}")
-    chosen = found if categories is None else sorted(set(categories))
     return [_check_category(dataset, category, deep, partial) for category in (progress or iter)(chosen)]
 
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
     check = CategoryCheck(category)
-    try:
-        sequences = {one.sequence_name: one for one in dataset.sequences(category)}
-        keys = dataset.frame_list(category)
-    except InputError as error:
-        check.problems.append(str(error))
+    annotations = check.attempt(dataset.sequences, category)
+    keys = check.attempt(dataset.frame_list, category) if annotations is not None else None
+    if keys is None:
         return check
+    sequences = {one.sequence_name: one for one in annotations}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
     check.sequences, check.frames = len(names), len(keys)
-    for name in sorted(set(sequences) - set(names)):
-        check.problems.append(f"sequence {name} has no frames in the annotations")
+    check.problems += [
+        f"sequence {name} has no frames in the annotations" for name in sorted(set(sequences) - set(names))
+    ]
     layouts, usable = set(), set()
     for name in names:
         if partial and not (dataset.root / category / name).exists():
             check.absent += 1
             continue
-        problems, complete_frames = [], 0
-        try:
-            annotations = dataset.frames(category, name)
-        except InputError as error:
-            check.problems.append(str(error))
-            continue
-        for annotation in annotations:
-            found, defect = _check_frame(dataset, annotation, deep, check)
-            whole = None not in (annotation.viewpoint, annotation.depth, annotation.mask)
-            complete_frames += whole and not found and not defect
-            problems += found
+        before, complete_frames = len(check.problems), 0
+        for annotation in check.attempt(dataset.frames, category, name) or ():
+            complete_frames += _check_frame(dataset, annotation, deep, check)
             if annotation.viewpoint is not None:
                 layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
         if name not in sequences:
-            problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
+            check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
         elif (cloud := sequences[name].point_cloud) is not None:
-            found = _check_file(dataset, cloud.path, check)
-            problems += found
-            if not found and deep:
-                try:
-                    dataset.point_cloud(category, name)
-                except InputError as error:
-                    problems.append(str(error))
-        check.complete += not problems
-        check.problems += problems
+            if _check_file(dataset, cloud.path, check) and deep:
+                check.attempt(dataset.point_cloud, category, name)
+        check.complete += len(check.problems) == before
         if complete_frames >= _MIN_FRAMES:
             usable.add(name)
     check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
@@ -134,54 +126,40 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
 
 
 def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usable: set[str]) -> None:
-    try:
-        labels = read_label_files(dataset.root, check.category)
-    except InputError as error:
-        check.problems.append(str(error))
-        labels = {}
+    labels = check.attempt(read_label_files, dataset.root, check.category) or {}
     check.labelled, check.usable = len(labels), len(set(labels) & usable)
     folder = label_folder(dataset.root, check.category)
     for name in sorted(set(labels) - annotated):
         check.problems.append(f"label {folder / name}.json is of a sequence that is not in the annotations")
-    references = {label.reference_seq for label in labels.values()}
-    if len(references) > 1:
-        check.problems.append(f"labels in {folder} have references {', '.join(sorted(references))}, expected one")
+    check.attempt(check_one_reference, labels, folder)
     # No recursive pattern: the folder may hold millions of files.
-    patterns = (f"{part}determ_eval/*/{check.category}.pt" for part in ("", "data/"))
-    for path in (path for pattern in patterns for path in sorted(dataset.root.glob(pattern))):
-        try:
-            read_upstream_pairs(path, dataset)
-            check.pairs += 1
-        except InputError as error:
-            check.problems.append(str(error))
+    for part in ("", "data/"):
+        for path in sorted(dataset.root.glob(f"{part}determ_eval/*/{check.category}.pt")):
+            check.pairs += check.attempt(read_published_pairs, path, dataset) is not None
 
 
-def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> tuple[list[str], str]:
-    """Return the problems of a frame's files and camera, and in a deep check its defect, which is counted."""
-    paths = [annotation.image.path]
-    paths += [annotation.mask.path] if annotation.mask else []
-    if annotation.depth:
-        paths += [path for path in (annotation.depth.path, annotation.depth.mask_path) if path]
-    problems = [problem for path in paths for problem in _check_file(dataset, path, check)]
-    if problems or annotation.viewpoint is None:
-        return problems, ""
-    try:
-        defect = frame_defect(dataset.load(annotation)) if deep else ""
-        dataset.camera(annotation)
-    except InputError as error:
-        return [str(error)], ""
-    check.defects.update([defect] if defect else [])
-    return [], defect
+def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> bool:
+    """Check the files and the camera of a frame, and count its defect; True if a pose can be estimated in it."""
+    depth, mask = annotation.depth, annotation.mask
+    paths = [annotation.image.path, mask and mask.path, depth and depth.path, depth and depth.mask_path]
+    are_there = [_check_file(dataset, path, check) for path in paths if path]
+    if annotation.viewpoint is None or not all(are_there):
+        return False
+    defect = ""
+    if not deep:
+        works = check.attempt(dataset.camera, annotation) is not None
+    elif works := (frame := check.attempt(dataset.load, annotation)) is not None:
+        defect = frame_defect(frame)
+        check.defects.update([defect] if defect else [])
+    return works and not defect and depth is not None and mask is not None
 
 
-def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> list[str]:
-    """Return the problems of a file, and add its size to `check`."""
-    try:
-        path = path_inside(dataset.root, relative)
-    except InputError as error:
-        return [str(error)]
-    if not path.is_file():
-        return [f"{relative} is missing"]
-    size = path.stat().st_size
-    check.size += size
-    return [] if size else [f"{relative} is empty"]
+def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> bool:
+    """Check that a file exists and is not empty, and add its size to `check`."""
+    if (path := check.attempt(path_inside, dataset.root, relative)) is None:
+        return False
+    size = path.stat().st_size if path.is_file() else None
+    check.size += size or 0
+    if not size:
+        check.problems.append(f"{relative} is {'missing' if size is None else 'empty'}")
+    return bool(size)

@@ -1,11 +1,9 @@
 """Reader and writer of data sets in CO3D's layout (v1 and v2)."""
 
-import functools
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -24,9 +22,9 @@ from zsp_lite.data.annotations import (
     SequenceAnnotation,
     Viewpoint,
     compress,
-    decode,
-    decompress,
+    read_annotations,
     read_frame_index,
+    read_sequences,
 )
 from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
 from zsp_lite.data.frames import (
@@ -40,12 +38,32 @@ from zsp_lite.data.frames import (
     write_mask,
 )
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import path_inside, plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
-if TYPE_CHECKING:
-    from zsp_lite.data.pairs import Pair
+
+@dataclass(frozen=True)
+class Pair:
+    """A reference frame of one sequence and the target frames, by their numbers, of another sequence of a category."""
+
+    category: str
+    reference_sequence: str
+    reference_frame: int
+    target_sequence: str
+    target_frames: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Unique identifier of the pair, used in results."""
+        targets = ",".join(map(str, self.target_frames))
+        reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
+        return f"{reference}/{self.target_sequence}:{targets}"
+
+    @property
+    def seed(self) -> int:
+        """Seed of all random draws for this pair; it depends on the key only."""
+        return stable_hash(self.key) >> 1
 
 
 class Co3D:
@@ -95,8 +113,7 @@ class Co3D:
             InputError: The category is unknown, or its annotations cannot be read or lack a field.
         """
         if category not in self._sequences:
-            path = self._category_folder(category) / SEQUENCES_FILE
-            self._sequences[category] = decode(decompress(path), list[SequenceAnnotation], path)
+            self._sequences[category] = read_sequences(self._category_folder(category) / SEQUENCES_FILE)
         return list(self._sequences[category])
 
     def select(
@@ -190,15 +207,14 @@ class Co3D:
         mask = None if annotation.mask is None else self._read(read_mask, annotation.mask.path, size)
         depth = None
         if annotation.depth is not None:
-            reader = functools.partial(read_depth, scale_adjustment=annotation.depth.scale_adjustment)
-            depth = self._read(reader, annotation.depth.path, size)
+            depth = self._read(read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment)
             if annotation.depth.mask_path is not None:
                 valid = self._read(read_mask, annotation.depth.mask_path, size) > 0
                 depth = np.where(valid, depth, np.float32(0))
         return Frame(rgb, depth, mask, camera, name)
 
-    def load_pair(self, pair: "Pair") -> tuple[Frame, list[Frame]]:
-        """Load the reference frame and the target frames of an evaluation pair (`zsp_lite.data.pairs.Pair`).
+    def load_pair(self, pair: Pair) -> tuple[Frame, list[Frame]]:
+        """Load the reference frame and the target frames of an evaluation pair.
 
         Raises:
             InputError: A frame is not in the data set or cannot be loaded.
@@ -218,30 +234,16 @@ class Co3D:
         Raises:
             InputError: The sequence is unknown or has no point cloud, or the file cannot be read.
         """
-        for annotation in self.sequences(category):
-            if annotation.sequence_name == sequence:
-                if annotation.point_cloud is None:
-                    raise InputError(f"sequence {category}/{sequence} has no point cloud")
-                return read_ply(path_inside(self.root, annotation.point_cloud.path))
-        raise InputError(f"category {category} has no sequence {sequence!r}")
+        clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
+        if (cloud := clouds.get(sequence)) is None:
+            raise InputError(f"sequence {category}/{sequence} has no point cloud")
+        return read_ply(path_inside(self.root, cloud.path))
 
-    def set_lists(self, category: str) -> dict[str, dict[str, list[tuple[str, int, str]]]]:
-        """Read CO3D's train and test splits: `set_lists.json` (v1) or `set_lists/*.json` (v2).
-
-        Returns:
-            {file stem: {subset: [(sequence, frame number, image path), ...]}}; {} if the category has none.
-        """
-        folder = self._category_folder(category)
-        paths = [folder / "set_lists.json"] if (folder / "set_lists.json").is_file() else []
-        paths += sorted((folder / "set_lists").glob("*.json"))
-        kind = dict[str, list[tuple[str, int, str]]]
-        return {path.stem: decode(read_bytes(path, "set list"), kind, path) for path in paths}
-
-    def _read(self, reader: Callable[[Path], np.ndarray], relative: str, size: tuple[int, int]) -> np.ndarray:
+    def _read(self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options) -> np.ndarray:
         path = path_inside(self.root, relative)
-        image = reader(path)
-        if image.shape[:2] != tuple(size):
-            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {tuple(size)}")
+        image = reader(path, *options)
+        if image.shape[:2] != size:
+            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {size}")
         return image
 
     def _category_folder(self, category: str) -> Path:
@@ -306,8 +308,7 @@ def write_co3d(
         intrinsics_format: "ndc_norm_image_bounds" (v1) or "ndc_isotropic" (v2).
 
     Raises:
-        InputError: A name is not a plain folder name, the parts of a sequence do not fit together, or another process
-            writes to the category.
+        InputError: A name is not a plain folder name, or another process writes to the category.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
@@ -318,8 +319,8 @@ def write_co3d(
             entries, keys = index.entries, index.keys
         listed = []
         if sequences_path.is_file():
-            raws = decode(decompress(sequences_path), list[msgspec.Raw], sequences_path)
-            listed = [(decode(raw, SequenceAnnotation, sequences_path).sequence_name, raw) for raw in raws]
+            names = [one.sequence_name for one in read_sequences(sequences_path)]
+            listed = list(zip(names, msgspec.json.decode(read_annotations(sequences_path), type=list[msgspec.Raw])))
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
@@ -336,8 +337,6 @@ def _write_sequence(
     root: Path, category: str, sequence: SequenceData, quality: int, intrinsics_format: str
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
-    if len(sequence.frames) != len(sequence.timestamps):
-        raise InputError(f"sequence {base} has {len(sequence.frames)} frames and {len(sequence.timestamps)} timestamps")
     annotations = []
     for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps, strict=True)):
         stem = f"frame{number + 1:06d}"

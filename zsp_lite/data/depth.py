@@ -8,22 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Real, UInt16
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError, check_magnitude, check_number
+from zsp_lite.errors import InputError
 
 _INPAINT_RADIUS = 3  # pixels
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
-    """Decode CO3D's depth: the bits of each 16-bit value are those of a float16.
+    """Decode CO3D's depth: the bits of each 16-bit value are those of a float16, which is times `scale_adjustment`.
 
-    Returns:
-        (H, W) depth times `scale_adjustment`, float32; values that are not finite or not positive become 0 (unknown).
-
-    Raises:
-        InputError: The factor is not positive, or above 1e9.
+    Values that are not finite or not positive become 0 (unknown).
     """
-    check_number("depth scale_adjustment", scale_adjustment, above=0)
-    check_magnitude("depth scale_adjustment", scale_adjustment)
     with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
         depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -38,16 +32,9 @@ def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) 
 
 
 def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting.
+    """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting; InputError if no pixel is known.
 
-    Args:
-        depth: (H, W) depth, 0 where unknown.
-
-    Returns:
-        (H, W) depth, float32. Known pixels are unchanged; filled ones are clipped to the range of the known depths.
-
-    Raises:
-        InputError: No pixel is known.
+    Known pixels are unchanged; filled ones are clipped to the range of the known depths.
     """
     depth = np.ascontiguousarray(depth, dtype=np.float32)
     known = np.isfinite(depth) & (depth > 0)
@@ -64,7 +51,6 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """Compute the point (H, W, 3) of each pixel in camera coordinates; unknown depth (0) gives the origin."""
     depth = np.asarray(depth, dtype=np.float64)
-    _check_size(depth, camera)
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return camera.unproject_camera(np.stack([x, y], axis=-1), depth)
@@ -83,21 +69,14 @@ def patch_points(
     Args:
         depth: (H, W) depth, 0 where unknown.
         camera: Camera of the depth map.
-        grid: Rows and columns of patches.
+        grid: Rows and columns of patches, at most one per pixel.
         inpaint: Whether to in-paint, which takes most of the time. If not, the point of a patch without known depth is
             the origin.
 
     Returns:
         Points (rows, columns, 3), and (rows, columns) whether the patch has a known depth.
-
-    Raises:
-        InputError: No depth is known, the depth map and the camera differ in size, or the grid is finer than the
-            image.
     """
     depth = np.asarray(depth, dtype=np.float32)
-    _check_size(depth, camera)
-    if not all(0 < cells <= pixels for cells, pixels in zip(grid, depth.shape, strict=True)):
-        raise InputError(f"patch grid is {tuple(grid)}, expected between 1 and the image's {depth.shape}")
     rows, row_valid, row_middle = _split(depth.shape[0], grid[0])
     cols, col_valid, col_middle = _split(depth.shape[1], grid[1])
 
@@ -122,8 +101,6 @@ def patch_points(
         np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
         row_middle[:, None] * depth.shape[1] + col_middle,
     )
-    if not known.any():
-        raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
     filled = inpaint_depth(depth) if inpaint and not known.all() else depth
     y, x = np.divmod(index, depth.shape[1])
     depths = filled.ravel()[index] if inpaint else np.where(known, filled.ravel()[index], 0)
@@ -136,8 +113,3 @@ def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]
     return np.minimum(index, length - 1), valid, (edges[:-1] + edges[1:]) // 2
-
-
-def _check_size(depth: np.ndarray, camera: Camera) -> None:
-    if depth.shape != camera.size:
-        raise InputError(f"depth map has shape {depth.shape}, expected the camera's image size {camera.size}")

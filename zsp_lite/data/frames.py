@@ -15,7 +15,7 @@ from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.html import picture_html
-from zsp_lite.io.images import MAX_PIXELS, decode_image
+from zsp_lite.io.images import decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
@@ -43,23 +43,20 @@ class Frame:
     name: str = ""
 
     def __post_init__(self):
-        rgb = np.asarray(self.rgb)
-        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-            raise InputError(f"{self._label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 (H, W, 3)")
-        if rgb.shape[:2] != self.camera.size:
-            raise InputError(f"{self._label} rgb is {rgb.shape[:2]} pixels, expected the camera's {self.camera.size}")
+        label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.asarray(self.rgb)
+        if rgb.dtype != np.uint8 or rgb.shape != (*size, 3):
+            raise InputError(
+                f"{label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 {(*size, 3)} as the camera"
+            )
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
-            if getattr(self, name) is None:
+            if (values := getattr(self, name)) is None:
                 continue
-            values = getattr(self, name)
             if getattr(values, "dtype", None) != np.float32:
-                values = real_array(f"{self._label} {name}", values).astype(np.float32)
-            if values.shape != rgb.shape[:2]:
-                raise InputError(f"{self._label} {name} has shape {values.shape}, expected the image's {rgb.shape[:2]}")
-            if not np.isfinite(values).all() or values.min() < 0 or values.max() > top:
-                expected = "values in [0, 1]" if name == "mask" else "finite values, 0 where unknown"
-                raise InputError(f"{self._label} {name} holds {values.min()} to {values.max()}, expected {expected}")
+                values = real_array(f"{label} {name}", values).astype(np.float32)
+            if values.shape != size or not (values.min() >= 0 and values.max() <= top):  # not, because of NaN
+                found = f"shape {values.shape}" if values.shape != size else f"{values.min()} to {values.max()}"
+                raise InputError(f"{label} {name} has {found}, expected shape {size} and values from 0 to {top:g}")
             object.__setattr__(self, name, values)
 
     def __repr__(self) -> str:
@@ -71,17 +68,9 @@ class Frame:
     def _repr_html_(self) -> str:
         return picture_html(repr(self), self.rgb)
 
-    @property
-    def _label(self) -> str:
-        return f"frame {self.name}" if self.name else "frame"
-
 
 def frame_defect(frame: Frame) -> str:
-    """Say why a frame cannot be used for pose estimation.
-
-    Returns:
-        "black image", "empty object mask", "no depth map" or "no known depth"; "" for a usable frame.
-    """
+    """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable frame."""
     if frame.rgb.max() < _BLACK:
         return "black image"
     if frame.mask is not None and not frame.mask.any():
@@ -92,24 +81,13 @@ def frame_defect(frame: Frame) -> str:
 
 
 def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
-    """Compute the bounding box of the mask above a threshold, padded and clipped to the image.
+    """Compute the bounding box (top, left, height, width) of the mask above a threshold, padded and clipped.
 
-    Args:
-        mask: (H, W) probabilities.
-        threshold: Pixels above it count. If there is none, the threshold is lowered in steps of 0.05, down to 0.
-        padding: Fraction by which height and width grow, half of it on each side, as in CO3D's loader.
-
-    Returns:
-        (top, left, height, width), pixels.
-
-    Raises:
-        InputError: The mask is empty or not two-dimensional, or the threshold is not in [0, 1].
+    If no pixel is above the threshold, it is lowered in steps of 0.05, down to 0. Height and width grow by the fraction
+    `padding`, half of it on each side, as in CO3D's loader. InputError if the mask is empty.
     """
-    mask = np.asarray(mask)
-    if not 0 <= threshold <= 1:
-        raise InputError(f"mask_to_bbox: threshold is {threshold}, expected 0 to 1")
-    if mask.ndim != 2 or not (mask > 0).any():
-        raise InputError(f"object mask of shape {mask.shape} is empty, expected (H, W) with a pixel above 0")
+    if not (mask > 0).any():
+        raise InputError(f"object mask of shape {mask.shape} is empty, expected a pixel above 0")
     while not (inside := mask > max(threshold, 0.0)).any():
         threshold -= 0.05
     top, bottom = _span(inside.any(axis=1), padding)
@@ -118,26 +96,8 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
 
 
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
-    """Crop a frame to the bounding box of its object mask (see `mask_to_bbox`).
-
-    Raises:
-        InputError: The frame has no mask, or an empty one.
-    """
-    if frame.mask is None or not frame.mask.any():
-        raise InputError(f"{frame._label} has no object mask, expected one with a pixel above 0 to crop to")
-    return crop_frame(frame, mask_to_bbox(frame.mask, threshold, padding))
-
-
-def crop_frame(frame: Frame, box: Box) -> Frame:
-    """Crop a frame and its camera to a box (top, left, height, width), pixels.
-
-    Raises:
-        InputError: The box is empty or extends beyond the image.
-    """
-    top, left, height, width = box
-    image_height, image_width = frame.camera.size
-    if min(box) < 0 or height == 0 or width == 0 or top + height > image_height or left + width > image_width:
-        raise InputError(f"{frame._label} box (top, left, height, width) is {tuple(box)}, outside {frame.camera.size}")
+    """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
+    box = top, left, height, width = mask_to_bbox(frame.mask, threshold, padding)
     inside = np.s_[top : top + height, left : left + width]
     return replace(
         frame,
@@ -165,13 +125,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     Colours are averaged (OpenCV's INTER_AREA) along a side that shrinks and interpolated along a side that grows.
     Depth is taken from the nearest pixel, since values interpolated at an edge or hole lie on no surface. The mask is
     interpolated.
-
-    Raises:
-        InputError: The size (height, width) is not positive or too large.
     """
     camera = frame.camera.resize(size)
-    if camera.size[0] * camera.size[1] > MAX_PIXELS:
-        raise InputError(f"resize_frame: size is {camera.size}, expected at most {MAX_PIXELS} pixels")
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
     rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)
@@ -187,37 +142,21 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read the colours (H, W, 3) of an image file.
-
-    Raises:
-        InputError: The file is missing, truncated or corrupt.
-    """
+    """Read the colours (H, W, 3) of an image file; InputError if it is damaged."""
     # An orientation tag is ignored, because the camera refers to the pixels as stored.
     image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1].
-
-    Raises:
-        InputError: The file is missing, truncated or corrupt.
-    """
+    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is damaged."""
     return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
-    """Read a CO3D depth file: a 16-bit PNG that holds the bits of float16 values.
+    """Read a CO3D depth file, a 16-bit PNG that holds the bits of float16 values; InputError if it is no such file.
 
-    Args:
-        path: The file to read.
-        scale_adjustment: Factor applied to the stored depth.
-
-    Returns:
-        (H, W) depth, 0 where unknown.
-
-    Raises:
-        InputError: The file is missing, truncated or corrupt, or not a 16-bit greyscale PNG.
+    The result is (H, W) depth, 0 where unknown: the stored depth times `scale_adjustment`.
     """
     return decode_depth(read_grey16(path), scale_adjustment)
 
@@ -258,15 +197,8 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
 
 
 def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
-    data = read_bytes(path, what)
-    try:
-        return decode_image(data, flags)
-    except InputError as error:
-        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes): {error}") from error
+    return decode_image(read_bytes(path, what), flags, f"{what} {path}")
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:
-    done, data = cv2.imencode(extension, image, options)
-    if not done:
-        raise InputError(f"image {path} of shape {image.shape} cannot be encoded as {extension}")
-    write_atomic(path, data.tobytes())
+    write_atomic(path, cv2.imencode(extension, image, options)[1].tobytes())

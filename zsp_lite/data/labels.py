@@ -5,8 +5,9 @@ world of the sequence; the label of the reference sequence is the identity. File
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import msgspec
 import numpy as np
@@ -14,10 +15,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.annotations import decode
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_magnitude
-from zsp_lite.io.files import plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import decode_json, plain_name, read_bytes, write_atomic
 
 # Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
 _RIGID_TOLERANCE = 1e-3
@@ -39,25 +39,11 @@ class PoseLabel:
         trans: (4, 4) rigid transform from the world of `reference_seq` to the world of `seq`.
         seq: Name of the sequence.
         reference_seq: Name of the reference sequence.
-
-    Raises:
-        InputError: `trans` is not a finite rigid transform.
     """
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
     reference_seq: str
-
-    def __post_init__(self):
-        trans = np.array(self.trans, dtype=np.float64)
-        check_magnitude(f"label of {self.seq}: trans", trans)
-        if trans.shape != (4, 4):
-            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a 4x4 matrix")
-        rotation = trans[:3, :3]
-        deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
-        if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise InputError(f"label of {self.seq} has trans {trans.tolist()}, expected a rigid transform")
-        object.__setattr__(self, "trans", trans)
 
 
 def label_folder(root: str | Path, category: str) -> Path:
@@ -81,32 +67,34 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
             name says; or the labels have several reference sequences.
     """
     labels = read_label_files(root, category)
-    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
-        folder = label_folder(root, category)
-        raise InputError(f"labels in {folder} have references {', '.join(references)}, expected one")
+    check_one_reference(labels, label_folder(root, category))
     return labels
 
 
 def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
     """Read the labels of a category, also if they have several reference sequences (see `read_labels`)."""
-    labels = {}
-    for path in sorted(label_folder(root, category).glob("*.json")):
-        label = parse_label(read_bytes(path, "label"), str(path))
-        if label.seq != path.stem:
-            raise InputError(f"label {path} is of sequence {label.seq!r}, expected {path.stem!r} as in its name")
-        labels[label.seq] = label
-    return labels
+    paths = sorted(label_folder(root, category).glob("*.json"))
+    return {path.stem: parse_label(read_bytes(path, "label"), path) for path in paths}
 
 
-def parse_label(data: bytes, where: str) -> PoseLabel:
-    """Parse the JSON of the label file `where`; InputError if it lacks a field, or is not rigid."""
-    try:
-        label = decode(data, _LabelFile, where)
-        return PoseLabel(np.array(label.trans), label.seq, label.reference_seq)
-    except InputError as error:
-        raise InputError(
-            f'{where}: {error}; a label is {{"trans": 4x4, "seq": NAME, "reference_seq": NAME}}'
-        ) from error
+def parse_label(data: bytes, path: PurePath) -> PoseLabel:
+    """Parse the content of a label file; InputError if it lacks a field, is not rigid, or has another name."""
+    label = decode_json(data, _LabelFile, f"label {path}")
+    trans = np.array(label.trans)
+    check_magnitude(f"label {path}: trans", trans)
+    rotation = trans[:3, :3]
+    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
+    if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InputError(f"label {path} has trans {trans.tolist()}, expected a rigid transform")
+    if label.seq != path.stem:
+        raise InputError(f"label {path} is of sequence {label.seq!r}, expected that of its name")
+    return PoseLabel(trans, label.seq, label.reference_seq)
+
+
+def check_one_reference(labels: Mapping[str, PoseLabel], folder: Path) -> None:
+    """Raise InputError if the labels of a category have several reference sequences."""
+    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
+        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
@@ -125,14 +113,8 @@ def label_bytes(label: PoseLabel) -> bytes:
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
     """Convert a similarity between two worlds to a label with the same rotation and the same image of `centre`.
 
-    The translation of the similarity itself would displace an object that is not at the origin, since a label has no
-    scale.
-
-    Args:
-        sim3: Similarity from the world of the reference sequence to the world of the sequence.
-        centre: (3,) object centre in the world of the reference sequence, such as the mean of its point cloud.
-        seq: Name of the sequence.
-        reference_seq: Name of the reference sequence.
+    The similarity leads from the world of the reference sequence, in which `centre` is the object's centre, to that of
+    the sequence. A label has no scale: with the similarity's translation, an object off the origin would be displaced.
     """
     centre = np.asarray(centre, dtype=np.float64)
     trans = np.eye(4)

@@ -1,7 +1,9 @@
-"""Download of a file over HTTP, with resume, checksum and a limit on its size (pooch cannot resume)."""
+"""Files on a server: download with resume, checksum and a limit on the size (pooch cannot resume), parts of a file."""
 
 import hashlib
 import http.client
+import io
+import math
 import os
 import urllib.error
 import urllib.request
@@ -16,6 +18,9 @@ from zsp_lite.io.files import read_bytes, sha256, write_atomic
 
 CHUNK = 1 << 18  # bytes
 TIMEOUT = 30  # of a connection, s
+ATTEMPTS = 3
+# What urllib raises if a server cannot be reached, sends no file, or is given by an invalid address.
+NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
 def cache_folder() -> Path:
@@ -24,71 +29,40 @@ def cache_folder() -> Path:
 
 
 def fetch(
-    url: str,
-    path: str | Path,
-    size: int | None = None,
-    md5_prefix: str = "",
-    digest: str = "",
-    most: int | None = None,
+    url: str, path: Path, size: int | None = None, md5_prefix: str = "", digest: str = "", most: float = math.inf
 ) -> Path:
-    """Download a file unless it exists.
+    """Download a file unless it exists; it has `size` bytes, or at most `most`, and the given checksums.
 
-    Data is written to `path`.part, which is renamed after its size and checksum were verified. An interrupted download
-    is resumed, in up to three attempts and by later calls.
-
-    Args:
-        url: URL of the file.
-        path: Where to store it, and the result.
-        size: Expected size, bytes; None if unknown.
-        md5_prefix: Expected first digits of the MD5 digest.
-        digest: Expected SHA-256 digest; empty if unknown.
-        most: Largest size, bytes, where `size` is unknown. A longer download is stopped and removed.
-
-    Raises:
-        InputError: The server cannot be reached, the download is interrupted three times or is too long, or the size
-            or checksum differs.
+    Data is written to `path`.part, which is renamed after its size, the first digits of its MD5 digest and its SHA-256
+    `digest` were verified. An interrupted download is resumed, in up to three attempts and by later calls.
     """
-    path = Path(path)
     if path.exists():
         return path
-    part = path.with_name(path.name + ".part")
+    part, most = path.with_name(path.name + ".part"), most if size is None else size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for _ in range(3):
-            if _fetch_rest(url, part, size, most if size is None else size):
-                break
-        else:
-            raise InputError(
-                f"download of {url} was interrupted three times, at {part.stat().st_size} bytes; call again to resume"
-            )
-        if not has_size_and_hash(part, size, md5_prefix) or (digest and sha256(part, "download") != digest):
-            received = part.stat().st_size
-            part.unlink()  # resuming from wrong data would never succeed
-            checksum = f"SHA-256 {digest}" if digest else f"MD5 {md5_prefix or '(any)'}..."
-            length = "any number of" if size is None else size
-            raise InputError(
-                f"download of {url} gave another file of {received} bytes, expected {length} bytes with {checksum}; "
-                "removed"
-            )
-        os.replace(part, path)
-    except urllib.error.HTTPError as error:
-        raise InputError(f"download of {url} failed: HTTP {error.code} {error.reason}") from error
-    except InputError:
-        raise
-    except (OSError, http.client.HTTPException, ValueError) as error:
-        raise InputError(f"download of {url} failed: {getattr(error, 'reason', error)}") from error
+        complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
+        received = part.stat().st_size
+    except NETWORK_ERRORS as error:
+        raise InputError(f"download of {url} failed: {error}") from error
+    if not complete:
+        raise InputError(
+            f"download of {url} was interrupted {ATTEMPTS} times at {received} bytes; call again to resume"
+        )
+    matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
+    if received > most or not matches:
+        part.unlink()  # resuming from wrong data would never succeed
+        expected = f"{'at most ' * (size is None)}{most} bytes with the checksum {digest or md5_prefix or '(any)'}"
+        raise InputError(f"download of {url} is another file of {received} bytes, expected {expected}; removed")
+    os.replace(part, path)
     return path
 
 
 def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:
     """Check the size of a file (bytes, if given) and the first digits of its MD5 digest."""
-    if size is not None and path.stat().st_size != size:
-        return False
-    if not md5_prefix:
-        return True
     with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
-    return digest.startswith(md5_prefix)
+        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest() if md5_prefix else ""
+    return size in (None, path.stat().st_size) and digest.startswith(md5_prefix)
 
 
 @contextmanager
@@ -108,39 +82,102 @@ def pinned(path: Path) -> Iterator[None]:
             write_atomic(pin, f"{found}  {path.name}\n".encode())
 
 
-def _fetch_rest(url: str, part: Path, size: int | None, most: int | None) -> bool:
-    """Request the missing rest of `part`. Returns True if the file is complete, False if interrupted."""
-    start = part.stat().st_size if part.exists() else 0
-    if size is not None and start >= size:
-        return True
-    request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
+def remote_size(url: str) -> int | None:
+    """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
     try:
-        response = urllib.request.urlopen(request, timeout=TIMEOUT)
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT) as response:
+            length = response.headers.get("Content-Length")
+        return None if length is None else int(length)
+    except NETWORK_ERRORS as error:
+        raise InputError(f"{url} cannot be reached: {error}") from error
+
+
+class RemoteFile(io.RawIOBase):
+    """A file on a server, of which only the parts that are read are transferred (HTTP range requests).
+
+    For zipfile and the like; `io.BufferedReader(RemoteFile(url), size)` makes few large requests of many small reads.
+    """
+
+    def __init__(self, url: str):
+        """Ask for the size of the file; InputError if the server cannot be reached."""
+        super().__init__()
+        self.url, self.size, self._position = url, remote_size(url) or 0, 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Set the position, as for every file."""
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
+        self._position = max(0, start + offset)
+        return self._position
+
+    def readinto(self, buffer: bytearray | memoryview) -> int:
+        """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not send parts."""
+        end = min(self._position + len(buffer), self.size)
+        if end <= self._position:
+            return 0
+        problem: object = "the connection was closed"
+        for _ in range(ATTEMPTS):
+            try:
+                with _request(self.url, self._position, end) as response:
+                    if not _is_part(response, self._position):
+                        problem = "the server does not send parts of files, expected range requests"
+                    elif data := _read(response, end - self._position):
+                        buffer[: len(data)] = data
+                        self._position += len(data)
+                        return len(data)
+            except NETWORK_ERRORS as error:
+                problem = error
+        raise InputError(f"{self.url} cannot be read: {problem}")
+
+
+def _request(url: str, start: int, end: int | None = None) -> http.client.HTTPResponse:
+    """Request the bytes of a file from `start` to before `end`."""
+    headers = {"Range": f"bytes={start}-{'' if end is None else end - 1}"} if start or end else {}
+    return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=TIMEOUT)
+
+
+def _is_part(response: http.client.HTTPResponse, start: int) -> bool:
+    """Tell whether a server sends a file from `start`, rather than all of it."""
+    return response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
+
+
+def _read(response: http.client.HTTPResponse, count: int) -> bytes:
+    """Read up to `count` bytes, or those that came before the connection was closed."""
+    try:
+        return response.read(count)
+    except http.client.IncompleteRead as error:
+        return error.partial
+
+
+def _fetch_rest(url: str, part: Path, most: float) -> bool:
+    """Request the missing rest of `part`, and stop beyond `most` bytes. Returns False if it was interrupted."""
+    start = part.stat().st_size if part.exists() else 0
+    if start >= most:
+        return True
+    try:
+        response = _request(url, start)
     except urllib.error.HTTPError as error:
-        if error.code != 416:  # 416 "range not satisfiable": complete already, or the file on the server changed
+        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
-        if error.headers.get("Content-Range", "") == f"bytes */{start}":
-            return True
-        part.unlink()
+        part.unlink()  # the file was complete, or it has changed on the server
         return False
     with response:
-        if start and not (
-            response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
-        ):
-            start = 0  # the server ignored the Range header and sends the whole file
+        start = start if _is_part(response, start) else 0
         length = response.headers.get("Content-Length")
-        total = start + int(length) if length is not None else None
-        if most is not None and (total or 0) > most:
-            raise InputError(f"download of {url} has {total} bytes, expected at most {most}")
+        total = None if length is None else start + int(length)
         bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)
         with bar, open(part, "ab" if start else "wb") as file:
             try:
-                while chunk := response.read(CHUNK):
+                while file.tell() <= most and (chunk := response.read(CHUNK)):
                     file.write(chunk)
                     bar.update(len(chunk))
-                    if most is not None and file.tell() > most:
-                        part.unlink()
-                        raise InputError(f"download of {url} has more than {most} bytes, expected no more; removed")
             except (http.client.IncompleteRead, ConnectionError, TimeoutError):
                 return False
-            return total is None or file.tell() >= total
+            return total is None or file.tell() >= min(total, most)

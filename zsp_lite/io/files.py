@@ -1,15 +1,17 @@
-"""Atomic writes, reads with limits and errors that name the file, and checks of paths and names."""
+"""Atomic writes, reads with limits and errors that name the file, JSON, and checks of paths and names."""
 
 import gzip
 import hashlib
 import io
-import lzma
+import math
 import os
 import secrets
 import stat
-import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from zsp_lite.errors import InputError
 
@@ -17,15 +19,10 @@ MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decom
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
 _GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME = 255  # bytes, on most file systems
-# Exceptions of zipfile and of decompression for truncated, damaged or encrypted files and unknown methods.
-ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError, KeyError)
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a file atomically: a reader sees the old content or the new one, never a part.
-
-    The data is written to a temporary file in the same folder, which is then renamed. Missing folders are created.
-    """
+    """Write a file, and missing folders above it, so that a reader sees the old or the new content, never a part."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -37,7 +34,7 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def make_folder(path: str | Path, what: str) -> Path:
-    """Make a folder unless it exists, with those above it. Raises InputError if that is not possible."""
+    """Make a folder unless it exists, with those above it; InputError if that is not possible."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
@@ -47,31 +44,53 @@ def make_folder(path: str | Path, what: str) -> Path:
 
 def read_bytes(path: str | Path, what: str) -> bytes:
     """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it cannot be read."""
-    if (size := file_size(path, what)) > MAX_FILE:
-        raise InputError(f"{what} {path} is {size} bytes long, expected at most {MAX_FILE}")
+    file_size(path, what, MAX_FILE)
+    return Path(path).read_bytes()
+
+
+def read_json(path: str | Path, kind: Any, what: str) -> Any:
+    """Read a JSON file as a type of msgspec; InputError, which names its kind `what`, its path and the field."""
+    return decode_json(read_bytes(path, what), kind, f"{what} {path}")
+
+
+def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
+    """Decode JSON as a type of msgspec; InputError, which begins with `what`, if it is damaged or lacks a field."""
     try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{what} {path} cannot be read: {_reason(error)}") from error
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{what}: {error}") from error
 
 
-def file_size(path: str | Path, what: str) -> int:
-    """Return the size of a regular file in bytes; InputError for a pipe or a device, which may never end."""
+def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
+    """Return the size of a file in bytes; InputError if it is longer than `most`, no file, or cannot be read."""
+    size, problem = 0, ""
     try:
         status = os.stat(path)
+        size = status.st_size
+        if not stat.S_ISREG(status.st_mode):
+            # A pipe or a device may never end.
+            problem = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
+        elif size > most:
+            problem = f"{size} bytes, expected at most {most}"
+        elif not os.access(path, os.R_OK):
+            problem = "permission denied"
     except (OSError, ValueError) as error:
-        raise InputError(f"{what} {_shown(path)} cannot be read: {_reason(error)}") from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
-        raise InputError(f"{what} {path} cannot be read: {kind}")
-    return status.st_size
+        problem = _reason(error)
+    if problem:
+        raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
+    return size
 
 
 def sha256(path: str | Path, what: str) -> str:
-    """Return the SHA-256 digest of a file in hexadecimal digits. Raises InputError if it cannot be read."""
+    """Return the SHA-256 digest of a file in hexadecimal digits; InputError if it cannot be read."""
     file_size(path, what)
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def stable_hash(text: str) -> int:
+    """Hash text to 64 bits; unlike Python's `hash`, the result is the same in every process."""
+    return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big")
 
 
 def growth_limit(size: int) -> int:
@@ -79,46 +98,41 @@ def growth_limit(size: int) -> int:
     return min(MAX_FILE, max(_GROWTH_ALLOWED, _GROWTH_FACTOR * size))
 
 
-def decompress(data: bytes, where: str) -> bytes:
-    """Decompress gzip data of the file `where`; InputError if it is incomplete or grows beyond `growth_limit`."""
+def decompress(data: bytes, what: str) -> bytes:
+    """Decompress the gzip data `what`; InputError if they are incomplete or grow beyond `growth_limit`."""
     limit = growth_limit(len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(limit + 1)
+        problem = f"{len(data)} bytes grow to more than {limit}" if len(content) > limit else ""
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{where} are not complete gzip data: {error}") from error
-    if len(content) > limit:
-        raise InputError(f"{where} grow from {len(data)} to more than {limit} bytes, expected less")
+        problem = str(error)
+    if problem:
+        raise InputError(f"{what}: not complete gzip data: {problem}")
     return content
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """Resolve a path relative to a folder.
-
-    Raises:
-        InputError: The path leads out of the folder (by "..", as an absolute path or by a link).
-    """
-    resolved_root = Path(root).resolve()
+    """Resolve a path relative to a folder; InputError if it leads out of it (by "..", absolute, or by a link)."""
+    root = Path(root).resolve()
     try:
-        resolved = (resolved_root / relative).resolve()
+        resolved = (root / relative).resolve()
         resolved.exists()  # raises OSError where a name is too long
-    except (ValueError, OSError, RuntimeError) as error:  # null byte, name too long, cyclic links
-        raise InputError(f"path {_shown(relative)} in {root} is invalid: {_reason(error)}") from error
-    if not resolved.is_relative_to(resolved_root) or Path(relative).is_absolute():
-        raise InputError(f"path {relative!r} leads out of the data folder {root}, expected a path inside")
+        problem = "" if resolved.is_relative_to(root) and not Path(relative).is_absolute() else "leads out of"
+    except (ValueError, OSError, RuntimeError):  # null byte, name too long, cyclic links
+        problem = "is invalid in"
+    if problem:
+        raise InputError(f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside")
     return resolved
 
 
 def plain_name(name: str, what: str) -> str:
-    """Return `name` if it is a valid name of a single file or folder; `what` says of which, for error messages.
-
-    Raises:
-        InputError: The name is empty, begins with a dot, or contains a separator.
-    """
-    if not name or name.startswith(".") or any(c in "/\\:\0" for c in name):
-        raise InputError(f"{what} name is {name!r}, expected a plain folder name")
-    if len(os.fsencode(name)) > _LONGEST_NAME:
-        raise InputError(f"{what} name has {len(name)} characters, expected at most {_LONGEST_NAME} bytes")
+    """Return `name` if it is a valid name of a single file or folder; InputError, which begins with `what`, if not."""
+    separated = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
+    if separated or len(os.fsencode(name)) > _LONGEST_NAME:
+        raise InputError(
+            f"{what} name is {_shown(name)!r}, expected a plain folder name of at most {_LONGEST_NAME} bytes"
+        )
     return name
 
 

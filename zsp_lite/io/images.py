@@ -13,25 +13,21 @@ from zsp_lite.errors import InputError
 MAX_PIXELS = 1 << 26
 
 
-def decode_image(data: bytes, flags: int) -> UInt8[np.ndarray, "..."] | UInt16[np.ndarray, "..."]:
-    """Decode the content of a JPEG or PNG file by OpenCV with its flags for `imdecode`.
-
-    Raises:
-        InputError: The file is of another format, incomplete or damaged, or has more than `MAX_PIXELS` pixels.
-    """
+def decode_image(data: bytes, flags: int, what: str) -> UInt8[np.ndarray, "..."] | UInt16[np.ndarray, "..."]:
+    """Decode the JPEG or PNG file `what` by OpenCV with its flags; InputError if it is damaged or too large."""
     is_jpeg = data[:2] == b"\xff\xd8"
     # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
     # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
     start, end = (b"\xff\xda", b"\xff\xd9") if is_jpeg else (b"IDAT", b"IEND")
-    image = None
+    image, expected = None, "a complete JPEG or PNG"
     try:
         width, height = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data)).size  # reads the header only
         if width * height > MAX_PIXELS:
-            raise InputError(f"{height} x {width} pixels, expected at most {MAX_PIXELS}")
-        if data.rfind(end) > data.rfind(start):
+            expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
+        elif data.rfind(end) > data.rfind(start):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
         image = None
     if image is None:
-        raise InputError("expected a complete JPEG or PNG")
+        raise InputError(f"{what} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image

@@ -1,5 +1,6 @@
 """One writer per folder."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,24 +15,25 @@ LOCK = ".writing.lock"
 
 @contextmanager
 def writing(folder: str | Path) -> Iterator[None]:
-    """Be the only writer of a folder, which is made if it does not exist.
+    """Be the only writer of a folder, which is made if it does not exist; InputError if another process writes to it.
 
-    The lock is one of the operating system, which is released when the process ends, however it ends.
-
-    Raises:
-        InputError: Another process writes to the folder, or the folder cannot be written.
+    The lock is one of the operating system, which is released when the process ends, however it ends. A folder that was
+    made, and into which nothing was written, is removed.
     """
+    made = [one for one in (Path(folder), *Path(folder).parents) if not os.path.exists(one)]
     path = make_folder(folder, "folder") / LOCK
     lock = FileLock(path, timeout=0)
     try:
         lock.acquire()
-    except Timeout as error:
-        raise InputError(f"{folder}: another process is writing to it") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be opened for writing ({error}); choose another folder") from error
+    except OSError as error:  # a Timeout of the lock is one, too
+        reason = "another process is writing to it" if isinstance(error, Timeout) else f"it cannot be written: {error}"
+        raise InputError(f"{folder}: {reason}; choose another folder") from error
     try:
         yield
     finally:
         with suppress(OSError):  # Windows keeps an open file
             path.unlink()
         lock.release()
+        with suppress(OSError):  # not empty
+            for one in made:
+                one.rmdir()

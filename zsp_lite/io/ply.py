@@ -9,8 +9,9 @@ from jaxtyping import Float64, Real, UInt8
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
-_COLOURS = ("red", "green", "blue")
-_VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in _COLOURS])
+_VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
+_PROPERTIES = [f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+_PROPERTIES += [f"uchar {name}" for name in ("red", "green", "blue")]
 
 
 def write_ply(
@@ -21,29 +22,23 @@ def write_ply(
 ) -> None:
     """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit colours.
 
-    Written here rather than by trimesh, because the sample data must be reproducible byte for byte. InputError if a
-    position is above 1e9 or not finite.
+    Written here rather than by trimesh, because the sample data must be reproducible byte for byte.
     """
     check_magnitude(f"point cloud {path}", points)
     vertices = np.zeros(len(points), dtype=_VERTEX)
-    normals = np.zeros((len(points), 3)) if normals is None else normals
-    for names, values in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals), (_COLOURS, colours)):
-        for name, column in zip(names, np.asarray(values).T):
-            vertices[name] = column
-    properties = "".join(f"property {'uchar' if name in _COLOURS else 'float'} {name}\n" for name in _VERTEX.names)
+    vertices["position"], vertices["colour"] = points, colours
+    if normals is not None:
+        vertices["normal"] = normals
+    properties = "".join(f"property {one}\n" for one in _PROPERTIES)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
     write_atomic(path, header.encode("ascii") + vertices.tobytes())
 
 
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-    """Read the vertices of a binary or ASCII PLY file.
+    """Read the positions and 8-bit colours (None if there are none) of a binary or ASCII PLY file.
 
-    Returns:
-        Positions (n, 3), and 8-bit RGB colours (n, 3) or None if the file has none. Colours are rescaled from [0, 1]
-        if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken as [0, 255] otherwise.
-
-    Raises:
-        InputError: The file is missing, damaged or empty, or has positions that are not finite or above 1e9.
+    Colours are rescaled from [0, 1] if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken
+    as [0, 255] otherwise. InputError if the file is damaged, or positions are not finite or above 1e9.
     """
     data = read_bytes(path, "point cloud")
     try:
