@@ -31,7 +31,6 @@ from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
-from zsp_lite.points import standard_deviation
 from zsp_lite.verified import VerifiedSolver, proposals, refinement, soft_icp, solver
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.views import extract_views, object_crop, patch_mask
@@ -313,7 +312,8 @@ def test_the_weights_and_the_calibration_reach_the_verified_solver(views, verifi
     for one in estimate_noisy(views, solver=VerifiedSolver(weights)).hypotheses:
         assert one.score == pytest.approx(sum(w * t for w, t in zip(astuple(weights), one.terms.values())), abs=1e-3)
     # Rivals do not count, and nothing else does.
-    certain = estimate_noisy(views, solver=VerifiedSolver(calibration=Calibration(20.0, 0.0, -3.0, 0.0, 0.0, 0.0)))
+    calibration = Calibration((20.0, 0.0, 0.0, 0.0, 0.0, 0.0), (-3.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0)
+    certain = estimate_noisy(views, solver=VerifiedSolver(calibration=calibration))
     assert certain.confidence == pytest.approx(1 / (1 + np.exp(-3))) != verified.confidence
 
 

@@ -1,7 +1,7 @@
 """tools/tuning.py: the fits recover known parameters, are evaluated on held-out categories, and refuse other splits."""
 
 import logging
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,9 @@ from zsp_lite.metrics import reliability
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 
+# Setting, span, number of views, angles to the nearest view and deviation of the view similarities, of no importance
+# to the weights of the score.
+ALL_AROUND_TARGET = ("5 views all around", 288.0, 5, np.zeros(6), 0.1)
 TRUE_WEIGHTS = ScoreCoefficients(6, 0, -4, -2, 0, 3, 0, -1, 2)
 
 
@@ -37,7 +40,7 @@ def sample_outcomes(n: int, rng: np.random.Generator, m: int = 6) -> list[Outcom
         probability = np.exp(score - score.max())
         errors = np.full(m, 120.0)
         errors[rng.choice(m, p=probability / probability.sum())] = 0
-        outcomes.append(Outcome(f"category {index % 4}", terms, errors, 90 * (1 - np.eye(m))))
+        outcomes.append(Outcome(f"category {index % 4}", terms, errors, 90 * (1 - np.eye(m)), *ALL_AROUND_TARGET))
     return outcomes
 
 
@@ -56,7 +59,8 @@ def test_pairs_without_a_correct_hypothesis_do_not_change_the_weights():
     rng = np.random.default_rng(1)
     outcomes = sample_outcomes(200, rng)
     shape = (6, len(TERM_NAMES))
-    wrong = [Outcome("x", rng.normal(size=shape), np.full(6, 90.0), 90 * (1 - np.eye(6))) for _ in range(50)]
+    apart = 90 * (1 - np.eye(6))
+    wrong = [Outcome("x", rng.normal(size=shape), np.full(6, 90.0), apart, *ALL_AROUND_TARGET) for _ in range(50)]
     np.testing.assert_allclose(astuple(fit_weights(outcomes + wrong)), astuple(fit_weights(outcomes)), atol=1e-4)
     with pytest.raises(InputError, match="50 pairs, none with a correct hypothesis"):
         fit_weights(wrong)
@@ -66,26 +70,31 @@ def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[O
     """Pairs of three different poses, scored by the first two terms, of which one or none is right as `true` says."""
     outcomes = []
     for index in range(n):
-        n_views, view_std, terms = int(rng.integers(1, 11)), float(rng.uniform(0, 0.2)), np.zeros((3, len(TERM_NAMES)))
+        terms = np.zeros((3, len(TERM_NAMES)))
         terms[:, 0] = np.sort(rng.uniform(0, 6, 3))[::-1]
         terms[:, 1] = rng.uniform(-2, 2)  # the shape term, equal for all poses
-        p = true.probabilities(terms[0, 0] - terms[:, 0], n_views, view_std, terms[0, 1])
+        views = int(rng.integers(1, 11))
+        seen = rng.uniform(0, 360), views, rng.uniform(0, 90, 3), rng.uniform(0, 0.2)
+        one = Outcome(f"category {index % 4}", terms, np.zeros(3), 90 * (1 - np.eye(3)), f"{views} views", *seen)
+        p = true.probabilities(terms[0, 0] - terms[:, 0], one.evidence(FIRST_TERMS))
         errors = np.full(4, 120.0)
         errors[rng.choice(4, p=[*p, 1 - p.sum()])] = 5
-        outcomes.append(Outcome(f"category {index % 4}", terms, errors[:3], 90 * (1 - np.eye(3)), view_std, n_views))
+        outcomes.append(replace(one, errors=errors[:3]))
     return outcomes
 
 
 FIRST_TERMS = ScoreCoefficients(*[1.0, 1.0, *[0.0] * (len(TERM_NAMES) - 2)])
-TRUE_CALIBRATION = Calibration(-0.4, 0.2, 0.5, -0.4, -6.0, -0.6)
+TRUE_CALIBRATION = Calibration((-0.4, 0.4, 0.2, 0.3, -1.0, 0.1), (0.5, -1.0, -0.4, -0.8, -6.0, -0.6), 0.2)
 
 
 def test_the_coefficients_of_the_calibration_are_recovered():
     outcomes = sample_ranked(6000, TRUE_CALIBRATION, np.random.default_rng(0))
     found = fit_calibration(outcomes, FIRST_TERMS, ridge=0)
-    assert astuple(found)[:4] == pytest.approx(astuple(TRUE_CALIBRATION)[:4], abs=0.2)
-    assert found.none_std == pytest.approx(TRUE_CALIBRATION.none_std, abs=1.5)
-    assert found.none_shape == pytest.approx(TRUE_CALIBRATION.none_shape, abs=0.1)
+    for name in ("scale", "none"):
+        true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
+        np.testing.assert_allclose(measured, true, atol=0.6)
+        assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)  # of view_std
+    assert found.unseen == pytest.approx(0.2, abs=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
     with pytest.raises(InputError, match="all have a right pose or none has"):
         fit_calibration(right, FIRST_TERMS)
@@ -95,14 +104,14 @@ def test_every_category_counts_the_same_in_the_calibration():
     outcomes = sample_ranked(400, TRUE_CALIBRATION, np.random.default_rng(1))
     more = outcomes + 3 * [one for one in outcomes if one.category == "category 0"]
     once, again = (fit_calibration(some, FIRST_TERMS, ridge=0) for some in (outcomes, more))
-    assert astuple(again) == pytest.approx(astuple(once), rel=0.01, abs=0.01)
+    assert [*again.scale, *again.none] == pytest.approx([*once.scale, *once.none], rel=0.05, abs=0.05)
 
 
 def test_calibrated_probabilities_are_frequencies_on_new_pairs():
     fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERMS)
     new = sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(3))
     ranked = [one.ranked(FIRST_TERMS) for one in new]
-    found = [fitted.probabilities(deficit, *one.circumstances(FIRST_TERMS)) for one, (deficit, _) in zip(new, ranked)]
+    found = [fitted.probabilities(deficit, one.evidence(FIRST_TERMS)) for one, (deficit, _) in zip(new, ranked)]
     for k in range(3):
         confidence, right = np.array([p[k] for p in found]), np.array([error[k] < 30 for _, error in ranked])
         assert reliability(confidence, right, 5).calibration_error < 0.05
@@ -129,12 +138,13 @@ def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog, monkeypatch):
     monkeypatch.setattr(tuning, "load_backbone", lambda device: CountingBackbone())
     CountingBackbone.seen.clear()
     with caplog.at_level(logging.INFO):
-        outcomes = collect_outcomes(Path(ellipsoids.root), "ellipsoid", 2, (3, 2))
+        outcomes = collect_outcomes(Path(ellipsoids.root), "ellipsoid", 2, ((3, 360.0), (2, 360.0), (5, 60.0)))
     correct = sum(one.errors[0] < 30 for one in outcomes[:2])
-    assert [one.n_views for one in outcomes] == [3, 3, 2, 2]
+    assert [one.n_views for one in outcomes[:4]] == [3, 3, 2, 2]
+    assert all(40 < one.span <= 60 and one.n_views == 2 for one in outcomes[4:])  # of seven views evenly around
     assert len(CountingBackbone.seen) == len(set(CountingBackbone.seen))  # features of an image are extracted once
     name = f"{Path(ellipsoids.root).name}/ellipsoid"
-    assert f"{name}: 2 pairs of 3 views, Acc30 {50 * correct} %" in caplog.messages
+    assert f"{name}: 2 pairs of 3 views all around, Acc30 {50 * correct} %" in caplog.messages
     assert min(one.errors[0] for one in outcomes[:2]) < 5
     for one in outcomes:
         m = len(one.errors)
@@ -149,7 +159,7 @@ def test_the_reports_have_all_fits():
     assert "60 pairs of 4 categories" in text and "held-out category" in text and "best 2 different poses" in text
     assert all(name in text for name in TERM_NAMES)
     text = "\n".join(report_calibration(sample_ranked(200, TRUE_CALIBRATION, np.random.default_rng(5)), FIRST_TERMS))
-    assert "AUROC" in text and "10 views:" in text and "probabilities of the other poses" in text
+    assert "AUROC" in text and "10 views: " in text and "probabilities of the other poses" in text
 
 
 def test_categories_of_another_side_are_refused(tmp_path, capsys):

@@ -25,6 +25,7 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import auroc, reliability, rotation_error
 from zsp_lite.verified.confidence import (
     Calibration,
+    Evidence,
     hypothesis_probabilities,
     is_one_of_two,
     modes,
@@ -570,8 +571,6 @@ def test_reliability_by_hand():
     np.testing.assert_allclose(found.accuracy, [1 / 3, 1])
     assert found.calibration_error == pytest.approx((1 / 3 - 0.3 + 1 - 2.3 / 3) / 2)
     assert found.top_half_accuracy == 1 and "more confident half 100.0 %" in str(found)
-    with pytest.raises(InputError, match="6 outcomes and 6 confidences, expected equal numbers of at least 10"):
-        reliability(confidence, right)
 
 
 # Angles between five rotations about one axis, of 0, 20, 180, 190 and 90 degrees.
@@ -590,42 +589,38 @@ MODE = np.array([0, 0, 2, 2, 4])
 
 
 def test_probabilities_of_hypotheses_by_hand():
-    # Of four views: a = exp(0.2 - 0.5 log 4), odds of "none" exp(0.3 - 0.1 log 4 - 2 * 0.03 - 0.25 * 2).
-    calibration = Calibration(0.2, -0.5, 0.3, -0.1, -2.0, -0.25)
-    a, none = np.exp(0.2) / 2, np.exp(0.3 - 0.06 - 0.5) * 4**-0.1
+    # Of four views that span 3/4 of the circle, the nearest with exp(-(angle / 45)^2) = 1/2.
+    evidence = Evidence(0.75, np.log(4), 0.5, 0.03, 2.0)
+    calibration = Calibration((0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4)
+    a, none = np.exp(0.2 + 0.3 + 0.3 + 0.03 + 0.2) / 2, np.exp(0.3 + 0.6 + 0.1 - 0.06 - 0.5) * 4**-0.1
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0]))
-    first, second, third = odds / (none + odds.sum())
+    first, second, third = (1 - 0.4 / 4) * odds / (none + odds.sum())
     score = np.array([5.0, 4.9, 4.5, 4.4, 3.0])
-    found = hypothesis_probabilities(score, MODE, 4, 0.03, 2.0, calibration)
+    found = hypothesis_probabilities(score, MODE, evidence, calibration)
     np.testing.assert_allclose(found, [first, first, second, second, third])
 
 
 @given(
     st.lists(st.floats(0, 40), min_size=0, max_size=5),
-    st.sampled_from([1, 2, 3, 4, 5, 10]),
-    st.floats(0, 0.3),
-    st.floats(-40, 40),
+    st.builds(Evidence, st.floats(0, 0.9), st.floats(0, 2.3), st.floats(0, 1), st.floats(0, 0.3), st.floats(-40, 40)),
 )
-def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, n_views, view_std, shape):
+def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, evidence):
     score = 10 - np.cumsum([0.0, *deficits])
-    found = hypothesis_probabilities(score, np.arange(len(score)), n_views, view_std, shape, Calibration())
+    found = hypothesis_probabilities(score, np.arange(len(score)), evidence, Calibration())
     assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
 
 
-def test_with_fewer_views_more_of_the_mass_is_left_for_none_of_the_poses():
+def test_the_smaller_the_part_that_was_seen_the_more_is_left_for_none_of_the_poses():
     score = np.array([5.0, 4.0])
-    left = [
-        1 - hypothesis_probabilities(score, np.arange(2), n, 0.03, 5.0, Calibration()).sum() for n in (1, 2, 3, 5, 10)
-    ]
-    assert (np.diff(left) < 0).all() and left[0] > 2 * left[-1]
 
+    def left(span: float, views: int, shape_fit: float = 5.0) -> float:
+        evidence = Evidence(span / 360, np.log(views), 0.5, 0.03, shape_fit)
+        return 1 - hypothesis_probabilities(score, np.arange(2), evidence, Calibration()).sum()
 
-def test_the_worse_the_shapes_fit_the_more_is_left_for_none_of_the_poses():
-    score, calibration = np.array([5.0, 4.0]), Calibration()
-    left = [
-        1 - hypothesis_probabilities(score, np.arange(2), 5, 0.03, fit, calibration).sum() for fit in (-5.0, 0.0, 5.0)
-    ]
-    assert (np.diff(left) < 0).all()
+    arcs = [left(span, 5) for span in (30, 60, 90, 120, 180, 288)]
+    around = [left(360 - 360 / n, n) for n in (1, 2, 3, 5, 10)]
+    assert (np.diff(arcs) < 0).all() and (np.diff(around) < 0).all() and around[0] > 2 * around[-1]
+    assert left(288, 5, -5.0) > left(288, 5, 0.0) > left(288, 5, 5.0)
 
 
 def test_poses_are_nearly_as_probable_above_a_fraction_of_the_best_ones_probability():

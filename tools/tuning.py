@@ -4,9 +4,10 @@ Run from the root of the repository. The weights are fitted on training categori
 categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
-    python -m tools.tuning calibration outputs/{validation:10,validation_poses:20}
+    python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
 
-FOLDER:PAIRS is a data folder and the number of pairs of each of its categories. Folders with categories of another
+FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in each setting of the target views:
+all around the object, and for the calibration also within arcs. Folders with categories of another
 side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on categories left out of the
 fit; the constants in `zsp_lite/verified` are these, rounded.
 
@@ -21,7 +22,8 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,6 +33,7 @@ from jaxtyping import Float
 
 from tools.concepts import DATA_HELP, check_sides, folder_and_pairs
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs
@@ -38,8 +41,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import reliability, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import Calibration, different_poses, modes
-from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
+from zsp_lite.verified.confidence import Calibration, Evidence, different_poses, modes
+from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 
 CORRECT_ANGLE = 30.0  # degrees
@@ -47,8 +50,13 @@ CORRECT_ANGLE = 30.0  # degrees
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
 _CALIBRATION_RIDGE = 1e-3
-# Numbers of target views, by what is fitted.
-_VIEWS = {"weights": (5,), "calibration": (1, 2, 3, 5, 7, 10)}
+_SURE = 0.8  # confidences above this are reported by themselves
+# The settings of the target views, by what is fitted: their number, and the arc in degrees that they lie in.
+ALL_AROUND = 360.0
+_SETTINGS = {
+    "weights": ((5, ALL_AROUND),),
+    "calibration": (*((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)), *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0))),
+}
 _log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
@@ -62,16 +70,22 @@ class Outcome:
         terms: (m, terms) score terms of the m hypotheses, in the order of `TERM_NAMES`.
         errors: (m,) rotation errors in degrees.
         angles: (m, m) angles between the hypotheses' rotations in degrees.
-        view_std: Standard deviation of the target views' similarity to the reference.
+        setting: Setting of the target views, in words.
+        span: Angle in degrees that the usable target views span around the target.
         n_views: Number of usable target views.
+        nearest: (m,) angle in degrees between the reference's camera and the nearest target view's, by hypothesis.
+        view_std: Standard deviation of the target views' similarity to the reference.
     """
 
     category: str
     terms: Float[np.ndarray, "m terms"]
     errors: Float[np.ndarray, " m"]
     angles: Float[np.ndarray, "m m"]
-    view_std: float = 0.0
-    n_views: int = 5
+    setting: str
+    span: float
+    n_views: int
+    nearest: Float[np.ndarray, " m"]
+    view_std: float
 
     @property
     def correctness(self) -> Float[np.ndarray, " m"]:
@@ -90,16 +104,18 @@ class Outcome:
         different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
         return scores[order[0]] - scores[different], self.errors[different]
 
-    def circumstances(self, weights: ScoreCoefficients) -> tuple[int, float, float]:
-        """Return what the probability of "none of these" depends on: number of views, view_std and shape fit."""
-        best = self.terms[(self.terms @ np.array(astuple(weights))).argmax()]
-        return self.n_views, self.view_std, float(best @ np.array(astuple(weights.of_shape())))
+    def evidence(self, weights: ScoreCoefficients) -> Evidence:
+        """Return the evidence for the calibration."""
+        best = int((self.terms @ np.array(astuple(weights))).argmax())
+        shape_fit = float(self.terms[best] @ np.array(astuple(weights.of_shape())))
+        nearness = float(np.exp(-((self.nearest[best] / VIEWPOINT_SIGMA) ** 2)))
+        return Evidence(self.span / 360, float(np.log(self.n_views)), nearness, self.view_std, shape_fit)
 
 
 def collect_outcomes(
-    root: Path, category: str, pairs: int, view_numbers: Sequence[int], seed: int = 0
+    root: Path, category: str, pairs: int, settings: Sequence[tuple[int, float]], seed: int = 0
 ) -> list[Outcome]:
-    """Run the verified solver on `pairs` pairs of a category, for each of several numbers of views.
+    """Run the verified solver on `pairs` pairs of a category in each setting of the target views.
 
     Features are extracted once per image.
 
@@ -107,33 +123,57 @@ def collect_outcomes(
         InputError: A sequence has no pose label.
     """
     torch.set_num_threads(1)
-    dataset, backbone, outcomes, views = Co3D(root), load_backbone(device="cpu"), [], {}
+    dataset, backbone, outcomes = Co3D(root), load_backbone(device="cpu"), []
     labels, name = read_labels(root, category), f"{root.name}/{category}"  # folders may share names of categories
-    for n_targets in view_numbers:
+    method = ZeroShotPose(backbone, solver="verified")
+    numbers: dict[str, list[int]] = {}
+    for frame in dataset.frame_list(category):
+        numbers.setdefault(frame.sequence_name, []).append(frame.frame_number)
+
+    @cache
+    def view(sequence: str, number: int) -> View:
+        return method.views([dataset.load(dataset.frame(category, sequence, number))])[0]
+
+    for n_targets, arc in settings:
+        setting = f"{n_targets} views all around" if arc == ALL_AROUND else f"views within {arc:.0f} degrees"
         found = []
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-            method = ZeroShotPose(backbone, solver=VerifiedSolver(), seed=pair.seed)
-            frames = [
-                (pair.reference_sequence, pair.reference_frame),
-                *((pair.target_sequence, number) for number in pair.target_frames),
-            ]
-            new = [one for one in frames if one not in views]
-            views |= zip(new, method.views(dataset.load(dataset.frame(category, *one)) for one in new))
-            reference, *targets = (views[one] for one in frames)
+            targets = [view(pair.target_sequence, number) for number in pair.target_frames]
+            if arc < ALL_AROUND:
+                around = [view(pair.target_sequence, number) for number in sorted(numbers[pair.target_sequence])]
+                targets = views_within(around, arc, np.random.default_rng(pair.seed))
+            reference = view(pair.reference_sequence, pair.reference_frame)
             ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-            found.append(solve_views(method, name, reference, targets, ends))
+            found.append(solve_views(replace(method, seed=pair.seed), (name, setting), reference, targets, ends))
         outcomes += found
         accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
-        _log.info("%s: %d pairs of %d views, Acc30 %.0f %%", name, len(found), n_targets, 100 * accuracy)
+        _log.info("%s: %d pairs of %s, Acc30 %.0f %%", name, len(found), setting, 100 * accuracy)
     return outcomes
 
 
+def views_within(around: Sequence[View], arc: float, rng: np.random.Generator) -> list[View]:
+    """Draw two to ten views from a random arc of the views that go once around an object, in their order."""
+    points = [one.frame.camera.to_world(one.measured_points[0][one.known_foreground]) for one in around]
+    centre = np.median(np.concatenate(points), axis=0)
+    first = int(rng.integers(len(around)))
+    turned = [*around[first:], *around[:first]]
+    count = 1
+    while count < len(turned) and view_span([one.frame.camera for one in turned[: count + 1]], centre) <= arc:
+        count += 1
+    wanted = min(int(rng.choice([2, 3, 5, 10])), count)
+    return [turned[k] for k in np.linspace(0, count - 1, wanted).round().astype(int)]
+
+
 def solve_views(
-    method: ZeroShotPose, category: str, reference: View, targets: Sequence[View], labels: tuple[PoseLabel, PoseLabel]
+    method: ZeroShotPose,
+    names: tuple[str, str],
+    reference: View,
+    targets: Sequence[View],
+    labels: tuple[PoseLabel, PoseLabel],
 ) -> Outcome:
-    """Run a method's verified solver on the views of a pair and compute the errors of its hypotheses."""
+    """Run the verified solver on the views of a pair, of a category and setting, and measure its hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
-    solution = method.solver.solve(reference, targets, method.match_views(reference, targets), method.seed)
+    solution = VerifiedSolver().solve(reference, targets, method.match_views(reference, targets), method.seed)
 
     cameras = [target.frame.camera for target in targets]
     true = [relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3] for camera in cameras]
@@ -141,12 +181,15 @@ def solve_views(
     # Rotations to the targets' world, which hypotheses in different target views have in common.
     in_world = np.stack([cameras[one.view].R.T @ one.sim3.R for one in hypotheses])
     return Outcome(
-        category,
+        names[0],
         np.array([[one.terms[name] for name in TERM_NAMES] for one in hypotheses]),
         np.array([rotation_error(one.sim3.R, true[one.view]) for one in hypotheses]),
         rotation_error(in_world[:, None], in_world[None]),
-        solution.scene.view_similarity_std,
+        names[1],
+        solution.scene.view_span,
         len(targets),
+        np.array([float(rotation_error(np.eye(3), one.sim3.R)) for one in hypotheses]),
+        solution.scene.view_similarity_std,
     )
 
 
@@ -213,10 +256,9 @@ def fit_calibration(
     Every category counts the same, so that the numbers of pairs chosen per category do not decide.
 
     Args:
-        outcomes: Outcomes for several numbers of views.
+        outcomes: Outcomes in several settings of the target views.
         weights: Weights of the score.
-        ridge: Penalty on the squared coefficients of log N, of the view similarities' standard deviation and of the
-            shape fit, per standard deviation of these.
+        ridge: Penalty on the squared coefficients of the evidence, per standard deviation of it.
 
     Raises:
         InputError: All estimates are right, or none is.
@@ -232,30 +274,31 @@ def fit_calibration(
     target = torch.tensor([int(found[0]) if len(found) else most for found in right])
     count = Counter(one.category for one in outcomes)
     importance = torch.tensor([1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64)
-    inputs = np.array([one.circumstances(weights) for one in outcomes])
-    inputs[:, 0] = np.log(inputs[:, 0])
-    mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
-    x = torch.from_numpy((inputs - mean) / std)
-    theta = torch.zeros(3 + inputs.shape[1], dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([theta], max_iter=300, line_search_fn="strong_wolfe")
+    evidence = np.array([astuple(one.evidence(weights)) for one in outcomes])
+    mean, std = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
+    x = torch.from_numpy(np.column_stack([np.ones(len(evidence)), (evidence - mean) / std]))
+    unspanned = torch.from_numpy(1 - evidence[:, 0])
+    theta = torch.zeros(2, x.shape[1], dtype=torch.float64, requires_grad=True)  # alpha and beta
+    unseen = torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)  # logit of lambda
+    optimiser = torch.optim.LBFGS([theta, unseen], max_iter=300, line_search_fn="strong_wolfe")
 
     def loss() -> Float[torch.Tensor, ""]:
         optimiser.zero_grad()
-        scale = torch.exp(theta[0] + theta[1] * x[:, 0])
-        none = theta[2] + x @ theta[3:]
-        logits = torch.cat([-scale[:, None] * deficits, none[:, None]], dim=1)
-        negative = torch.nn.functional.cross_entropy(logits, target, reduction="none")
-        value = importance @ negative + ridge * torch.cat([theta[1:2], theta[3:]]).square().sum()
+        log_scale, none = theta @ x.T
+        logits = torch.cat([-log_scale.exp()[:, None] * deficits, none[:, None]], dim=1)
+        look_alike = (unseen.sigmoid() * unspanned)[:, None]
+        probability = (1 - look_alike) * logits.softmax(dim=1)
+        probability = torch.cat([probability[:, :-1], probability[:, -1:] + look_alike], dim=1)
+        likelihood = probability.gather(1, target[:, None])[:, 0].clamp_min(1e-12)
+        value = ridge * theta[:, 1:].square().sum() - importance @ likelihood.log()
         value.backward()
         return value
 
     with torch.enable_grad():
         optimiser.step(loss)
-    scale, scale_n, none, *slopes = theta.detach().numpy()
-    slopes = np.array(slopes) / std
-    return Calibration(
-        *map(float, (scale - scale_n * mean[0] / std[0], scale_n / std[0], none - slopes @ mean, *slopes))
-    )
+    constant, slopes = theta.detach().numpy()[:, 0], theta.detach().numpy()[:, 1:] / std
+    scale, none = np.column_stack([constant - slopes @ mean, slopes]).tolist()
+    return Calibration(tuple(scale), tuple(none), unseen.sigmoid().item())
 
 
 def leave_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit]) -> list[_Fit]:
@@ -289,29 +332,35 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     first, others = [], []
     for one, calibration in zip(outcomes, held_out):
         deficit, error = one.ranked(weights)
-        probability = calibration.probabilities(deficit, *one.circumstances(weights))
-        pairs = list(zip(probability, error < CORRECT_ANGLE))
-        first.append((one.n_views, *pairs[0]))
+        pairs = list(zip(calibration.probabilities(deficit, one.evidence(weights)), error < CORRECT_ANGLE))
+        first.append(pairs[0])
         others += pairs[1:]
-    views, confidence, right = map(np.array, zip(*first))
+    confidence, right = map(np.array, zip(*first))
     lines = [
         f"{len(outcomes)} outcomes of {len({one.category for one in outcomes})} categories",
-        "fitted: " + ", ".join(f"{name} {value:.3f}" for name, value in asdict(fitted).items()),
+        f"scale: {_numbers(fitted.scale)}; none: {_numbers(fitted.none)}; unseen: {fitted.unseen:.3f}",
         "confidence, held-out category:",
         str(reliability(confidence, right, min(10, len(right)))),
     ]
-    for n in np.unique(views):
-        chosen = views == n
-        found = reliability(confidence[chosen], right[chosen], min(5, int(chosen.sum())))
+    settings = np.array([one.setting for one in outcomes])
+    for setting in dict.fromkeys(settings.tolist()):
+        chosen = settings == setting
+        sure = chosen & (confidence > _SURE)
+        error = reliability(confidence[chosen], right[chosen], min(5, int(chosen.sum()))).calibration_error
         lines.append(
-            f"  {n} views: {chosen.sum()} outcomes, mean confidence {100 * confidence[chosen].mean():.0f} %, right "
-            f"{100 * right[chosen].mean():.0f} %, expected calibration error {100 * found.calibration_error:.1f} points"
+            f"  {setting}: {chosen.sum()} outcomes, mean confidence {100 * confidence[chosen].mean():.0f} %, right "
+            f"{100 * right[chosen].mean():.0f} %, expected calibration error {100 * error:.1f} points; "
+            f"{right[sure].sum()} of {sure.sum()} with a confidence above {_SURE} are right"
         )
     if others:
         probability, right = map(np.array, zip(*others))
-        found = reliability(probability, right, min(10, len(right)))
-        lines += ["probabilities of the other poses, held-out category:", str(found)]
+        lines += ["probabilities of the other poses, held-out category:"]
+        lines += [str(reliability(probability, right, min(10, len(right))))]
     return lines
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
 
 
 def _share(outcomes: Sequence[Outcome], weights: ScoreCoefficients, k: int) -> float:
@@ -332,7 +381,7 @@ def _log_progress() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
-    parser.add_argument("constants", choices=_VIEWS, help="what to fit")
+    parser.add_argument("constants", choices=_SETTINGS, help="what to fit")
     parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS", help=DATA_HELP)
     given = parser.parse_args(arguments)
     fit = given.constants
@@ -340,7 +389,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_sides([folder for folder, _ in given.data], "validation" if fit == "calibration" else "training")
         jobs = [(root, category, pairs) for root, pairs in given.data for category in Co3D(root).categories()]
         with ProcessPoolExecutor(os.cpu_count(), initializer=_log_progress) as pool:
-            parts = pool.map(collect_outcomes, *zip(*jobs), [_VIEWS[fit]] * len(jobs))
+            parts = pool.map(collect_outcomes, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
             outcomes = [one for part in parts for one in part]
         report = report_weights if fit == "weights" else report_calibration
         print("\n".join(report(outcomes, ScoreCoefficients())))

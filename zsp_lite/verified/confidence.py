@@ -1,19 +1,19 @@
 r"""Calibrated probabilities: how likely is the rotation of each hypothesis within 30 degrees of the truth?
 
 The score S is a conditional logit (McFadden 1974), with one more alternative: that none of the poses is right. Of the
-different poses (see `modes`) of an estimate from N target views, pose k has the probability
+different poses (see `modes`) of an estimate, pose k has the probability
 
-    p_k = \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
-    a = \exp(\alpha_0 + \alpha_1 \log N),   b = \beta_0 + \beta_1 \log N + \beta_2 s + \beta_3 g,
+    p_k = (1 - \lambda (1 - span)) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
+    \log a = \alpha . x,   b = \beta . x.
 
-where s is the standard deviation of the target views' feature similarity to the reference, and g that part of the best
-score which compares shapes (overlap, silhouettes and free space). If s is small, the features hardly distinguish the
-sides of the object; if g is small, the two shapes do not fit under any pose that was found. What the p_k leave of 1 is
+x is what is known about the estimate beside the scores (see `Evidence`), above all the span: how far around the target
+its views go. Where they show one side only, the best pose turns that side to the reference, and whether the reference
+shows another side that looks alike cannot be known: \lambda is the chance of such a side. What the p_k leave of 1 is
 the probability of none of these. The confidence of an estimate is p_1. `metrics.reliability` measures how well such
 probabilities are calibrated.
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -24,25 +24,44 @@ TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, anoth
 
 
 @dataclass(frozen=True)
+class Evidence:
+    r"""What the probabilities of an estimate depend on, beside the scores of its poses.
+
+    Attributes:
+        span: Share of the circle around the target that its views span, in [0, 1) (see `cameras.view_span`).
+        log_views: Logarithm of the number N of target views.
+        nearness: \exp(-(\theta / 45 degrees)^2), where \theta is the angle between the reference's camera and the
+            nearest target view's under the best pose.
+        view_std: Standard deviation of the target views' feature similarity to the reference. If it is small, the
+            features hardly distinguish the sides of the object.
+        shape_fit: The part of the best score that compares shapes (overlap, silhouettes and free space). If it is
+            small, the two shapes do not fit under any pose that was found.
+    """
+
+    span: float
+    log_views: float
+    nearness: float
+    view_std: float
+    shape_fit: float
+
+
+@dataclass(frozen=True)
 class Calibration:
-    r"""The six coefficients, fitted on validation categories of equal weight for N = 1 to 10 (`tools/tuning.py`)."""
+    r"""The coefficients \alpha and \beta of a constant and the `Evidence`, in its order, and \lambda.
 
-    scale: float = -1.01  # \alpha_0
-    scale_views: float = 0.52  # \alpha_1
-    none: float = 1.23  # \beta_0
-    none_views: float = -0.99  # \beta_1
-    none_std: float = -32.6  # \beta_2
-    none_shape: float = -0.339  # \beta_3
+    They are fitted on validation categories of equal weight, with target views all around the object and within arcs
+    of 30 to 120 degrees (`tools/tuning.py`).
+    """
 
-    def probabilities(
-        self, deficit: Float[np.ndarray, "*batch m"], n_views: float | Float[np.ndarray, "*batch 1"],
-        view_std: float | Float[np.ndarray, "*batch 1"], shape_fit: float | Float[np.ndarray, "*batch 1"],
-    ) -> Float[np.ndarray, "*batch m"]:  # fmt: skip
+    scale: tuple[float, ...] = (-0.31, 1.41, 0.03, -0.91, 0.65, -0.077)  # \alpha
+    none: tuple[float, ...] = (0.21, -3.86, 0.72, 1.62, -39.9, -0.334)  # \beta
+    unseen: float = 0.126  # \lambda
+
+    def probabilities(self, deficit: Float[np.ndarray, " m"], evidence: Evidence) -> Float[np.ndarray, " m"]:
         """Return the probabilities of different poses; the `deficit` S_1 - S_k is infinite for no pose."""
-        log_n = np.log(n_views)
-        odds = np.exp(-np.exp(self.scale + self.scale_views * log_n) * deficit)
-        none = self.none + self.none_views * log_n + self.none_std * view_std + self.none_shape * shape_fit
-        return odds / (np.exp(none) + odds.sum(axis=-1, keepdims=True))
+        x = np.array([1.0, *astuple(evidence)])
+        odds = np.exp(-np.exp(x @ self.scale) * deficit)
+        return (1 - self.unseen * (1 - evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
@@ -62,12 +81,11 @@ def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
 
 
 def hypothesis_probabilities(
-    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], n_views: int, view_std: float, shape_fit: float,
-    calibration: Calibration,
-) -> Float[np.ndarray, " m"]:  # fmt: skip
+    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], evidence: Evidence, calibration: Calibration
+) -> Float[np.ndarray, " m"]:
     """Return the probability of each hypothesis; over different poses they sum to at most 1."""
     different, probability = different_poses(mode), np.empty(len(score))
-    probability[different] = calibration.probabilities(score[0] - score[different], n_views, view_std, shape_fit)
+    probability[different] = calibration.probabilities(score[0] - score[different], evidence)
     return probability[mode]
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera
+from zsp_lite.data.cameras import Camera, view_span
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
@@ -47,6 +47,7 @@ class Scene:
     target_cameras: tuple[Camera, ...]  # cameras of the targets
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]  # points of reference and target, per target
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
+    view_span: float  # angle in degrees that the target views span around the target
 
     @property
     def view_similarity_std(self) -> float:
@@ -109,6 +110,9 @@ def build_scene(
         target_cameras=tuple(target.frame.camera for target in targets),
         matches=tuple(matched),
         view_similarity=view_similarities - view_similarities.mean(),
+        view_span=view_span(
+            [target.frame.camera for target in targets], first.to_world(target_to_working.inverse().apply(np.zeros(3)))
+        ),
     )
 
 

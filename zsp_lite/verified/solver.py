@@ -7,17 +7,30 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.confidence import Calibration, hypothesis_probabilities, is_one_of_two, modes, nearly_as_probable
+from zsp_lite.verified.confidence import (
+    Calibration,
+    Evidence,
+    hypothesis_probabilities,
+    is_one_of_two,
+    modes,
+    nearly_as_probable,
+)
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import TERM_NAMES, ScoreTerms, ScoreCoefficients, score_terms
+from zsp_lite.verified.verification import (
+    TERM_NAMES,
+    VIEWPOINT_SIGMA,
+    ScoreCoefficients,
+    ScoreTerms,
+    score_terms,
+)
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
@@ -111,20 +124,23 @@ class VerifiedSolver:
                 best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 angles = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
-                hypotheses = self._hypotheses(scene, poses, terms, angles.argmin(axis=1), order)
+                hypotheses = self._hypotheses(scene, poses, terms, angles, order)
         view_angles = np.empty(len(order))
         view_angles[list(order)] = angles[0]
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
 
     def _hypotheses(
-        self, scene: Scene, poses: Poses, terms: ScoreTerms, views: Int[np.ndarray, " m"], order: Sequence[int]
+        self, scene: Scene, poses: Poses, terms: ScoreTerms, angles: Float[np.ndarray, "m v"], order: Sequence[int]
     ) -> tuple[Hypothesis, ...]:
         """Build the hypotheses of ranked poses, each with the view of the scene that is closest under it."""
+        views = angles.argmin(axis=1)
         score, shape_fit = (one.score(terms).double().numpy() for one in (self.weights, self.weights.of_shape()))
         mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-        confidence = hypothesis_probabilities(
-            score, mode, len(order), scene.view_similarity_std, shape_fit[0], self.calibration
+        nearness = float(np.exp(-((angles[0].min() / VIEWPOINT_SIGMA) ** 2)))
+        evidence = Evidence(
+            scene.view_span / 360, float(np.log(len(order))), nearness, scene.view_similarity_std, float(shape_fit[0])
         )
+        confidence = hypothesis_probabilities(score, mode, evidence, self.calibration)
         sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
         named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
         parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
