@@ -229,6 +229,7 @@ def test_pickles_are_not_read(tmp_path):
     torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
     (folder / "model.safetensors").unlink()
     refused(f"hf:{folder}", "no model.safetensors")
+    refused(f"hf:{tmp_path}", "no config.json")
 
 
 @pytest.mark.parametrize(
@@ -282,7 +283,3 @@ def test_what_the_hub_refuses_is_told_in_one_line(monkeypatch):
 @pytest.mark.parametrize("name", ["hf:", "hf:a/b/c", "hf:../nowhere", "hf:a b", "hf:facebook/dinov2-small"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
     refused(name, "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives")
-
-
-def test_a_folder_that_is_no_model_is_refused(tmp_path):
-    refused(f"hf:{tmp_path}", "no config.json")

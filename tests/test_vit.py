@@ -116,12 +116,8 @@ def test_position_embedding_is_itself_on_its_own_grid_and_interpolated_on_others
     stored = model.pos_embed[:, 1:].reshape(1, 4, 4, DIM).permute(0, 3, 1, 2)
     expected = F.interpolate(stored, scale_factor=((24 // 8 + 0.1) / 4, (48 // 8 + 0.1) / 4), mode="bicubic")
     torch.testing.assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, -1, DIM))
-
-
-def test_a_larger_image_gives_a_larger_grid(model):
     with torch.no_grad():
-        tokens = model.extract(torch.zeros(1, 3, 24, 48), 0)
-    assert tokens.grid == (3, 6) and tokens.keys.shape == (1, 18, DIM)
+        assert model.extract(torch.zeros(1, 3, 24, 48), 0).grid == (3, 6)
 
 
 @pytest.mark.parametrize("arguments", [(33, 8, 48, 1, 6), (32, 8, 50, 1, 6), (32, 8, 48, 0, 6)])
