@@ -232,7 +232,7 @@ def by_stage(estimate: PoseEstimate) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     "setting, value, first_changed",
     [
-        ("saliency_threshold", 0.6, "foreground"), ("foreground", "mask", "foreground"), ("k", 20, "scores"),
+        ("foreground", "mask", "foreground"), ("k", 20, "scores"),
         ("kmeans", False, "scores"), ("seed", 1, "scores"), ("cycle_from", "target", "scores"),
         ("matcher", "dual softmax", "scores"), ("binning", False, "scores"), ("view_selector", "global", "scores"),
         ("view_selector", "saliency", "scores"), ("view_selector", "cyclical", "scores"),
@@ -434,7 +434,6 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
         {"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"solver": "best"}, {"threshold": -1},
         {"k": 0}, {"k": 2.5}, {"k": True}, {"trials": 10.5}, {"trials": 0}, {"sample_size": 2}, {"sample_size": 4.0},
         {"seed": -1}, {"seed": 0.5}, {"threshold": 0}, {"threshold": np.inf}, {"threshold": np.nan}, {"threshold": "0.2"}, {"threshold": True},
-        {"saliency_threshold": np.nan}, {"saliency_threshold": np.inf}, {"saliency_threshold": "x"},
     ],
     ids=str,
 )  # fmt: skip

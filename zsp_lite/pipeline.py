@@ -16,7 +16,7 @@ from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
-from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor
+from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match
 from zsp_lite.matching import similarities as cosine_similarities
@@ -42,7 +42,6 @@ class ZeroShotPose:
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
             deviation.)
         sample_size: Points per RANSAC trial.
-        saliency_threshold: A patch is foreground if its saliency is above this. The default is the published code's.
         foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency
             need "mask".
         cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the cycle step of the
@@ -69,7 +68,6 @@ class ZeroShotPose:
     trials: int = 1000
     threshold: float = 0.2
     sample_size: int = 4
-    saliency_threshold: float = SALIENCY_THRESHOLD
     foreground: Literal["saliency", "mask"] = "saliency"
     cycle_from: Literal["reference", "target"] = "reference"
     matcher: str | Matcher = "cyclical"
@@ -97,7 +95,6 @@ class ZeroShotPose:
             name = getattr(self.backbone, "name", type(self.backbone).__name__)
             raise InputError(f"foreground is 'saliency', which {name} does not have; expected 'mask'")
         check_number("threshold", self.threshold, above=0)
-        check_number("saliency_threshold", self.saliency_threshold)
 
     @property
     def clusters(self) -> bool:
@@ -192,7 +189,7 @@ class ZeroShotPose:
         return replace(turn_reference_back(best, reference, quarters), timings=dict(timings))
 
     def _views(self, crops: Sequence[Frame]) -> list[View]:
-        return extract_views(self.backbone, crops, self.foreground, self.saliency_threshold)
+        return extract_views(self.backbone, crops, self.foreground)
 
     def _solve(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None

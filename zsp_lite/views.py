@@ -11,11 +11,10 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame, turn_frame
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
-_MOST_PIXELS = 4096
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
 _MASK_SHARE = 0.25
 
@@ -56,9 +55,6 @@ class View:
         """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`).
 
         Computed on first use: of N target views the paper's solver needs only those of the chosen one.
-
-        Raises:
-            InputError: The frame has no known depth.
         """
         return self._patch_points(inpaint=True)
 
@@ -68,13 +64,7 @@ class View:
         return self._patch_points(inpaint=False)
 
     def _patch_points(self, inpaint: bool) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        name = self.frame.name or "frame"
-        if self.frame.depth is None:
-            raise InputError(f"{name}: no depth map, expected one to unproject matches")
-        try:
-            return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
+        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint)
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
@@ -83,14 +73,8 @@ class View:
 
 
 def crop_size(backbone: FeatureExtractor | None) -> int:
-    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one.
-
-    Raises:
-        InputError: `image_size` is not an integer from 1 to 4096.
-    """
-    size = getattr(backbone, "image_size", IMAGE_SIZE)
-    check_integer("image_size of the backbone", size, 1, _MOST_PIXELS)
-    return size
+    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one."""
+    return getattr(backbone, "image_size", IMAGE_SIZE)
 
 
 def has_saliency(backbone: FeatureExtractor | None) -> bool:
@@ -99,67 +83,32 @@ def has_saliency(backbone: FeatureExtractor | None) -> bool:
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
-    """Crop a frame to its object and resize it to (size, size), not keeping its aspect (supplement, "Object crops").
+    """Crop a frame to its object and resize it to size x size pixels (supplement, "Object crops").
 
-    A frame without a mask, or with an empty one, is not cropped.
-
-    Args:
-        frame: Frame, whole.
-        size: Pixels; see `crop_size` for the size that a backbone takes.
+    The aspect is not kept. A frame without a mask, or with an empty one, is not cropped.
     """
     return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
 
 
-def extract_views(
-    backbone: FeatureExtractor,
-    frames: Sequence[Frame],
-    foreground: str = "saliency",
-    saliency_threshold: float = SALIENCY_THRESHOLD,
-) -> list[View]:
-    """Extract the views of cropped frames, their features in one batch.
+def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency") -> list[View]:
+    """Extract the views of object crops, their features in one batch; see `frame_view` for the foreground."""
+    maps = backbone([crop.rgb for crop in crops])
+    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps)]
 
-    Args:
-        backbone: Computes the features.
-        frames: Object crops (see `object_crop`).
-        foreground: "saliency" or "mask" (see `frame_view`).
-        saliency_threshold: A patch is foreground if its saliency is above this.
+
+def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") -> View:
+    """Combine an object crop with its features and its foreground patches.
+
+    The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches of which the frame's
+    mask covers at least a quarter. A frame with an empty mask has no foreground.
     """
-    if not callable(backbone):
-        raise InputError(f"backbone is {backbone!r}, expected a callable that maps images to feature maps")
-    maps = backbone([frame.rgb for frame in frames])
-    return [frame_view(frame, features, foreground, saliency_threshold) for frame, features in zip(frames, maps)]
-
-
-def frame_view(
-    frame: Frame, features: FeatureMap, foreground: str = "saliency", saliency_threshold: float = SALIENCY_THRESHOLD
-) -> View:
-    """Combine a cropped frame with its features and its foreground patches.
-
-    A frame with an empty mask has no foreground.
-
-    Args:
-        frame: Object crop.
-        features: Features of its image.
-        foreground: "saliency" for patches whose saliency is above the threshold, or "mask" for patches of which the
-            frame's mask covers at least a quarter.
-        saliency_threshold: A patch is foreground if its saliency is above this.
-
-    Raises:
-        InputError: foreground is "mask" and the frame has no mask.
-    """
-    if foreground == "mask" or (frame.mask is not None and not frame.mask.any()):
-        return View(frame, features, patch_mask(frame, features.grid).to(features.keys.device), frame.mask)
-    soft = soft_saliency(features, frame.camera.size, saliency_threshold)
-    return View(frame, features, features.foreground(saliency_threshold), soft)
+    if foreground == "mask" or (crop.mask is not None and not crop.mask.any()):
+        return View(crop, features, patch_mask(crop, features.grid).to(features.keys.device), crop.mask)
+    return View(crop, features, features.foreground(), soft_saliency(features, crop.camera.size))
 
 
 def turn_view(view: View, quarters: int) -> View:
-    """Turn a view with its feature maps and masks by quarter turns; features are not computed again.
-
-    Args:
-        view: The view.
-        quarters: Number of turns by 90 degrees, counterclockwise as in `numpy.rot90`.
-    """
+    """Turn a view with its feature maps and masks by quarter turns, counterclockwise as in `numpy.rot90`."""
     features = view.features
     keys, saliency, foreground = (
         torch.rot90(values, quarters, (0, 1)) for values in (features.keys, features.saliency, view.foreground)
@@ -170,17 +119,9 @@ def turn_view(view: View, quarters: int) -> View:
 
 
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
-    """Select the target views that a pose can be estimated in.
+    """Select the target views that a pose can be estimated in: those without a `frame_defect`, with a foreground patch.
 
-    Args:
-        targets: Target views.
-
-    Returns:
-        The indices of the views without a `frame_defect` and with a foreground patch, and for each other view a flag
-        that names it and the reason.
-
-    Raises:
-        InputError: No view is usable.
+    Returns their indices, and for each other view a flag that names it and the reason. InputError if none is usable.
     """
     usable, flags = [], []
     for index, target in enumerate(targets):
@@ -194,26 +135,17 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
     return usable, tuple(flags)
 
 
-def soft_saliency(
-    features: FeatureMap, size: tuple[int, int], threshold: float = SALIENCY_THRESHOLD
-) -> Float[np.ndarray, "height width"]:
-    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the threshold, 1 from twice the threshold on.
+def soft_saliency(features: FeatureMap, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
+    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on.
 
-    Args:
-        features: Features of the image.
-        size: (height, width) of the mask in pixels; values are interpolated between the patches' centres.
-        threshold: Threshold of the foreground.
+    `size` is (height, width) in pixels; values are interpolated between the patches' centres.
     """
-    ramp = (features.saliency.cpu().numpy() / max(2 * threshold, 1e-6)).clip(0, 1)
+    ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
-    """Select the patches of which the frame's mask covers at least a quarter.
-
-    Raises:
-        InputError: The frame has no mask.
-    """
+    """Select the patches of which the frame's mask covers at least a quarter."""
     if frame.mask is None:
         raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
     covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)

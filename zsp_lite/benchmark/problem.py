@@ -23,7 +23,7 @@ RESERVED = (
     "error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two",
 )  # fmt: skip
 # What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
-_MATCH_SETTINGS = ("k", "clusters", "foreground", "saliency_threshold", "cycle_from", "matcher", "binning")
+_MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,11 +153,9 @@ class Problem:
         """Return what an extractor computes from each crop (see `extractors.EXTRACTORS`)."""
         return [self.store.describe(features, key) for key in self.keys]
 
-    def views(
-        self, features: str = "backbone", foreground: str = "saliency", saliency_threshold: float = 0.05
-    ) -> list[View]:
+    def views(self, features: str = "backbone", foreground: str = "saliency") -> list[View]:
         """Return the crops with their features and foregrounds (see `views.frame_view`)."""
-        return [self.store.view(features, key, foreground, saliency_threshold) for key in self.keys]
+        return [self.store.view(features, key, foreground) for key in self.keys]
 
     def first_cameras(self) -> tuple[Camera, Camera]:
         """Return the cameras of the first frame of the reference's and the target's sequence."""
@@ -180,7 +178,7 @@ class Problem:
         return self._shared[name]
 
     def _estimate(self, features: str, method: ZeroShotPose, target: int | None) -> PoseEstimate:
-        reference, *views = self.views(features, method.foreground, method.saliency_threshold)
+        reference, *views = self.views(features, method.foreground)
         keys = self.keys[1:]
         if target is not None:
             keys, views = [keys[target]], [views[target]]

@@ -81,12 +81,12 @@ class FrameStore:
         """Return the result of an earlier `describe`, None if there is none."""
         return self._entry(key).descriptions.get(features)
 
-    def view(self, features: str, key: FrameKey, foreground: str, saliency_threshold: float) -> View:
+    def view(self, features: str, key: FrameKey, foreground: str) -> View:
         """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
-        views, name = self._entry(key).views, (features, foreground, saliency_threshold)
+        views, name = self._entry(key).views, (features, foreground)
         if name not in views:
             feature_map = self.describe(features, key)
-            views[name] = frame_view(self.frame(key), feature_map, foreground, saliency_threshold)
+            views[name] = frame_view(self.frame(key), feature_map, foreground)
         view = views[name]
         # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
         for other in views.values():
