@@ -216,10 +216,7 @@ def fits_with_one_outlier(
 
 
 def trials_over_good_share(
-    shares: Real[np.ndarray, " n"],
-    needed: Mapping[str, Sequence[float]],
-    trials: int,
-    marks: Mapping[str, float],
+    shares: Real[np.ndarray, " n"], needed: Mapping[str, Sequence[float]], trials: int, marks: Mapping[str, float]
 ) -> Figure:
     """Show how many trials are needed over the share of good matches; lines mark a number of trials and some shares."""
     figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")

@@ -40,10 +40,7 @@ def plain_text(text: str) -> str:
 
 
 def show_images(
-    images: Sequence[np.ndarray],
-    titles: Sequence[str] | None = None,
-    columns: int | None = None,
-    size: float = 2.4,
+    images: Sequence[np.ndarray], titles: Sequence[str] | None = None, columns: int | None = None, size: float = 2.4
 ) -> tuple[Figure, list[Axes]]:
     """Show images in a grid, without ticks. Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
 
@@ -95,13 +92,7 @@ def overlay_map(
     values = np.ma.masked_invalid(np.asarray(values, dtype=np.float64))
     low, high = limits or (None, None)
     drawn = axis.imshow(
-        values,
-        cmap=cmap,
-        alpha=alpha,
-        extent=(left, right, bottom, top),
-        interpolation="nearest",
-        vmin=low,
-        vmax=high,
+        values, cmap=cmap, alpha=alpha, extent=(left, right, bottom, top), interpolation="nearest", vmin=low, vmax=high
     )
     if label is not None:
         bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
@@ -205,8 +196,7 @@ def show_maps(
 
 
 def pca_colours(
-    maps: Sequence[Real[np.ndarray, "rows cols d"]],
-    foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None,
+    maps: Sequence[Real[np.ndarray, "rows cols d"]], foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None
 ) -> list[Float[np.ndarray, "rows cols 3"]]:
     """Map features to colours by their first three principal components, which all maps share.
 
@@ -229,11 +219,7 @@ def pca_colours(
 
 
 def draw_points(
-    axis: Axes,
-    camera: Camera,
-    points: Real[np.ndarray, "n 3"],
-    colours: np.ndarray | str = BLUE,
-    size: float = 5.0,
+    axis: Axes, camera: Camera, points: Real[np.ndarray, "n 3"], colours: np.ndarray | str = BLUE, size: float = 5.0
 ) -> None:
     """Draw points of a camera's frame in its image, far ones first; those behind the camera are left out."""
     points = np.asarray(points, dtype=np.float64)
@@ -268,13 +254,7 @@ def draw_axes(
             pixels[0],
             zorder=6,
             annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": colour,
-                "linewidth": 2,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
+            arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0},
         )
         axis.text(
             *end,

@@ -381,11 +381,7 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
 
 
 # The clouds fill the scene. The eye is above the target camera, to its right.
-_CLOSE = {
-    "up": {"x": 0, "y": -1, "z": 0},
-    "eye": {"x": 0.75, "y": -0.5, "z": -1.2},
-    "center": {"x": 0, "y": 0, "z": 0},
-}
+_CLOSE = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
 
 
 def _two_poses_figure(estimate: PoseEstimate) -> Figure:

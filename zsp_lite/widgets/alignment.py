@@ -1,7 +1,5 @@
 """Widgets on alignment: the settings of RANSAC, and the effect of one outlier on least squares."""
 
-from typing import TYPE_CHECKING
-
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Real
@@ -11,11 +9,8 @@ from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
-from zsp_lite.widgets.common import interactive_figure, load_package, slider
+from zsp_lite.widgets.common import Widget, interactive_figure, load_package, slider
 from zsp_lite.widgets.views import match_canvas
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
 
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -25,7 +20,7 @@ def ransac_settings(
     pixels: tuple[Real[np.ndarray, "n 2"], Real[np.ndarray, "n 2"]],
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
-) -> "VBox":
+) -> Widget:
     """Show the inliers of RANSAC on the matches of two images; choose trials, threshold and seed.
 
     A match is given by its pixels (x, y) in both images, which have one size, and its points in both camera frames.
@@ -71,7 +66,7 @@ def ransac_settings(
     return interactive_figure(figure, controls, update, alt)
 
 
-def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> "VBox":
+def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Widget:
     """Show the least-squares fit of corresponding points while the last target point moves along x.
 
     The plot shows x to the right and y down. The caption compares the fit with that of the unmoved points.

@@ -31,8 +31,9 @@ from matplotlib.patheffects import Normal, Stroke
 from zsp_lite.errors import InputError
 
 if TYPE_CHECKING:
-    from ipywidgets import ValueWidget, VBox
+    from ipywidgets import ValueWidget
 
+Widget = Any  # an ipywidgets.VBox; the package is imported when a widget is made
 MAX_HEIGHT = "420px"  # of a picture
 _LABEL = {"description_width": "initial"}
 
@@ -54,9 +55,10 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     return kind(value, min=low, max=high, step=step, description=label, style=_LABEL, layout={"width": "22em"}, **form)
 
 
-def patch_slider(label: str, cells: int, value: int) -> "ValueWidget":
-    """Return a slider over the rows or columns of a patch grid, counted from 0."""
-    return slider(label, 0, cells - 1, value)
+def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, "ValueWidget"]:
+    """Return sliders over the rows and columns of a patch grid, counted from 0, that begin at a patch."""
+    names = (("row", f"row{of}"), ("col", f"column{of}"))
+    return {name: slider(label, 0, cells - 1, at) for (name, label), cells, at in zip(names, grid, start)}
 
 
 def choice(label: str, options: list[str], value: str | None = None) -> "ValueWidget":
@@ -67,7 +69,7 @@ def choice(label: str, options: list[str], value: str | None = None) -> "ValueWi
 
 def interactive_figure(
     figure: Figure, controls: Mapping[str, "ValueWidget"], update: Callable[..., str], alt: str
-) -> "VBox":
+) -> Widget:
     """Return a widget of controls above a figure above a caption.
 
     Args:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +17,7 @@ from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import choice, interactive_figure, patch_outline, patch_slider, slider
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, patch_outline, patch_sliders, slider
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -46,7 +42,7 @@ def attention(
     keys: Float[Tensor, "layers tokens dim"],
     grid: tuple[int, int],
     heads: int,
-) -> "VBox":
+) -> Widget:
     """Show the attention weights of one patch over all patches; choose the patch, the layer and the head.
 
     `queries` and `keys` are those of all tokens, CLS first, with the heads concatenated.
@@ -75,7 +71,7 @@ def attention(
         )
 
     controls = {
-        "row": patch_slider("row", grid[0], grid[0] // 2), "col": patch_slider("column", grid[1], grid[1] // 2),
+        **patch_sliders(grid, (grid[0] // 2, grid[1] // 2)),
         "layer": slider("layer", 0, layers - 1, layers * 3 // 4), "head": slider("head", 0, heads - 1, 0),
     }  # fmt: skip
     return interactive_figure(
@@ -89,7 +85,7 @@ def facets(
     features: Mapping[tuple[int, str], tuple[Float[Tensor, "h w d"], Float[Tensor, "h w d"]]],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
-) -> "VBox":
+) -> Widget:
     """Show the similarities of one patch, its nearest neighbour and its true match; choose patch, layer and facet.
 
     `features` maps (layer, facet) to the features of both images; `cells` and `valid` are the true matches of the
@@ -115,9 +111,8 @@ def facets(
             "nearest neighbour within one patch of it."
         )
 
-    row, col = _first_patch(valid)
     controls = {
-        "row": patch_slider("row", grid[0], row), "col": patch_slider("column", grid[1], col),
+        **patch_sliders(grid, _first_patch(valid)),
         "layer": slider("layer", layers[0], layers[-1], layers[len(layers) * 3 // 4]),
         "facet": choice("facet", names, "key" if "key" in names else None),
     }  # fmt: skip
@@ -131,7 +126,7 @@ def context(
     keys: tuple[Float[Tensor, "h w d"], Float[Tensor, "h w d"]],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
-) -> "VBox":
+) -> Widget:
     """Show the similarities of one patch by keys alone and by log-binned descriptors."""
     grid = valid.shape
     kinds = {"keys": key_similarities(keys[0], [keys[1]])[0], "log-binned": similarity(*keys)}
@@ -146,13 +141,11 @@ def context(
             texts.append(f"{kind}: {panels.fill(panel, similar, np.array(np.unravel_index(similar.argmax(), grid)))}")
         return "<br>".join(texts)
 
-    row, col = _first_patch(valid)
-    controls = {"row": patch_slider("row", grid[0], row), "col": patch_slider("column", grid[1], col)}
     alt = "A patch of the reference; its similarities in the target without and with context."
-    return interactive_figure(panels.figure, controls, update, alt)
+    return interactive_figure(panels.figure, patch_sliders(grid, _first_patch(valid)), update, alt)
 
 
-def saliency(view: View) -> "VBox":
+def saliency(view: View) -> Widget:
     """Show the foreground patches above a saliency threshold, and their overlap with the object mask."""
     grid, values = view.features.grid, view.features.saliency.cpu().numpy()
     truth = patch_mask(view.frame, grid)
@@ -225,7 +218,5 @@ class _SimilarityPanels:
 def _first_patch(valid: Bool[np.ndarray, "rows cols"]) -> tuple[int, int]:
     """Return the patch with a true match that is closest to the median of all such patches."""
     cells = np.argwhere(valid)
-    if not len(cells):
-        raise InputError("no patch of the reference has a true match in the target, expected at least one")
     row, col = cells[np.abs(cells - np.median(cells, axis=0)).sum(axis=1).argmin()]
     return int(row), int(col)

@@ -17,15 +17,14 @@ from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
 from zsp_lite.labelling.session import OPEN, Labelling
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.cloud_view import subsample
+from zsp_lite.widgets.common import Widget
 from zsp_lite.widgets.labelling_panel import NEW_KEYPOINT, Panel
 
 if TYPE_CHECKING:
-    from ipywidgets import VBox
-
     from zsp_lite.backbones.backbone import Backbone
 
 
-def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> "VBox":
+def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> Widget:
     """Label a category: the point cloud of the reference on the left, that of the current sequence on the right.
 
     Args:

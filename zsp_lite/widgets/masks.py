@@ -9,16 +9,14 @@ from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
-from zsp_lite.widgets.common import interactive_figure, slider
+from zsp_lite.widgets.common import Widget, interactive_figure, slider
 
 if TYPE_CHECKING:
-    from ipywidgets import VBox
-
     from zsp_lite.data.cameras import Box
     from zsp_lite.data.frames import Frame
 
 
-def box_to_mask(frame: "Frame", box: "Box") -> "VBox":
+def box_to_mask(frame: "Frame", box: "Box") -> Widget:
     """Show the mask that GrabCut segments in a bounding box; choose the sides of the box.
 
     The initial box is (top, left, height, width) in pixels. If the frame has a mask, the caption gives the overlap.

@@ -1,7 +1,6 @@
 """Widgets on matching: the cycle of one patch, and the matches of every matcher."""
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,13 +14,11 @@ from zsp_lite.matching import match, nearest_neighbours
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import choice, interactive_figure, load_package, patch_outline, patch_slider, slider
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
+from zsp_lite.widgets import common
+from zsp_lite.widgets.common import Widget, interactive_figure, patch_outline, patch_sliders
 
 
-def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
+def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     """Show the cycle of a reference patch (eq. 2).
 
     v is the nearest neighbour of the patch u in the target, u' the nearest neighbour of v in the reference, and
@@ -72,10 +69,8 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> "VBox":
             + (f"; {', '.join(background)} not on the foreground, so the distance is infinite." if background else ".")
         )
 
-    row, col = np.unravel_index(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax(), grid)
-    controls = {
-        "row": patch_slider("row of u", grid[0], int(row)), "col": patch_slider("column of u", grid[1], int(col)),
-    }  # fmt: skip
+    start = divmod(int(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax()), grid[1])
+    controls = patch_sliders(grid, start, " of u")
     alt = "A solid line from the outlined patch u to its nearest neighbour v, a dashed line from v to the circle u'."
     return interactive_figure(figure, controls, update, alt)
 
@@ -86,7 +81,7 @@ def matches(
     sim: Float[Tensor, "n1 n2"],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
-) -> "VBox":
+) -> Widget:
     """Show which matches are correct; choose the matcher, the number of matches and k-means."""
     grid = reference.features.grid
     height, width = reference.frame.rgb.shape[:2]
@@ -137,7 +132,7 @@ def matches(
         )
 
     controls = {
-        "matcher": choice("matcher", ["cyclical", *MATCHERS]), "k": slider("K", 5, 100, 50, 5),
-        "kmeans": load_package().Checkbox(value=True, description="k-means on the best 2K", indent=False),
+        "matcher": common.choice("matcher", ["cyclical", *MATCHERS]), "k": common.slider("K", 5, 100, 50, 5),
+        "kmeans": common.load_package().Checkbox(value=True, description="k-means on the best 2K", indent=False),
     }  # fmt: skip
     return interactive_figure(figure, controls, update, "Two objects and lines between matched patches.")

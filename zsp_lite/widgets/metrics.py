@@ -1,7 +1,6 @@
 """Widgets on metrics: the uncertainty of a measured accuracy, and rotation errors of symmetric objects."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,10 +10,7 @@ from scipy.stats import binom
 from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.widgets.common import choice, interactive_figure, slider
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider
 
 _STEP = 5  # degrees between the angles with precomputed distances
 
@@ -29,7 +25,7 @@ def order_probabilities(n: int, first: float, second: float) -> tuple[float, flo
     return float(probability @ binom.cdf(k - 1, n, first)), float(probability @ binom.sf(k, n, first))
 
 
-def measured_accuracy() -> "VBox":
+def measured_accuracy() -> Widget:
     """Show the distributions of the measured Acc30 of two methods.
 
     The controls are the number of pairs, the true accuracy of the first method, and the gain of the second. The
@@ -80,7 +76,7 @@ def rotated_distance(
     return np.array([search.kneighbors(_rotate_z(cloud, angle))[0].mean() for angle in np.asarray(degrees, np.float64)])
 
 
-def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
+def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> Widget:
     """Show an object rotated about z over itself, with its rotation error and its closest-point distance.
 
     The clouds, by name, are centred, in scene units with z up, and have about a thousand points each.
@@ -113,15 +109,12 @@ def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> "VBox":
             f"{100 * distance / curves[cloud].max():.0f} % of its maximum over all angles."
         )
 
-    controls = {
-        "cloud": choice("object", list(clouds)),
-        "angle": slider("rotated by (degrees)", 0, 180, 180, 5),
-    }
+    controls = {"cloud": choice("object", list(clouds)), "angle": slider("rotated by (degrees)", 0, 180, 180, 5)}
     alt = "A point cloud and its rotated copy from above, and the closest-point distance over the angle"
     return interactive_figure(figure, controls, update, alt)
 
 
-def accuracy_threshold(errors: Mapping[str, Real[np.ndarray, " n"]]) -> "VBox":
+def accuracy_threshold(errors: Mapping[str, Real[np.ndarray, " n"]]) -> Widget:
     """Show the share of pairs within a rotation error (degrees), a bar per method. The control is the threshold."""
     figure, axis = plt.subplots(figsize=(6.5, 3), layout="constrained")
     bars = axis.barh(list(errors), np.zeros(len(errors)), color=BLUE)

@@ -13,11 +13,9 @@ from zsp_lite.verified.poses import rotation_angles
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, forward_terms
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.viz.verified import POINT_CLASSES, classify_points, score_contributions
-from zsp_lite.widgets.common import interactive_figure, slider
+from zsp_lite.widgets.common import Widget, interactive_figure, slider
 
 if TYPE_CHECKING:
-    from ipywidgets import VBox
-
     from zsp_lite.views import View
 
 _MAX_POINTS = 350  # per point cloud in 3D
@@ -26,7 +24,7 @@ _LIMIT = 2.2  # of the 3D axes, in standard deviations of the object
 
 def ranked_hypotheses(
     solution: Solution, targets: Sequence["View"], weights: ScoreCoefficients = ScoreCoefficients()
-) -> "VBox":
+) -> Widget:
     """Show one hypothesis: point clouds in 3D, points in a target view, and the terms of the score.
 
     The controls are the rank of the hypothesis, the target view, and the azimuth of the 3D plot.

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,14 +11,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch
-from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError
+from zsp_lite.data.cameras import Camera, ground_axes
 from zsp_lite.views import View
 from zsp_lite.viz.plots import BLUE, CHOSEN, patch_centres
-from zsp_lite.widgets.common import choice, interactive_figure, slider
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider
 
 _GAP = 16  # pixels between the two images of a `MatchCanvas`
 
@@ -70,21 +65,9 @@ def match_canvas(axis: Axes, first: np.ndarray, second: np.ndarray, titles: tupl
 def viewpoints_from_above(
     cameras: Sequence[Camera], others: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 2"]]:
-    """Project the positions of cameras around an object onto a circle, seen from above.
-
-    The circle lies in the plane of the camera centres, which the singular value decomposition gives. Up is opposite
-    to the mean y axis of the cameras.
-    """
-    centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
-    mean = centres.mean(axis=0) if len(centres) else np.zeros(3)
-    _, spread, axes = np.linalg.svd(centres - mean)
-    if len(centres) < 3 or spread[1] < 0.05 * spread[0]:
-        raise InputError(f"{len(centres)} camera centres are too few or on one line, expected cameras around an object")
-    first, second = axes[:2]
-    down = np.mean([camera.R[1] for camera in cameras], axis=0)
-    if np.cross(first, second) @ down > 0:
-        second = -second
-    flat = [(points - mean) @ np.stack([first, second], axis=1) for points in (centres, np.asarray(others))]
+    """Return unit vectors from the mean camera centre towards the cameras and other camera centres, from above."""
+    centres = np.stack([camera.centre for camera in cameras])
+    flat = [(points - centres.mean(axis=0)) @ ground_axes(cameras).T for points in (centres, others)]
     return tuple(points / np.linalg.norm(points, axis=1, keepdims=True) for points in flat)
 
 
@@ -99,7 +82,7 @@ def best_view(
     pairs: Sequence[ViewMatch],
     positions: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
     angles: Float[np.ndarray, " n"],
-) -> "VBox":
+) -> Widget:
     """Show the best of N target views by each view selector, and its matches.
 
     The controls are the selector, the number of target views, and the first of them. Targets are in the order of the
