@@ -6,10 +6,8 @@ import pytest
 import torch
 from test_matching import feature_map
 
-from zsp_lite.errors import InputError
 from zsp_lite.matchers import MATCHERS, dual_softmax, mutual_nearest_neighbours, optimal_transport, sinkhorn
 from zsp_lite.matching import key_similarities, match
-from zsp_lite.pipeline import ZeroShotPose
 
 
 def similarities(seed: int = 0, n1: int = 12, n2: int = 15) -> torch.Tensor:
@@ -88,10 +86,3 @@ def test_plain_similarity_is_the_cosine_of_the_keys():
     (found,) = key_similarities(first, [second])
     u, v = first.keys[2, 3], second.keys[4, 5]
     assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(float(u @ v / u.norm() / v.norm()), abs=1e-6)
-
-
-def test_a_matcher_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="guess"):
-        match(feature_map(0), feature_map(1), matcher="guess")
-    with pytest.raises(InputError, match="guess"):
-        ZeroShotPose(lambda images: [], matcher="guess")

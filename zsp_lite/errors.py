@@ -75,11 +75,3 @@ def real_array(name: str, values: object) -> "np.ndarray":
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{name} is {reprlib.repr(values)}, expected real numbers") from error
-
-
-def check_seed(name: str, value: object) -> None:
-    """Raise InputError if a value is neither a non-negative integer nor a `numpy.random.Generator`."""
-    import numpy as np
-
-    if not isinstance(value, np.random.Generator):
-        check_integer(name, value, 0)

@@ -35,16 +35,10 @@ class Matcher(Protocol):
         foreground2: Bool[Tensor, " n2"],
         /,
     ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-        """Match the patches of image 1 with those of image 2.
+        """Match the patches of image 1 with those of image 2, given the cosines between their descriptors.
 
-        Args:
-            similarity: (n1, n2) cosines between the patches' descriptors.
-            foreground1: (n1,) which patches of image 1 are foreground.
-            foreground2: (n2,) which patches of image 2 are foreground.
-
-        Returns:
-            For each patch of image 1, the index of its partner in image 2, and the score of the match, higher is
-            better; -inf for no match.
+        Returns for each patch of image 1 the index of its partner in image 2, and the score of the match, higher is
+        better; -inf for no match.
         """
         ...
 
@@ -102,15 +96,9 @@ def optimal_transport(
 
 
 def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
-    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013).
+    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in float64.
 
-    Args:
-        cost: (n1, n2) cost of moving mass.
-        regularisation: Weight of the entropy, in the unit of the cost.
-        steps: Number of Sinkhorn iterations, each of which scales the rows and the columns.
-
-    Returns:
-        (n1, n2) plan in float64; its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
+    Its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
     # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.
     kernel = torch.exp((cost.min() - cost.to(torch.float64)) / regularisation)
