@@ -33,17 +33,6 @@ def from_the_front(mesh, size=48):
     return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), size, margin=1.5)
 
 
-def test_object_coordinates_project_to_the_centres_of_their_pixels():
-    mesh = painted(wedge())
-    camera = view(mesh.vertices)
-    drawn = render(mesh, camera)
-    row, col = np.nonzero(drawn.mask)
-    pixels, depth = camera.project(drawn.canonical[row, col].astype(float))
-    assert pixels == pytest.approx(np.stack([col + 0.5, row + 0.5], 1), abs=2e-3)
-    assert depth == pytest.approx(drawn.depth[row, col], abs=1e-4)
-    assert np.isnan(drawn.canonical[~drawn.mask]).all() and len(row) > 300
-
-
 def intersect(camera, vertices, faces):
     """Depth (h, w) of the nearest triangle at the centre of each pixel, from a linear system each; inf elsewhere."""
     x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
@@ -180,7 +169,7 @@ def test_the_same_seed_gives_the_same_picture_and_vertices_may_have_colours():
     assert (drawn.rgb[drawn.mask].argmax(-1) == 2).all()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_random_room_has_finite_light_and_a_floor_that_reflects_less_than_it_receives(seed):
     room = random_room(seed)
     assert np.linalg.norm(room.light) == pytest.approx(1) and room.light[2] > 0.4

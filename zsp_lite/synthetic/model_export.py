@@ -9,7 +9,7 @@ import numpy as np
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
-from zsp_lite.synthetic.models import Model, list_models
+from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.recording import (
     check_settings,
     read_poses,
@@ -78,7 +78,10 @@ def export_models(
     rendered = _read_rendered(out, {"seed": seed, "frames": frames, "image_size": image_size})
     left_out = {}
     for model in progress(models):
-        record = _record(model, Path(folder))
+        info, file = model.info, model.path.relative_to(folder).as_posix()
+        rotation = tuple(np.round(info.axes(model.path.suffix), 9).ravel().tolist())
+        origin = (info.author, info.licence, info.source, info.changes)
+        record = ModelRecord(file, sha256(model.path, "model"), rotation, *origin)
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
             continue
@@ -101,13 +104,6 @@ def export_models(
         if len(sequences) > 1:
             write_pairs(out, category, _PAIRS, [n for n in _TARGETS if n <= frames], seed)
     return left_out
-
-
-def _record(model: Model, folder: Path) -> ModelRecord:
-    info = model.info
-    rotation = tuple(np.round(info.axes(model.path.suffix), 9).ravel().tolist())
-    file, digest = model.path.relative_to(folder).as_posix(), sha256(model.path, "model")
-    return ModelRecord(file, digest, rotation, info.author, info.licence, info.source, info.changes)
 
 
 def _read_rendered(out: Path, settings: dict[str, int | str]) -> _Rendered:

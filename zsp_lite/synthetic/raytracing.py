@@ -255,7 +255,7 @@ class MeshScene:
     # Background
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
-        """Return the visible shares of the key light and of the room on a grid below the object, and the grid's width."""
+        """Return the visible shares of the key light and of the room on a grid below the object, and its width."""
         extent, light = np.ptp(self.mesh.vertices, axis=0), self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
         n, width = _SHADOW_CELLS, float(extent[:2].max()) + 2 * min(length, 5.0)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
@@ -70,31 +70,26 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[
 
 
 def fused_cloud(
-    views: Sequence[Rendering],
-    depths: Sequence[Float[np.ndarray, "h w"]],
-    n_points: int,
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    views: Sequence[Rendering], depths: Sequence[Float[np.ndarray, "h w"]], n_points: int, rng: np.random.Generator
+) -> list[np.ndarray]:
     """Sample points of the object from the depth maps of all views: world points, unit normals, 8-bit colours."""
-    points, normals, colours = [], [], []
+    parts = []
     for view, depth in zip(views, depths, strict=True):
         row, col = np.nonzero((depth > 0) & view.mask)
-        points.append(view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col]))
-        normals.append(view.normals[row, col] @ view.camera.R)
-        colours.append(view.rgb[row, col])
-    points, normals, colours = (np.concatenate(values) for values in (points, normals, colours))
-    chosen = np.sort(rng.choice(len(points), min(n_points, len(points)), replace=False))
-    return points[chosen], normals[chosen], colours[chosen]
+        points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
+        parts.append((points, view.normals[row, col] @ view.camera.R, view.rgb[row, col]))
+    cloud = [np.concatenate(values) for values in zip(*parts, strict=True)]
+    chosen = np.sort(rng.choice(len(cloud[0]), min(n_points, len(cloud[0])), replace=False))
+    return [values[chosen] for values in cloud]
 
 
 def simulate_capture(
     sequence: RenderedSequence, name: str, rng: np.random.Generator
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Convert an exact rendering to a sequence with the errors of CO3D's data.
+    """Return a rendering as a sequence with the errors of CO3D's data, and the exact rendering in the same unit.
 
     The world is scaled so that the point cloud has unit standard deviation, averaged over its axes. The quality
-    scores are drawn from the range of the sequences that the paper labels. Returns the sequence, and the exact
-    rendering in the same unit.
+    scores are drawn from the range of the sequences that the paper labels.
     """
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
     depths, masks = [], []
