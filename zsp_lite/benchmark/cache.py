@@ -14,30 +14,25 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.io.files import make_folder, write_atomic
 
 _PARTS = ("keys", "saliency", "global_feature")
-_UNCACHED = ("rootsift",)  # computed faster than read
 
 
 class FeatureCache:
     """A folder of feature maps in full precision: results with it equal those without it.
 
-    A file's name is a hash of the library's source, of the extractor's fingerprint and of its input: the crop's
-    pixels, and for extractors with `describe` also the depth, the mask and the camera. Only results of the type
-    FeatureMap are kept. The fingerprint of a user-defined extractor without weights is its name: use another folder
-    when its code changes.
+    A file's name is a hash of the library's source, of the extractor's fingerprint and of the crop's pixels. The
+    fingerprint of a user-defined extractor without weights is its name: use another folder when its code changes.
+    Extractors that see more than the pixels, by `describe`, are not cached.
     """
 
     def __init__(self, folder: str | Path, extractors: Mapping[str, Any]):
-        self.folder, self.extractors = make_folder(folder, "cache folder"), extractors
-        self._fingerprints = {name: fingerprint(one) for name, one in extractors.items() if name not in _UNCACHED}
+        self.folder = make_folder(folder, "cache folder")
+        # RootSIFT is computed faster than read.
+        cached = {name: one for name, one in extractors.items() if name != "rootsift" and not hasattr(one, "describe")}
+        self._fingerprints = {name: fingerprint(one) for name, one in cached.items()}
 
     def path(self, features: str, frame: Frame) -> Path:
         """Return the file of a frame's features."""
-        seen = [frame.rgb]
-        if hasattr(self.extractors[features], "describe"):
-            camera = frame.camera
-            seen += [frame.depth, frame.mask, camera.R, camera.t, camera.focal_length, camera.principal_point]
-        parts = ("none" if part is None else part for part in seen)
-        name = digest(library_version()["source"], self._fingerprints[features], *parts)
+        name = digest(library_version()["source"], self._fingerprints[features], frame.rgb)
         return self.folder / name[:2] / f"{name}.safetensors"
 
     def read(self, features: str, frame: Frame) -> FeatureMap | None:
@@ -50,8 +45,8 @@ class FeatureCache:
         except (OSError, SafetensorError, KeyError, InputError):
             return None
 
-    def write(self, features: str, frame: Frame, found: Any) -> None:
-        """Store features of the type FeatureMap."""
-        if features in self._fingerprints and isinstance(found, FeatureMap):
+    def write(self, features: str, frame: Frame, found: FeatureMap) -> None:
+        """Store features."""
+        if features in self._fingerprints:
             tensors = {part: getattr(found, part).cpu().contiguous() for part in _PARTS}
             write_atomic(self.path(features, frame), save(tensors))

@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import decode_json, read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.io.locks import writing
 
 SETTINGS, RECORDS = "run.json", "run.jsonl"
@@ -34,7 +34,7 @@ class Records:
 
     Attributes:
         rows: By row and pair key, what the row found.
-        evaluations: By pair key, every evaluation as `evaluate_pair` returned it.
+        evaluations: By pair key, what each evaluation cost: "seconds", "timings", "saliency_iou" (see `evaluate_pair`).
         invocations: Calls of `evaluate`, the latest last.
     """
 
@@ -44,8 +44,10 @@ class Records:
 
 
 class _Line(msgspec.Struct):
-    call: dict[str, Any] | None = None
-    pair: str | None = None
+    """A line of run.jsonl; `checked_json` keeps what else it holds."""
+
+    call: dict[str, Any] = {}
+    pair: str = ""
     results: dict[str, dict[str, Any]] = {}
     seconds: float = 0.0
     timings: dict[str, list[float]] = {}
@@ -64,61 +66,60 @@ class _Settings(msgspec.Struct):
     labels: dict[str, str] = {}
 
 
-@dataclass(frozen=True)
-class RunFolder:
-    """A run's folder, open for writing (see `open_run`)."""
-
-    path: Path
-
-    def read(self) -> Records:
-        """Read all lines; none of a run that begins."""
-        return read_records(self.path) if (self.path / RECORDS).exists() else Records()
-
-    def add(self, lines: Iterable[Mapping[str, Any]]) -> None:
-        """Add lines to run.jsonl."""
-        text = "".join(f"{json.dumps(line, separators=(',', ':'))}\n" for line in lines)
-        try:
-            with open(self.path / RECORDS, "ab") as file:
-                file.write(text.encode())
-        except OSError as error:
-            raise InputError(f"{self.path / RECORDS} cannot be written: {error}") from error
-
-
 @contextmanager
-def open_run(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False) -> Iterator[RunFolder]:
-    """Be the only writer of a run's folder, which is new or holds a run with these settings."""
+def open_run(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool = False) -> Iterator[None]:
+    """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
-        folder = RunFolder(Path(out))
-        merged = merged_settings(out, settings, allow_other_version)
-        if (records := folder.path / RECORDS).exists():
+        out = Path(out)
+        merged, records = merged_settings(out, settings, allow_other_version), out / RECORDS
+        if records.exists():
             complete = read_bytes(records, "results of a run").rfind(b"\n") + 1
             os.truncate(records, complete)  # the rest is a line that a killed process was writing
-        write_atomic(folder.path / SETTINGS, json.dumps(merged, indent=1).encode())
-        yield folder
+        write_atomic(out / SETTINGS, json.dumps(merged, indent=1).encode())
+        add_lines(out, [])  # make the file
+        yield
+
+
+def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
+    """Add lines to run.jsonl."""
+    text = "".join(f"{json.dumps(line, separators=(',', ':'))}\n" for line in lines)
+    try:
+        with open(Path(out) / RECORDS, "ab") as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise InputError(f"{Path(out) / RECORDS} cannot be written: {error}") from error
+
+
+def checked_json(data: bytes, kind: Any, what: str) -> Any:
+    """Decode JSON that Python wrote, with NaN; InputError, which begins with `what`, if it is damaged or no `kind`."""
+    try:
+        content = json.loads(data)
+        msgspec.convert(content, kind)
+        return content
+    except (ValueError, RecursionError, msgspec.ValidationError) as error:
+        raise InputError(f"{what}: {error}") from error
 
 
 def read_records(out: str | Path) -> Records:
     """Read what a run has found, finished or interrupted."""
     path, found = Path(out) / RECORDS, Records()
     for number, text in enumerate(read_bytes(path, "results of a run").split(b"\n")[:-1], 1):
-        line = decode_json(text, _Line, f"results of a run {path}, line {number}")
-        if line.call is not None:
-            found.invocations.append(line.call)
-        elif line.pair is not None:
-            for row, result in line.results.items():
-                found.rows.setdefault(row, {})[line.pair] = result
-            cost = {"seconds": line.seconds, "timings": line.timings, "saliency_iou": line.saliency_iou}
-            found.evaluations.setdefault(line.pair, []).append(cost)
+        line = checked_json(text, _Line, f"results of a run {path}, line {number}")
+        if "call" in line:
+            found.invocations.append(line["call"])
+        elif "pair" in line:
+            for row, result in line.pop("results", {}).items():
+                found.rows.setdefault(row, {})[line["pair"]] = result
+            found.evaluations.setdefault(line["pair"], []).append({"timings": {}, "saliency_iou": {}} | line)
         elif found.invocations:
-            found.invocations[-1]["seconds"] = line.seconds
+            found.invocations[-1] |= line
     return found
 
 
 def read_settings(out: str | Path) -> dict[str, Any]:
     """Read run.json."""
-    data = read_bytes(Path(out) / SETTINGS, "settings of a run")
-    decode_json(data, _Settings, f"settings of a run {Path(out) / SETTINGS}")
-    return json.loads(data)
+    path = Path(out) / SETTINGS
+    return checked_json(read_bytes(path, "settings of a run"), _Settings, f"settings of a run {path}")
 
 
 def merged_settings(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool) -> dict[str, Any]:

@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import msgspec
 
-from zsp_lite.benchmark.records import Records, read_records, read_settings
+from zsp_lite.benchmark.records import Records, checked_json, read_records, read_settings
 from zsp_lite.benchmark.summary import category_of, summarise_rows, summarise_run
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import decode_json, decompress, read_bytes, write_atomic
+from zsp_lite.io.files import decompress, read_bytes, write_atomic
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class _Summary(msgspec.Struct):
 
 
 class _File(msgspec.Struct):
-    summary: msgspec.Raw
+    summary: _Summary
     settings: dict[str, Any]
     invocations: list[dict[str, Any]]
     pairs: list[str]
@@ -117,16 +117,14 @@ def read_results(path: str | Path) -> Results:
     if path.is_dir():
         return results_of(read_settings(path), read_records(path))
     what = f"results {path}"
-    file: _File = decode_json(decompress(read_bytes(path, "results"), what), _File, what)
-    summary: _Summary = decode_json(file.summary, _Summary, what)
-    rows = {name: _row(columns, file.pairs) for name, columns in file.rows.items()}
+    content = checked_json(decompress(read_bytes(path, "results"), what), _File, what)
+    summary = content["summary"]
+    rows = {name: _row(columns, content["pairs"]) for name, columns in content["rows"].items()}
     counts = {name: len(row) for name, row in rows.items()}
-    if not counts or counts != {name: row.n for name, row in summary.methods.items()}:
-        raise InputError(
-            f"{what}: summary and rows ({', '.join(rows)}) do not fit, expected a result of every pair once"
-        )
+    if not counts or counts != {name: row["n"] for name, row in summary["methods"].items()}:
+        raise InputError(f"{what}: summary and rows do not fit, expected the rows {', '.join(rows)}, each pair once")
     _check_rows(rows, what)
-    return Results(msgspec.json.decode(file.summary), file.settings, file.invocations, rows)
+    return Results(summary, content["settings"], content["invocations"], rows)
 
 
 def _row(columns: Mapping[str, list[Any]], pairs: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -20,7 +20,7 @@ from zsp_lite.benchmark.execution import (
 from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
-from zsp_lite.benchmark.records import open_run
+from zsp_lite.benchmark.records import add_lines, open_run, read_records
 from zsp_lite.benchmark.results import results_of
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
@@ -95,13 +95,13 @@ def evaluate(
         check_integer("threads", threads, 1, MOST_WORKERS)
     if cache is not None:
         cache = make_folder(cache, "cache folder").resolve()  # before anything is written
-    with open_run(out, settings, allow_other_version) as folder, open_workers(executor, workers) as opened:
+    with open_run(out, settings, allow_other_version), open_workers(executor, workers) as opened:
         threads = threads or max(1, available_cores() // opened.number)
         setup = Setup(
             str(Path(root).resolve()), rows, backbone if named else loaded, settings["backbone"], cache, threads,
             keep_hypotheses,
         )  # fmt: skip
-        known = folder.read().rows
+        known = read_records(out).rows
         todo = {
             category: {
                 pair: names for pair, every in found.items()
@@ -112,12 +112,12 @@ def evaluate(
         total, left = sum(map(len, work.values())), sum(map(len, todo.values()))
         where = executor if isinstance(executor, str) else type(opened.executor).__name__ if opened.executor else None
         call = {"executor": where, "workers": opened.number, "threads": threads, "rows": list(rows)}
-        folder.add([{"call": environment() | call | {"categories": list(work), "pairs": left}}])
+        add_lines(out, [{"call": environment() | call | {"categories": list(work), "pairs": left}}])
         done = total - left
 
         def save(evaluated: list[dict[str, Any]]) -> None:
             nonlocal done
-            folder.add(evaluated)
+            add_lines(out, evaluated)
             done += len(evaluated)
             if progress is not None:
                 progress(done, total)
@@ -126,8 +126,8 @@ def evaluate(
         size = max(1, min(CHUNK_SIZE, left // (4 * opened.number)))
         chunks = [chunk for found in todo.values() if found for chunk in make_chunks(found, size)]
         evaluate_chunks(setup, chunks, opened, save, extractors)
-        folder.add([{"seconds": round(time.perf_counter() - start, 2)}])
-        summary = results_of(settings, folder.read()).summary
+        add_lines(out, [{"seconds": round(time.perf_counter() - start, 2)}])
+        summary = results_of(settings, read_records(out)).summary
         write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
     return summary
 
