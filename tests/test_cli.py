@@ -99,6 +99,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["demo", "--layer", "block12"], "'block0' to 'block11'"),
         (["benchmark", "--layer", "-13"], "'-13'"),
         (["benchmark", "--methods", "magic"], "magic"),
+        (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
         (["weights", "fetch", "resnet"], "resnet"),
@@ -112,11 +113,6 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys,
     assert cli.main(arguments + data) == 2
     assert names in assert_one_line(capsys)
     assert not list(tmp_path.iterdir())
-
-
-def test_an_unknown_category_is_reported_with_the_known_ones(capsys, ellipsoids):
-    assert cli.main(["benchmark", "--data", str(ellipsoids.root), "--categories", "ellipsoid,cube"]) == 2
-    assert "cube" in (line := assert_one_line(capsys)) and "ellipsoid" in line
 
 
 @pytest.mark.parametrize(
@@ -185,21 +181,6 @@ def test_the_benchmark_prints_a_row_for_each_method_and_writes_its_summary(ellip
     summary = json.loads((tmp_path / "summary.json").read_text())
     text = capsys.readouterr().out
     assert all(name in text and row["n"] == 2 for name, row in summary["methods"].items())
-
-
-@pytest.mark.slow
-def test_layer_facet_and_size_reach_the_backbone(ellipsoids, tmp_path, monkeypatch, capsys):
-    """The summary names the options, and a run with other options needs another folder."""
-    monkeypatch.setenv("COLUMNS", "200")
-    ask = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "1", "--targets", "1", "--methods", "ours-bv"]
-    ask += ["--out", str(tmp_path)]
-    chosen = ["--backbone", "zsp-tiny", "--layer", "-1", "--facet", "token", "--image-size", "60"]
-    assert cli.main([*ask, *chosen, "--workers", "2"]) == 0
-    assert "zsp-tiny (block11, token, 60 px)" in capsys.readouterr().out
-    assert json.loads((tmp_path / "summary.json").read_text())["backbone"] == "zsp-tiny (block11, token, 60 px)"
-    assert cli.main([*ask, *chosen, "--quiet"]) == 0 and capsys.readouterr().out == ""
-    assert cli.main([*ask, *chosen[:-1], "120"]) == 2
-    assert str(tmp_path) in assert_one_line(capsys)
 
 
 def test_options_of_the_demo_reach_the_library(ellipsoids, tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-import yaml
 
 from tools import command_line
 from zsp_lite.cli.main import cli
@@ -69,12 +68,6 @@ def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page)
         assert not anchor or anchor in headings(target), f"{page.name}: {link}"
 
 
-def test_the_start_page_links_to_every_page():
-    start = (REPOSITORY / "docs" / "index.md").read_text()
-    for page in (REPOSITORY / "docs").glob("*.md"):
-        assert page.name == "index.md" or f"({page.name})" in start, page.name
-
-
 def test_the_page_of_the_command_line_is_that_of_the_program():
     assert command_line.PAGE.read_text() == command_line.page(), "run python -m tools.command_line"
 
@@ -121,15 +114,6 @@ def test_every_make_target_that_is_named_exists(page):
     for command in commands:
         if words := re.findall(r"(?:^|\s)make ([a-z-]+)", command):
             assert set(words) <= targets, command
-
-
-def test_the_workflow_of_continuous_integration_runs_targets_of_the_makefile():
-    jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
-    steps = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
-    made = set(
-        re.findall(r"^(?:exec )?make ([a-z-]+)", "\n".join([*steps, (REPOSITORY / ".ci" / "run").read_text()]), re.M)
-    )
-    assert made and made <= set(re.findall(r"^(\S+):", (REPOSITORY / "Makefile").read_text(), re.M))
 
 
 def parse(words: list[str]) -> None:

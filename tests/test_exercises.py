@@ -27,7 +27,6 @@ MISTAKES = {
     "01_features": {
         "patchify": {
             "patches column by column": ("transpose(0, 2, 1, 3, 4)", "transpose(2, 0, 1, 3, 4)"),
-            "pixels never regrouped": (".transpose(0, 2, 1, 3, 4)", ""),
         },
         "attention_head": {
             "scale forgotten": (" / np.sqrt(query.shape[1])", ""),
@@ -36,7 +35,6 @@ MISTAKES = {
         },
         "log_bin": {
             "rows and columns swapped": ("x[rows[:, None], columns]", "x[columns[:, None], rows]"),
-            "round the border": (".clip(0, width - 1)", " % width"),
             "far ring not pooled": ("shifted(pooled", "shifted(keys"),
         },
     },
@@ -45,7 +43,7 @@ MISTAKES = {
             "rows and columns swapped": (
                 "sim.argmax(axis=1), sim.argmax(axis=0)",
                 "sim.argmax(axis=0), sim.argmax(axis=1)",
-            ),
+            )
         },
         "cycle": {
             "rows and columns swapped": ("rows, columns = grid", "columns, rows = grid"),
@@ -54,7 +52,6 @@ MISTAKES = {
         "cyclical_map": {
             "return not checked": (" & on1[back[forth]]", ""),
             "target's foreground not checked": (" & on2[forth]", ""),
-            "sign": ("-distance", "distance"),
         },
         "mutual": {
             "one way only": ("np.flatnonzero(back[forth] == here)", "here"),
@@ -64,7 +61,6 @@ MISTAKES = {
     "03_best_view": {
         "score": {
             "missing matches cost nothing": (" - (k - len(distances)) * np.sqrt(2)", ""),
-            "distances rewarded": ("return -float", "return float"),
             "cosine above one": ("np.maximum(2 - 2 * np.asarray(cosines, dtype=float), 0)", "2 - 2 * cosines"),
         },
         "choose": {
@@ -84,7 +80,6 @@ MISTAKES = {
     "04_umeyama_ransac": {
         "umeyama": {
             "forgotten reflection": ("np.sign(np.linalg.det(left @ right))", "1"),
-            "reflection forgotten in the scale": ("(sign * singular).sum()", "singular.sum()"),
             "scale from the spreads": (
                 "(sign * singular).sum() / np.square(centred_x).sum()",
                 "np.sqrt(np.square(centred_y).sum() / np.square(centred_x).sum())",
@@ -93,27 +88,17 @@ MISTAKES = {
         },
         "trials": {
             "one match, not a sample": ("inlier_share**size", "inlier_share"),
-            "percent": ("inlier_share**size", "(inlier_share / 100) ** size"),
             "chance of failure for success": ("math.log(1 - confidence)", "math.log(confidence)"),
         },
         "consensus": {
             "last trial, not the best": ("if (residuals < threshold).sum() > best.sum():", "if True:"),
-            "no fit to all inliers": (
-                "return library_umeyama(x[best], y[best])",
-                "return library_umeyama(x[sample], y[sample])",
-            ),
-            "source and target swapped": (
-                "return library_umeyama(x[best], y[best])",
-                "return library_umeyama(y[best], x[best])",
-            ),
+            "no fit to all inliers": ("library_umeyama(x[best], y[best])", "library_umeyama(x[sample], y[sample])"),
+            "source and target swapped": ("library_umeyama(x[best], y[best])", "library_umeyama(y[best], x[best])"),
         },
     },
     "05_metrics": {
         "geodesic": {
-            "radians": (
-                "np.degrees(np.arctan2(sine, np.trace(relative) - 1))",
-                "np.arctan2(sine, np.trace(relative) - 1)",
-            ),
+            "radians": ("np.degrees(np.arctan2", "(np.arctan2"),
             "bare arccos": (
                 "np.arctan2(sine, np.trace(relative) - 1)",
                 "np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))",
@@ -129,10 +114,8 @@ MISTAKES = {
         },
         "symmetric_error": {
             "turned in the wrong frame": ("truth @ turn(axis, 360 * k / n)", "turn(axis, 360 * k / n) @ truth"),
-            "radians": ("360 * k / n", "2 * np.pi * k / n"),
         },
         "accuracy": {
-            "share for percent": ("100 * np.mean", "np.mean"),
             "drawn without replacement": (
                 "rng.choice(errors, size=(resamples, len(errors)))",
                 "rng.permuted(np.tile(errors, (resamples, 1)), axis=1)",
@@ -332,21 +315,14 @@ def test_every_test_passes_with_the_solutions(prepared, assignment):
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_students_version_passes_no_test(prepared, config, assignment):
+def test_the_students_version_shows_no_solution_and_passes_no_test(prepared, config, assignment):
     notebook = source(assignment)
     tests = set(graded(notebook, grade=True, solution=False))
     assert len(tests) >= 3
-    assert failing_tests(prepared(assignment), students_version(assignment, config), notebook) == tests
-
-
-@pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_students_see_neither_solutions_nor_hidden_tests(config, assignment):
-    notebook = students_version(assignment, config)
-    text = "\n".join(cell.source for cell in notebook.cells)
+    handed_out = students_version(assignment, config)
+    text = "\n".join(cell.source for cell in handed_out.cells)
     assert "SOLUTION" not in text and "HIDDEN" not in text and "Guide for marking" not in text
-    for task, cell in graded(notebook, solution=True).items():
-        stub = "*Write your answer" if cell.cell_type == "markdown" else "raise NotImplementedError"
-        assert stub in cell.source, task
+    assert failing_tests(prepared(assignment), handed_out, notebook) == tests
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
@@ -409,9 +385,7 @@ def test_nbgrader_generates_grades_and_returns_an_assignment(tmp_path, config, m
     "name",
     [
         "archive/Ada Lovelace_123_assignsubmission_file_05_metrics.ipynb",
-        "archive/Ada Lovelace_123_assignsubmission_file/05_metrics.ipynb",
         "archive/Ada Lovelace_123_assignsubmission_file_/05_metrics.ipynb",
-        "archive/lovelaceada_123_67890_05_metrics.ipynb",
         "archive/lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
     ],
 )

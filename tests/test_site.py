@@ -160,12 +160,6 @@ def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guid
             )
 
 
-def test_the_reading_path_names_every_notebook_and_exercise(pages):
-    links = set(pages["docs/index.html"].links)
-    for path in (*NOTEBOOKS, *EXERCISES):
-        assert f"../{page_of(path)}" in links, path.name
-
-
 def test_the_reference_describes_every_public_class_and_function(pages):
     anchors = set().union(*(page.anchors for name, page in pages.items() if name.startswith("docs/api/")))
     homes = zsp_lite._HOME_OF  # without importing them, which takes seconds

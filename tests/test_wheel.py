@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from zsp_lite import samples
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError
 
 REPOSITORY = Path(__file__).parents[1]
@@ -87,11 +86,6 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
         assert samples.sample_data() == made
         assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
         assert calls == [("demo", []), ("demo", ["made 1"])]
-
-
-def test_a_missing_data_folder_names_the_command_that_makes_one(tmp_path):
-    with pytest.raises(InputError, match="zsp-lite synth --preset demo --out"):
-        Co3D(tmp_path / "nowhere")
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):

@@ -237,13 +237,9 @@ def _await_marks(page, cloud: str, number: int) -> None:
 
 
 def photograph(page, path: Path, width: int = 1300, highest: int = 15_000) -> None:
-    """The whole notebook as a picture; what Chromium cannot draw at once goes into further ones, NAME-2.png etc."""
+    """The notebook as a picture, up to the height in pixels that Chromium can draw at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cells = page.evaluate("() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height")
     page.set_viewport_size({"width": width, "height": int(min(cells + 150, highest))})
     time.sleep(2)  # until everything is laid out anew
-    shown = page.evaluate("() => document.querySelector('.jp-WindowedPanel-outer').clientHeight")
-    for part in range(int(cells // shown) + 1):
-        page.evaluate(f"() => {{ document.querySelector('.jp-WindowedPanel-outer').scrollTop = {part * shown} }}")
-        time.sleep(1)
-        page.screenshot(path=path.with_stem(f"{path.stem}-{part + 1}") if part else path, timeout=120_000)
+    page.screenshot(path=path, timeout=120_000)
