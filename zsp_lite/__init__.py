@@ -29,61 +29,11 @@ Read the files in this order:
 """
 
 import importlib
-from typing import TYPE_CHECKING
 
 __version__ = "0.3.0"
 
-if TYPE_CHECKING:  # for editors and type checkers; a test compares it with `_HOMES`
-    from zsp_lite import (
-        alignment,
-        backbones,
-        baselines,
-        benchmark,
-        best_view,
-        choices,
-        cli,
-        data,
-        demo,
-        errors,
-        estimates,
-        features,
-        importers,
-        io,
-        labelling,
-        matchers,
-        matching,
-        metrics,
-        minimal,
-        own_objects,
-        pipeline,
-        points,
-        samples,
-        synthetic,
-        training,
-        verified,
-        views,
-        viz,
-        widgets,
-    )
-    from zsp_lite.alignment import Sim3
-    from zsp_lite.backbones import checkpoints, facets, huggingface, vit
-    from zsp_lite.backbones.backbone import Backbone
-    from zsp_lite.backbones.load import load_backbone
-    from zsp_lite.data import annotations, cameras, check, co3d, depth, frames, labels, pairs
-    from zsp_lite.data.cameras import Camera
-    from zsp_lite.data.co3d import Co3D
-    from zsp_lite.data.frames import Frame
-    from zsp_lite.errors import InputError
-    from zsp_lite.estimates import PoseEstimate
-    from zsp_lite.features import FeatureMap
-    from zsp_lite.io import download, files, ply
-    from zsp_lite.matching import Matches
-    from zsp_lite.own_objects import estimate_pose, open_source
-    from zsp_lite.pipeline import ZeroShotPose
-    from zsp_lite.viz import plots, report, scene3d
-
-# Public names by the module or package that holds them. They are imported on first use: torch takes seconds to import,
-# which `zsp-lite --help` does not need.
+# Public names by the module that holds them, "" for modules; `__init__.pyi` has them for editors. They are imported on
+# first use: torch takes seconds to import, which `zsp-lite --help` does not need.
 _HOMES = {
     "": "alignment best_view choices demo errors estimates features matchers matching metrics minimal own_objects "
     "pipeline points samples views backbones baselines benchmark cli data importers io labelling synthetic training "
