@@ -267,11 +267,3 @@ def test_the_overview_shows_all_results(results, tmp_path):
     picture = read_image(write_overview(tmp_path / "deep" / "overview.jpg", results * 2))
     height, width = picture.shape[:2]
     assert 2 < width / height < 4  # two rows of six square images
-
-
-def test_frames_with_an_empty_mask_are_left_out_of_the_overview(results, tmp_path):
-    (result,) = results
-    empty = [replace(frame, mask=np.zeros_like(frame.mask)) for frame in result.sequence[:4]]
-    sequence = (*empty, *result.sequence[4:])
-    whole = read_image(write_overview(tmp_path / "whole.jpg", results))
-    assert read_image(write_overview(tmp_path / "some.jpg", [replace(result, sequence=sequence)])).shape == whole.shape

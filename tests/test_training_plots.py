@@ -20,20 +20,6 @@ def test_the_same_place_has_the_same_colour_and_the_background_is_white():
     assert (first == second).all() and (background == 1).all() and not (first == 1).any()
 
 
-def test_coordinates_stand_below_the_pictures_of_their_object():
-    pictures = np.arange(2, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 4, 4, 3), np.float32)
-    figure = training_plots.show_object_coordinates(pictures, np.full((2, 2, 4, 4, 3), np.nan))
-    shown = [float(np.mean(axis.images[0].get_array())) for axis in figure.axes]
-    assert shown == [0, 0, 1, 1, 1, 1, 1, 1]
-    assert [axis.get_title() for axis in figure.axes[:3]] == ["view 0", "view 1", ""]
-
-
-def test_each_case_has_a_panel_with_its_probabilities():
-    figure = training_plots.show_answers({"even": np.full((2, 4), 0.25), "sure": np.eye(2, 4)})
-    assert [axis.get_title() for axis in figure.axes[:2]] == ["even", "sure"]
-    np.testing.assert_allclose(figure.axes[1].images[0].get_array(), np.eye(2, 4))
-
-
 def test_a_running_mean_stands_at_the_middle_of_its_window():
     steps, means = training_plots.smoothed([3.0, 0.0, 3.0, 6.0], 3)
     assert steps.tolist() == [2, 3] and means.tolist() == [2, 3]
@@ -74,19 +60,3 @@ def test_the_step_of_a_change_is_marked_in_each_loss():
     figure = training_plots.show_losses(rows, {"match": "correspondence", "geometry": "geometry"}, 15)
     assert [axis.lines[1].get_xdata()[0] for axis in figure.axes] == [15, 15]
     assert figure.axes[0].lines[0].get_ydata()[0] == pytest.approx(5)  # mean of the first eleven
-
-
-def test_a_measurement_of_all_runs_is_in_one_panel():
-    figure = training_plots.show_measurements(
-        {"a": [0, 1], "b": [0, 1]}, {"a": [(0.1, 1.0), (0.2, 2.0)], "b": [(0.1, 1.0), (0.3, 4.0)]}, ["one", "two"]
-    )
-    assert [line.get_ydata()[-1] for line in figure.axes[1].lines] == [2, 4]
-
-
-def test_keys_stand_on_the_left_and_attention_on_the_right():
-    picture = np.zeros((8, 8, 3), np.float32)
-    figure = training_plots.show_keys_and_attention(
-        [picture], [("untrained", [np.full((2, 2, 3), 0.5)], [np.ones((2, 2))])]
-    )
-    assert figure.axes[2].get_title(loc="left") == "untrained"
-    assert figure.axes[2].images[0].get_array().ndim == 3 and figure.axes[3].images[0].get_cmap().name == "viridis"

@@ -22,14 +22,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
 
-from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.demo import PhotographResult
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.points import coloured_cloud, object_cloud
 from zsp_lite.samples import REPOSITORY
-from zsp_lite.views import View, object_crop
+from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.viz.feature_plots import matches_of_estimate
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
@@ -44,7 +43,7 @@ _MEANINGS = {
     "confidence": "probability of an error below 30°",
 }
 _DPI = 110
-_OVERVIEW_FRAMES = 4
+_OVERVIEW_VIEWS = 4
 _OVERVIEW_POINTS = 1500
 _TWO_POSES_VIEWS = 3
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
@@ -117,7 +116,7 @@ def render_page(
             "rows": table_rows(result),
             "reference": result.sources[0],
             "target": result.sources[1],
-            "answers": [_answer(solver, estimate) for solver, estimate in result.estimates.items()],
+            "estimates": result.estimates,
             "disagreement": result.disagreement,
             "pictures": pose_pictures(result),
             "stages": stage_figures(result, f"scene-{index}"),
@@ -129,20 +128,6 @@ def render_page(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, labelled=labelled, data=data,
         data_note=data_note, own=own, photograph=_photograph_section(photograph) if photograph else None,
     )  # fmt: skip
-
-
-def _answer(solver: str, estimate: PoseEstimate) -> dict:
-    """Collect what the page says of one solver's answer."""
-    return {
-        "solver": solver,
-        "confidence": estimate.confidence,
-        "matrix": estimate.sim3.matrix,
-        "scale": estimate.sim3.scale,
-        "view": estimate.view + 1,
-        "turn": estimate.reference_turn,
-        "alternatives": estimate.alternatives,
-        "timings": estimate.timings,
-    }
 
 
 def _explain(text: str) -> Markup:
@@ -223,27 +208,26 @@ def legend(columns: Sequence[str] = COLUMNS) -> str:
 
 
 def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
-    """Write a JPEG with one row per result: reference, chosen target view, and the pose in the target sequence.
-
-    The pose is that of the first solver.
-    """
+    """Write a JPEG with a row per result: reference, chosen target view, and the first solver's pose in the others."""
     path = Path(path)
-    images, titles = [], []
+    images, titles, others = [], [], []
     for result in results:
-        views, frames = [view.frame for view in _chosen_views(result)], _sequence_crops(result)
-        blank = [np.full_like(views[0].rgb, 255)] * (_OVERVIEW_FRAMES - len(frames))
-        images += [frame.rgb for frame in (*views, *frames)] + blank
-        titles += [f"{result.title}: reference", "chosen target view"]
-        titles += [f"rotation error {result.error:.0f}°" if k == 0 else "" for k in range(_OVERVIEW_FRAMES)]
-    columns = 2 + _OVERVIEW_FRAMES
+        views, chosen = result.estimate.target_views, result.estimate.view
+        others.append([view.frame for k, view in enumerate(views) if k != chosen][:_OVERVIEW_VIEWS])
+        frames = [result.estimate.reference_view.frame, views[chosen].frame, *others[-1]]
+        blank = [np.full_like(frames[0].rgb, 255)] * (_OVERVIEW_VIEWS - len(others[-1]))
+        images += [frame.rgb for frame in frames] + blank
+        titles += [f"{result.title}: reference", "chosen target view", f"rotation error {result.error:.0f}°"]
+        titles += [""] * (_OVERVIEW_VIEWS - 1)
+    columns = 2 + _OVERVIEW_VIEWS
     figure, axes = plots.show_images(images, titles, columns=columns, size=1.7)
-    for result, row in zip(results, np.reshape(np.array(axes, dtype=object), (-1, columns))):
-        reference = result.estimate.reference_view
+    for index, (result, frames) in enumerate(zip(results, others)):
+        first, _, *row = axes[index * columns : (index + 1) * columns]
+        reference, cameras = result.estimate.reference_view, [frame.camera for frame in frames]
         cloud = object_cloud(reference, most=_OVERVIEW_POINTS)
-        plots.draw_points(row[0], reference.frame.camera, cloud, plots.coordinate_colours(cloud), size=3)
-        cameras = [frame.camera for frame in _sequence_crops(result)]
-        plots.draw_moved_cloud(row[2:], cameras, cloud, result.estimate.propagate(cameras), names=None)
-    write_atomic(path, _jpeg(figure))
+        plots.draw_points(first, reference.frame.camera, cloud, plots.coordinate_colours(cloud), size=3)
+        plots.draw_moved_cloud(row, cameras, cloud, result.estimate.propagate(cameras), names=None)
+    write_atomic(path, _encode(figure, format="jpeg", facecolor="white", pil_kwargs={"quality": 88}))
     return path
 
 
@@ -409,12 +393,6 @@ def _chosen_views(result: PairResult) -> list[View]:
     return [result.estimate.reference_view, result.estimate.target_views[result.estimate.view]]
 
 
-def _sequence_crops(result: PairResult) -> list[Frame]:
-    """Crop the first usable frames of the target sequence to their objects; in CO3D some frames have an empty mask."""
-    usable = [frame for frame in result.sequence if not frame_defect(frame)]
-    return [object_crop(frame) for frame in usable[:_OVERVIEW_FRAMES]]
-
-
 def _data_uri(figure: Figure) -> str:
     """Encode a figure for the page, without a ground: WebP, which has transparency and is as small as JPEG."""
     for text in figure.findobj(Text):
@@ -426,11 +404,6 @@ def _data_uri(figure: Figure) -> str:
             spine.set_edgecolor(_GREY)
     data = _encode(figure, format="webp", transparent=True, pil_kwargs={"quality": 86})
     return "data:image/webp;base64," + base64.b64encode(data).decode()
-
-
-def _jpeg(figure: Figure) -> bytes:
-    """Encode a figure as JPEG, because it mostly shows photographs."""
-    return _encode(figure, format="jpeg", facecolor="white", pil_kwargs={"quality": 88})
 
 
 def _encode(figure: Figure, **options) -> bytes:
