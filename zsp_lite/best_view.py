@@ -24,21 +24,14 @@ _ORTHOGONAL = 2**0.5
 
 @dataclass(frozen=True, eq=False)
 class ViewMatch:
-    """The reference and one target view, with their matches: the input of a view selector.
+    """The reference and one target view, with their matches: the input of a view selector."""
 
-    Attributes:
-        reference: The reference.
-        target: The target view.
-        similarity: Cosines between the descriptors of the reference's patches and the target's.
-        matches: At most k matches.
-        k: Requested number of matches.
-    """
-
-    reference: View
-    target: View
+    reference: View  # the reference
+    target: View  # the target view
+    # cosines between the descriptors of the reference's patches and the target's
     similarity: Float[torch.Tensor, "reference target"]
-    matches: Matches
-    k: int
+    matches: Matches  # at most k matches
+    k: int  # requested number of matches
 
     def __repr__(self) -> str:
         foregrounds = int(self.reference.foreground.sum()), int(self.target.foreground.sum())

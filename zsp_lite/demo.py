@@ -106,25 +106,16 @@ class PhotographResult:
     """Pose of the motorcycle of `motorcycle_photograph`, estimated from views of a synthetic one.
 
     All points and directions are in the frame of the photograph's camera.
-
-    Attributes:
-        photograph: The photograph.
-        sequence: Sequence of the synthetic motorcycle.
-        foreground: Setting of `ZeroShotPose`.
-        solver: Setting of `ZeroShotPose`.
-        estimate: Pose estimate with the photograph as the reference.
-        axes: Columns: front, left and up of the photographed motorcycle, as estimated.
-        cloud: Point cloud of the synthetic motorcycle, aligned with the photographed one.
-        along: Position of each point of the cloud, from the rear (0) to the front (1) of the synthetic motorcycle.
     """
 
-    photograph: Frame
-    sequence: str
-    foreground: str
-    solver: str
-    estimate: PoseEstimate
-    axes: Float[np.ndarray, "3 3"]
-    cloud: Float[np.ndarray, "n 3"]
+    photograph: Frame  # the photograph
+    sequence: str  # sequence of the synthetic motorcycle
+    foreground: str  # setting of `ZeroShotPose`
+    solver: str  # setting of `ZeroShotPose`
+    estimate: PoseEstimate  # pose estimate with the photograph as the reference
+    axes: Float[np.ndarray, "3 3"]  # columns: front, left and up of the photographed motorcycle, as estimated
+    cloud: Float[np.ndarray, "n 3"]  # point cloud of the synthetic motorcycle, aligned with the photographed one
+    # position of each point of the cloud, from the rear (0) to the front (1) of the synthetic motorcycle
     along: Float[np.ndarray, " n"]
 
     @property

@@ -26,47 +26,32 @@ SEQUENCE_FRAMES = 6  # frames of the target sequence that the pose of a pair is 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One of several candidate poses of a solver.
+    """One of several candidate poses of a solver."""
 
-    Attributes:
-        sim3: Reference-camera points to camera points of target view `view`.
-        view: Index of the target view that is closest to the reference viewpoint under this pose.
-        score: In nats, comparable between the hypotheses of one estimate.
-        terms: The terms that the score is a weighted sum of, by name.
-        confidence: Probability that the rotation error is below 30 degrees. Over different poses, those whose `mode` is
-            their own index, the probabilities sum to at most 1 (see `verified.confidence.hypothesis_probabilities`).
-        mode: Index of the hypothesis that stands for this pose: its own, or that of a better one that is the same pose
-            within 30 degrees.
-    """
-
-    sim3: Sim3
-    view: int
-    score: float
-    terms: dict[str, float]
+    sim3: Sim3  # reference-camera points to camera points of target view `view`
+    view: int  # index of the target view that is closest to the reference viewpoint under this pose
+    score: float  # in nats, comparable between the hypotheses of one estimate
+    terms: dict[str, float]  # the terms that the score is a weighted sum of, by name
+    # probability that the rotation error is below 30 degrees. Over different poses, those whose `mode` is their own
+    # index, the probabilities sum to at most 1 (see `verified.confidence.hypothesis_probabilities`)
     confidence: float
+    # index of the hypothesis that stands for this pose: its own, or that of a better one that is the same pose within
+    # 30 degrees
     mode: int
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another pose that explains the views, less well than the estimate.
+    """Another pose that explains the views, less well than the estimate."""
 
-    Attributes:
-        rank: Rank among the different poses; the estimate has 1.
-        sim3: Reference-camera points to camera points of target view `view`.
-        view: Index of the target view that is closest to the reference viewpoint under this pose.
-        probability: Probability that its rotation error is below 30 degrees. Together with the estimate's confidence,
-            the probabilities of all alternatives sum to at most 1; the rest is that of none of these.
-        angle: Angle between its rotation and that of the estimate in degrees.
-        deficit: Score of the estimate minus its own, in nats.
-    """
-
-    rank: int
-    sim3: Sim3
-    view: int
+    rank: int  # rank among the different poses; the estimate has 1
+    sim3: Sim3  # reference-camera points to camera points of target view `view`
+    view: int  # index of the target view that is closest to the reference viewpoint under this pose
+    # probability that its rotation error is below 30 degrees. Together with the estimate's confidence, the
+    # probabilities of all alternatives sum to at most 1; the rest is that of none of these
     probability: float
-    angle: float
-    deficit: float
+    angle: float  # angle between its rotation and that of the estimate in degrees
+    deficit: float  # score of the estimate minus its own, in nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,31 +169,19 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PairResult:
-    """Pose estimates of one pair by one or several solvers. `print` shows them.
+    """Pose estimates of one pair by one or several solvers. `print` shows them."""
 
-    Attributes:
-        title: Name of the pair, such as its category.
-        sources: Where the reference and the target views come from, in words.
-        reference: Reference frame, whole.
-        targets: Target frames, whole.
-        estimates: Estimate of each solver by its name, at least one.
-        errors: Rotation error of each estimate in degrees; empty without pose labels.
-        sequence: Some whole frames of the target sequence, for displaying the propagated pose.
-        pair: The evaluation pair, or None.
-        masks: Where the masks of the reference and of the targets come from: "given", "box" or "auto".
-        backbone: Name of the backbone.
-    """
-
-    title: str
-    sources: tuple[str, str]
-    reference: Frame
-    targets: tuple[Frame, ...]
-    estimates: dict[str, PoseEstimate]
-    errors: dict[str, float]
-    sequence: tuple[Frame, ...]
-    pair: Pair | None = None
+    title: str  # name of the pair, such as its category
+    sources: tuple[str, str]  # where the reference and the target views come from, in words
+    reference: Frame  # reference frame, whole
+    targets: tuple[Frame, ...]  # target frames, whole
+    estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
+    errors: dict[str, float]  # rotation error of each estimate in degrees; empty without pose labels
+    sequence: tuple[Frame, ...]  # some whole frames of the target sequence, for displaying the propagated pose
+    pair: Pair | None = None  # the evaluation pair, or None
+    # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
-    backbone: str = ""
+    backbone: str = ""  # name of the backbone
 
     @property
     def estimate(self) -> PoseEstimate:

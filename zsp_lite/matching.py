@@ -33,18 +33,12 @@ Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """K corresponding patches of two images, best first; K may be 0.
+    """K corresponding patches of two images, best first; K may be 0."""
 
-    Attributes:
-        reference: (K, 2) row and column on the reference's patch grid.
-        target: (K, 2) row and column on the target's patch grid.
-        similarity: (K,) cosine of the two descriptors.
-        distance: (K,) cyclical distance d(u, u') >= 0 in patches; for another matcher, minus its score.
-    """
-
-    reference: Int[np.ndarray, "k 2"]
-    target: Int[np.ndarray, "k 2"]
-    similarity: Float[np.ndarray, " k"]
+    reference: Int[np.ndarray, "k 2"]  # (K, 2) row and column on the reference's patch grid
+    target: Int[np.ndarray, "k 2"]  # (K, 2) row and column on the target's patch grid
+    similarity: Float[np.ndarray, " k"]  # (K,) cosine of the two descriptors
+    # (K,) cyclical distance d(u, u') >= 0 in patches; for another matcher, minus its score
     distance: Float[np.ndarray, " k"]
 
     def __len__(self) -> int:

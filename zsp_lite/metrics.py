@@ -114,22 +114,14 @@ class Reliability:
     """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table.
 
     Bins hold equal numbers of estimates, in order of confidence.
-
-    Attributes:
-        auroc: Area under the ROC curve (see `auroc`).
-        calibration_error: Expected calibration error, in [0, 1].
-        top_half_accuracy: Fraction of correct estimates among the more confident half.
-        count: (bins,) number of estimates.
-        confidence: (bins,) mean confidence.
-        accuracy: (bins,) fraction of correct estimates.
     """
 
-    auroc: float
-    calibration_error: float
-    top_half_accuracy: float
-    count: np.ndarray
-    confidence: Float[np.ndarray, " bins"]
-    accuracy: Float[np.ndarray, " bins"]
+    auroc: float  # area under the ROC curve (see `auroc`)
+    calibration_error: float  # expected calibration error, in [0, 1]
+    top_half_accuracy: float  # fraction of correct estimates among the more confident half
+    count: np.ndarray  # (bins,) number of estimates
+    confidence: Float[np.ndarray, " bins"]  # (bins,) mean confidence
+    accuracy: Float[np.ndarray, " bins"]  # (bins,) fraction of correct estimates
 
     def __str__(self) -> str:
         lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]

@@ -21,18 +21,12 @@ _MASK_SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An object crop with its features and foreground.
+    """An object crop with its features and foreground."""
 
-    Attributes:
-        frame: The crop.
-        features: Features of the crop's image.
-        foreground: Patches on the object.
-        object_mask: Probability of each pixel of being on the object, in [0, 1]; None if unknown.
-    """
-
-    frame: Frame
-    features: FeatureMap
-    foreground: Bool[torch.Tensor, "rows cols"]
+    frame: Frame  # the crop
+    features: FeatureMap  # features of the crop's image
+    foreground: Bool[torch.Tensor, "rows cols"]  # patches on the object
+    # probability of each pixel of being on the object, in [0, 1]; None if unknown
     object_mask: Float[np.ndarray, "height width"] | None = None
 
     def __repr__(self) -> str:

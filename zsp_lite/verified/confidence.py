@@ -25,23 +25,18 @@ TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, anoth
 
 @dataclass(frozen=True)
 class Evidence:
-    r"""What the probabilities of an estimate depend on, beside the scores of its poses.
+    r"""What the probabilities of an estimate depend on, beside the scores of its poses."""
 
-    Attributes:
-        span: Share of the circle around the target that its views span, in [0, 1) (see `cameras.view_span`).
-        log_views: Logarithm of the number N of target views.
-        nearness: \exp(-(\theta / 45 degrees)^2), where \theta is the angle between the reference's camera and the
-            nearest target view's under the best pose.
-        view_std: Standard deviation of the target views' feature similarity to the reference. If it is small, the
-            features hardly distinguish the sides of the object.
-        shape_fit: The part of the best score that compares shapes (overlap, silhouettes and free space). If it is
-            small, the two shapes do not fit under any pose that was found.
-    """
-
-    span: float
-    log_views: float
+    span: float  # share of the circle around the target that its views span, in [0, 1) (see `cameras.view_span`)
+    log_views: float  # logarithm of the number N of target views
+    # \exp(-(\theta / 45 degrees)^2), where \theta is the angle between the reference's camera and the nearest target
+    # view's under the best pose
     nearness: float
+    # standard deviation of the target views' feature similarity to the reference. If it is small, the features hardly
+    # distinguish the sides of the object
     view_std: float
+    # the part of the best score that compares shapes (overlap, silhouettes and free space). If it is small, the two
+    # shapes do not fit under any pose that was found
     shape_fit: float
 
 
