@@ -162,7 +162,7 @@ def test_the_single_sequence_subset_has_its_own_archives_and_folder(server, tmp_
     assert download(tmp_path / "single", "--single-sequence") == 0
     assert len(Co3D(tmp_path / "single").sequences("toaster")) == 3
     assert download(tmp_path / "single") == 2
-    assert "is from co3d single-sequence, expected another folder" in capsys.readouterr().err
+    assert "is from co3d (single-sequence), expected another folder" in capsys.readouterr().err
 
 
 def test_a_category_from_elsewhere_is_not_touched(server, source, tmp_path, capsys):

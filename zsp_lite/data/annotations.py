@@ -85,19 +85,12 @@ class SequenceAnnotation(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """Frame annotations of a category.
-
-    Attributes:
-        path: The annotation file.
-        entries: JSON of each frame, in file order.
-        keys: Identifier of each frame, in file order.
-        by_sequence: Positions of each sequence's frames in `entries`, sorted by frame number.
-    """
+    """Frame annotations of a category, in file order."""
 
     path: Path
-    entries: list[msgspec.Raw]
+    entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    by_sequence: dict[str, list[int]]
+    by_sequence: dict[str, list[int]]  # positions of each sequence's frames in `entries`, sorted by frame number
 
     def positions(self, sequence: str) -> list[int]:
         """Return the positions of a sequence's frames in `entries`; InputError if the sequence is unknown."""

@@ -32,27 +32,20 @@ _WORK = ".download"  # in the data folder: archives in progress, and the list of
 
 @dataclass(frozen=True)
 class Archive:
-    """A published archive: the file `name`, with its SHA-256 digest."""
+    """A published archive of a category."""
 
-    dataset: str  # "co3d" (v2) or "co3d-v1"
     category: str
-    subset: str  # "full" or "single-sequence"
-    number: int  # of the chunk, from 0
+    origin: str  # data set and subset
     name: str
+    url: str
     sha256: str
-
-    @property
-    def url(self) -> str:
-        """Address of the file."""
-        base = os.environ.get(URL_VARIABLES[self.dataset]) or _catalogue(CATALOGUE)[self.dataset]["url"]
-        return base.rstrip("/") + "/" + self.name
+    has_annotations: bool
 
 
 class _Unpacked(msgspec.Struct):
     """What is unpacked of a category: names of archives, and of single sequences."""
 
-    dataset: str
-    subset: str
+    origin: str
     archives: list[str] = []
     sequences: list[str] = []
 
@@ -60,23 +53,19 @@ class _Unpacked(msgspec.Struct):
 def list_archives(
     dataset: str, category: str, single_sequence: bool = False, chunks: int | None = None
 ) -> list[Archive]:
-    """List the archives of a category; the first one holds the annotations.
-
-    Args:
-        dataset: "co3d" (v2) or "co3d-v1".
-        category: Name of the category.
-        single_sequence: The single-sequence subset of v2: a few sequences of each category.
-        chunks: Largest number of archives, from the first; None for all.
-    """
+    """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the annotations."""
     subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
-    digests = _catalogue(CATALOGUE)[dataset].get(subset, {})
+    catalogue, origin = _catalogue(CATALOGUE)[dataset], f"{dataset} ({subset})"
+    digests = catalogue.get(subset, {})
     if category not in digests:
-        has = ", ".join(digests) or "no such subset"
-        raise InputError(f"category {category!r} is not in {dataset} ({subset}), which has {has}")
+        raise InputError(
+            f"category {category!r} is not in {origin}, which has {', '.join(digests) or 'no such subset'}"
+        )
+    base = (os.environ.get(URL_VARIABLES[dataset]) or catalogue["url"]).rstrip("/")
     archives = []
     for number, sha256 in enumerate(digests[category][:chunks]):
         name = f"{category}_{number:03d}{suffix}.zip" if dataset == "co3d" else f"{category}.zip"
-        archives.append(Archive(dataset, category, subset, number, name, sha256))
+        archives.append(Archive(category, origin, name, f"{base}/{name}", sha256, number == 0))
     return archives
 
 
@@ -85,13 +74,9 @@ def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
     record, missing = _read_record(root), []
     for archive in archives:
         place, found = root / archive.category, record.get(archive.category)
-        origin = (found.dataset, found.subset) if found else ("elsewhere",)
-        is_there = found is not None or (place.is_dir() and any(place.iterdir()))
-        if is_there and origin != (archive.dataset, archive.subset):
-            raise InputError(
-                f"{place} is from {' '.join(origin)}, expected another folder (--root) for {archive.dataset} "
-                f"{archive.subset}"
-            )
+        origin = found.origin if found else "elsewhere" if place.is_dir() and any(place.iterdir()) else archive.origin
+        if origin != archive.origin:
+            raise InputError(f"{place} is from {origin}, expected another folder (--root) for {archive.origin}")
         if found is None or archive.name not in found.archives:
             missing.append(archive)
     return missing
@@ -107,15 +92,15 @@ def missing_sequences(root: Path, archive: Archive, sequences: Iterable[str]) ->
 
 def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
     """Return the size of sequences and of the annotations in an archive on the server, bytes."""
-    with _remote_archive(archive) as zipped:
+    with _zip(RemoteFile(archive.url), archive.url) as zipped:
         return sum(member.compress_size for member in _members(zipped, archive.category, sequences))
 
 
 def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
     """Return the number of bytes that missing archives need on the disk; InputError if it has less.
 
-    These are the unpacked archives, which are about as large as the archives, and one archive, as an archive is removed
-    once it is unpacked. With `whole` false, parts of the archives are unpacked at once. Unknown sizes are None.
+    These are the unpacked archives, which are about as large as the archives, and, if `whole` archives are downloaded,
+    one archive, as each is removed once it is unpacked. Unknown sizes are None.
     """
     known = [size for size in sizes if size is not None]
     needed = sum(known) + (max(known, default=0) if whole else 0)
@@ -139,12 +124,12 @@ def download_archives(root: Path, archives: Sequence[Archive], progress: Callabl
     """
     with writing(root / _WORK):
         missing = missing_archives(root, archives)
-        # The chunk with the annotations comes last.
-        for archive in sorted(missing, key=lambda one: (one.category, one.number == 0, one.number)):
+        # The archive with the annotations comes last.
+        for archive in sorted(missing, key=lambda one: (one.category, one.has_annotations, one.name)):
             path = root / _WORK / archive.name
             if not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
-            with _recorded(root, archive) as category, open(path, "rb") as file, _zip(file, str(path)) as zipped:
+            with _recorded(root, archive) as category, _zip(io.FileIO(path), str(path)) as zipped:
                 unpack(zipped, root, _members(zipped, archive.category), progress)
                 category.archives.append(archive.name)
             path.unlink()
@@ -159,7 +144,7 @@ def download_sequences(
     """
     with writing(root / _WORK):
         if missing := missing_sequences(root, archive, sequences):
-            with _recorded(root, archive) as category, _remote_archive(archive) as zipped:
+            with _recorded(root, archive) as category, _zip(RemoteFile(archive.url), archive.url) as zipped:
                 unpack(zipped, root, _members(zipped, archive.category, missing), progress)
                 category.sequences += missing
 
@@ -197,26 +182,20 @@ def _members(zipped: zipfile.ZipFile, category: str, sequences: Collection[str] 
 def _recorded(root: Path, archive: Archive) -> Iterator[_Unpacked]:
     """Record that the category is from this archive, and at the end what was unpacked of it."""
     record = _read_record(root)
-    category = record.setdefault(archive.category, _Unpacked(archive.dataset, archive.subset))
+    category = record.setdefault(archive.category, _Unpacked(archive.origin))
     _write_record(root, record)
     yield category
     _write_record(root, record)
 
 
 @contextmanager
-def _zip(file: io.BufferedReader, where: str) -> Iterator[zipfile.ZipFile]:
+def _zip(file: io.RawIOBase, where: str) -> Iterator[zipfile.ZipFile]:
     """Open a zip archive; InputError where it turns out to be damaged or encrypted."""
     try:
-        with zipfile.ZipFile(file) as zipped:
+        with io.BufferedReader(file, _PART) as buffered, zipfile.ZipFile(buffered) as zipped:
             yield zipped
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise InputError(f"archive {where} is damaged or encrypted: {error}") from error
-
-
-@contextmanager
-def _remote_archive(archive: Archive) -> Iterator[zipfile.ZipFile]:
-    with io.BufferedReader(RemoteFile(archive.url), _PART) as file, _zip(file, archive.url) as zipped:
-        yield zipped
 
 
 def _is_annotation(member: zipfile.ZipInfo) -> bool:

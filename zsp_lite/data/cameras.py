@@ -103,9 +103,6 @@ class Camera:
             size: Image (height, width), pixels.
             intrinsics_format: "ndc_norm_image_bounds" (each image side covers [-1, 1]) or "ndc_isotropic" (the
                 shorter side does).
-
-        Raises:
-            InputError: A value is not valid for a `Camera`.
         """
         R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)

@@ -20,36 +20,22 @@ _MIN_FRAMES = 2  # complete frames of a sequence that can be evaluated
 
 @dataclass
 class CategoryCheck:
-    """Result of the check of a category.
-
-    Attributes:
-        category: Name of the category.
-        layout: "v1", "v2" or "mixed".
-        sequences: Number of annotated sequences.
-        frames: Number of annotated frames.
-        complete: Number of sequences without problems.
-        absent: Number of annotated sequences without any file, in a folder that was downloaded in part.
-        labelled: Number of sequences with a label.
-        usable: Number of labelled sequences that can be evaluated: at least two frames have image, mask, depth and
-            camera, and in a deep check no defect.
-        defects: Number of frames with each `frames.frame_defect`, such as a black image; counted by a deep check alone.
-        pairs: Number of valid files of evaluation pairs.
-        size: Total size of the annotated files, bytes.
-        problems: Messages, one line each.
-    """
+    """Result of the check of a category."""
 
     category: str
-    layout: str = "v1"
-    sequences: int = 0
-    frames: int = 0
-    complete: int = 0
-    absent: int = 0
-    labelled: int = 0
+    layout: str = "v1"  # or "v2", or "mixed"
+    sequences: int = 0  # annotated ones
+    frames: int = 0  # annotated ones
+    complete: int = 0  # sequences without problems
+    absent: int = 0  # annotated sequences without any file, in a folder that was downloaded in part
+    labelled: int = 0  # sequences with a label
+    # Labelled sequences that can be evaluated: at least two frames have image, mask, depth and camera, and no defect.
     usable: int = 0
+    # Frames with each `frames.frame_defect`, such as a black image; counted by a deep check alone.
     defects: Counter[str] = field(default_factory=Counter)
-    pairs: int = 0
-    size: int = 0
-    problems: list[str] = field(default_factory=list)
+    pairs: int = 0  # valid files of evaluation pairs
+    size: int = 0  # of all annotated files, bytes
+    problems: list[str] = field(default_factory=list)  # messages, one line each
 
     def attempt(self, function: Callable, *values: object) -> Any:
         """Call a function; if it raises InputError, its message becomes a problem, and the result is None."""
@@ -79,9 +65,6 @@ def check_folder(
 
     Returns:
         One result per category, sorted by name.
-
-    Raises:
-        InputError: `root` is not a folder or has no category. All other problems are in the results.
     """
     dataset = Co3D(root)
     chosen = sorted(set(dataset.categories() if categories is None else categories))

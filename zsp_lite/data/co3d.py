@@ -70,18 +70,12 @@ class Co3D:
     """A data set in CO3D's layout: ROOT/CATEGORY/frame_annotations.jgz and the files named there.
 
     Annotations are read at the first access to a category. The frame annotations of one category stay in memory
-    (about 100 MB for the largest), so process the categories one after the other.
+    (about 100 MB for the largest), so process the categories one after the other. All methods raise InputError, which
+    names category, sequence, frame, file or field, for what is unknown, missing or invalid.
     """
 
     def __init__(self, root: str | Path):
-        """Open a data set.
-
-        Args:
-            root: The data folder.
-
-        Raises:
-            InputError: `root` is not a folder.
-        """
+        """Open the data set in the folder `root`; InputError if there is no such folder."""
         self.root = Path(root)
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
@@ -107,34 +101,17 @@ class Co3D:
         return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
 
     def sequences(self, category: str) -> list[SequenceAnnotation]:
-        """Read the sequence annotations of a category, in file order.
-
-        Raises:
-            InputError: The category is unknown, or its annotations cannot be read or lack a field.
-        """
+        """Read the sequence annotations of a category, in file order."""
         if category not in self._sequences:
             self._sequences[category] = read_sequences(self._category_folder(category) / SEQUENCES_FILE)
         return list(self._sequences[category])
 
     def select(
-        self,
-        category: str,
-        viewpoint_quality: float = 1.25,
-        point_cloud_quality: float = 0.3,
-        top: int | None = 10,
+        self, category: str, viewpoint_quality: float = 1.25, point_cloud_quality: float = 0.3, top: int | None = 10
     ) -> list[SequenceAnnotation]:
-        """Select sequences for labelling by their quality scores.
+        """Select the `top` sequences for labelling whose quality scores are above both bounds, best point clouds first.
 
         Follows the supplement, "Choice of evaluation categories & sequences".
-
-        Args:
-            category: Name of the category.
-            viewpoint_quality: The viewpoint quality score must be above it.
-            point_cloud_quality: The quality score of the point cloud must be above it.
-            top: Maximum number of sequences; None for all.
-
-        Returns:
-            The sequences that have both scores above their bounds, best point clouds first.
         """
         selected = []
         for sequence in self.sequences(category):
@@ -150,25 +127,12 @@ class Co3D:
         return self._frame_index(category).keys
 
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
-        """Read the frame annotations of a sequence, sorted by frame number.
-
-        Raises:
-            InputError: The sequence is unknown, or a field is missing.
-        """
+        """Read the frame annotations of a sequence, sorted by frame number."""
         index = self._frame_index(category)
         return [index.frame(position) for position in index.positions(sequence)]
 
     def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
-        """Read the annotation of one frame.
-
-        Args:
-            category: Name of the category.
-            sequence: Name of the sequence.
-            frame_number: Number of the frame; it differs from the position in `frames` if frames are missing.
-
-        Raises:
-            InputError: The sequence or the frame is unknown, or a field is missing.
-        """
+        """Read the annotation of one frame; its number differs from its position in `frames` if frames are missing."""
         index = self._frame_index(category)
         for position in index.positions(sequence):
             if index.keys[position].frame_number == frame_number:
@@ -176,11 +140,7 @@ class Co3D:
         raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
 
     def camera(self, annotation: FrameAnnotation) -> Camera:
-        """Convert the viewpoint of a frame to a camera.
-
-        Raises:
-            InputError: The frame has no viewpoint, or an invalid one.
-        """
+        """Convert the viewpoint of a frame to a camera."""
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         view = annotation.viewpoint
         if view is None:
@@ -195,11 +155,7 @@ class Co3D:
     def load(self, annotation: FrameAnnotation) -> Frame:
         """Load the image and camera of a frame, and its depth and mask if annotated.
 
-        Depth is 0 (unknown) where its file is 0 or the depth mask is 0.
-
-        Raises:
-            InputError: The frame has no viewpoint, a path leads out of the data folder, or a file is missing, corrupt
-                or of another size than annotated.
+        Depth is 0 (unknown) where its file is 0 or the depth mask is 0. No path may lead out of the data folder.
         """
         camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
@@ -214,11 +170,7 @@ class Co3D:
         return Frame(rgb, depth, mask, camera, name)
 
     def load_pair(self, pair: Pair) -> tuple[Frame, list[Frame]]:
-        """Load the reference frame and the target frames of an evaluation pair.
-
-        Raises:
-            InputError: A frame is not in the data set or cannot be loaded.
-        """
+        """Load the reference frame and the target frames of an evaluation pair."""
         reference = self.load(self.frame(pair.category, pair.reference_sequence, pair.reference_frame))
         targets = [self.load(self.frame(pair.category, pair.target_sequence, n)) for n in pair.target_frames]
         return reference, targets
@@ -226,14 +178,7 @@ class Co3D:
     def point_cloud(
         self, category: str, sequence: str
     ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-        """Read the point cloud of a sequence.
-
-        Returns:
-            Points (n, 3) in world coordinates, and 8-bit RGB colours (n, 3) or None.
-
-        Raises:
-            InputError: The sequence is unknown or has no point cloud, or the file cannot be read.
-        """
+        """Read the point cloud of a sequence: points (n, 3) in world coordinates, and RGB colours (n, 3) or None."""
         clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
         if (cloud := clouds.get(sequence)) is None:
             raise InputError(f"sequence {category}/{sequence} has no point cloud")
@@ -262,29 +207,17 @@ class Co3D:
 
 @dataclass(frozen=True, eq=False)
 class SequenceData:
-    """Content of a sequence for `write_co3d`.
-
-    Attributes:
-        name: Name of the sequence.
-        frames: Frames, numbered from 0 in this order.
-        timestamps: Time of each frame, seconds.
-        points: (n, 3) point cloud in world coordinates.
-        colours: (n, 3) RGB colours of the points.
-        normals: (n, 3) normals of the points, or None.
-        viewpoint_quality: Viewpoint quality score, or None.
-        point_cloud_quality: Quality score of the point cloud, or None.
-        depth_scale_adjustment: CO3D's factor from stored depth to depth.
-    """
+    """Content of a sequence for `write_co3d`; the points are in world coordinates."""
 
     name: str
-    frames: Sequence[Frame]
-    timestamps: Sequence[float]
+    frames: Sequence[Frame]  # numbered from 0 in this order
+    timestamps: Sequence[float]  # of each frame, seconds
     points: Real[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0
+    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
 
 
 def write_co3d(
@@ -306,9 +239,6 @@ def write_co3d(
         sequences: The sequences.
         quality: JPEG quality, 0 to 100.
         intrinsics_format: "ndc_norm_image_bounds" (v1) or "ndc_isotropic" (v2).
-
-    Raises:
-        InputError: A name is not a plain folder name, or another process writes to the category.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE

@@ -66,12 +66,7 @@ def patch_points(
     depth takes the in-painted depth at its central pixel. (The paper in-paints the depth and unprojects the matches;
     it does not say which of a patch's 64 pixels it takes.)
 
-    Args:
-        depth: (H, W) depth, 0 where unknown.
-        camera: Camera of the depth map.
-        grid: Rows and columns of patches, at most one per pixel.
-        inpaint: Whether to in-paint, which takes most of the time. If not, the point of a patch without known depth is
-            the origin.
+    In-painting takes most of the time; without, the point of a patch without known depth is the origin.
 
     Returns:
         Points (rows, columns, 3), and (rows, columns) whether the patch has a known depth.

@@ -32,8 +32,7 @@ class Frame:
         camera: Camera of the image.
         name: Name for error messages.
 
-    Raises:
-        InputError: Shapes do not fit together, or values are out of range.
+    InputError if shapes do not fit together, or values are out of range.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]

@@ -11,17 +11,10 @@ _MOST_POINTS = 4000  # that a plane is fitted to
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"], threshold: float) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane to points with outliers, by RANSAC and by least squares over the inliers of the best trial.
+    """Fit a plane `normal @ x = offset` to points with outliers; InputError if all points lie on a line.
 
-    Args:
-        points: (N, 3) points, N >= 3. At most 4,000 of them, evenly spaced, are used.
-        threshold: Largest distance of an inlier.
-
-    Returns:
-        Unit normal and offset of the plane `normal @ x = offset`. The sign of the normal is arbitrary.
-
-    Raises:
-        InputError: All points lie on a line.
+    RANSAC is followed by least squares over the inliers of the best trial, the points nearer than `threshold`. Returns
+    the unit normal, of arbitrary sign, and the offset.
     """
     points = points[:: -(-len(points) // _MOST_POINTS)]
     corners = points[np.random.default_rng(0).integers(len(points), size=(_TRIALS, 3))]

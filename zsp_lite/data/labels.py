@@ -33,13 +33,7 @@ class _LabelFile(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """Pose label of a sequence.
-
-    Attributes:
-        trans: (4, 4) rigid transform from the world of `reference_seq` to the world of `seq`.
-        seq: Name of the sequence.
-        reference_seq: Name of the reference sequence.
-    """
+    """Pose label of the sequence `seq`: the rigid transform from the world of `reference_seq` to its world."""
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -63,8 +57,7 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
         Labels by sequence, sorted by name; {} if the category has none.
 
     Raises:
-        InputError: A file cannot be read, lacks a field, is not rigid, or is the label of another sequence than its
-            name says; or the labels have several reference sequences.
+        InputError: A file is invalid (see `parse_label`), or the labels have several reference sequences.
     """
     labels = read_label_files(root, category)
     check_one_reference(labels, label_folder(root, category))

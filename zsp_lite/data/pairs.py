@@ -44,9 +44,6 @@ def sample_pairs(
         n_targets: Number of target frames per pair.
         seed: Seed or generator. With an integer, the draws depend on the category and the seed only, and the pairs of
             a smaller `n` are the first ones of a larger `n`.
-
-    Raises:
-        InputError: Fewer than two sequences are labelled, or a sequence has fewer than `n_targets` frames.
     """
     if not isinstance(seed, np.random.Generator):
         seed = np.random.default_rng([seed, stable_hash(category) >> 1])
@@ -92,19 +89,9 @@ def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read an evaluation set that is part of the data folder.
+    """Read the first evaluation set of the data folder with at least so many pairs; [] if there is none.
 
-    Args:
-        dataset: The data set; its sets are in ROOT/determ_eval or, as in the published code, ROOT/data/determ_eval.
-        category: Name of the category.
-        n_targets: Number of target frames per pair.
-        at_least: Smallest number of pairs of the set.
-
-    Returns:
-        The pairs of the first set that is large enough; [] if there is none.
-
-    Raises:
-        InputError: A set cannot be read (see `read_published_pairs`).
+    Sets are in ROOT/determ_eval or, as in the published code, ROOT/data/determ_eval.
     """
     name = f"determ_eval/*samples_{n_targets}tgt/{plain_name(category, 'category')}.pt"
     for path in [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]:

@@ -31,10 +31,6 @@ def import_labels(
 
     Returns:
         Number of imported files by kind, "class_labels" and "determ_eval".
-
-    Raises:
-        InputError: The source has no such files, a file is invalid or would be overwritten, or a category would have
-            two reference sequences.
     """
     Co3D(root)  # raises InputError if there is no such folder
     files, labels = _read_published(source, categories)

@@ -31,9 +31,8 @@ def transfer_labels(source: str | Path, target: str | Path, category: str, repla
         Residual of each sequence: RMS distance of the aligned camera centres over their RMS distance from their mean.
 
     Raises:
-        InputError: A residual is above 0.05, a sequence is not in `target`, fewer than four cameras are in
-            both data sets, or labels in `target` would be overwritten or have another reference sequence. Nothing is
-            written then.
+        InputError: A residual is above 0.05, fewer than four cameras are in both data sets, or labels in `target` would
+            be overwritten or have another reference sequence. Nothing is written then.
     """
     labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
     if not labels:
@@ -60,11 +59,7 @@ def transfer_labels(source: str | Path, target: str | Path, category: str, repla
 
 
 def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Sim3, float]:
-    """Align a sequence's world coordinates in two data sets by the camera centres of the frames in both.
-
-    Returns:
-        The similarity from `old` to `new`, and its residual (see `transfer_labels`).
-    """
+    """Compute the similarity from a sequence's world in `old` to that in `new`, and its residual."""
     centres = [
         {one.frame_number: data.camera(one).centre for one in data.frames(category, sequence) if one.viewpoint}
         for data in (old, new)
