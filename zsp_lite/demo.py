@@ -34,9 +34,6 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
 
     This is the first evaluation pair in the data folder, or, for a category without pairs of `n_targets` target views,
     the first of a sample with seed 0.
-
-    Raises:
-        InputError: No category has pose labels.
     """
     pairs = []
     for category in labelled_categories(dataset):
@@ -50,9 +47,6 @@ def example_pair(dataset: Co3D) -> Pair:
 
     Of `data_samples/`, this is a pair of cars that is chosen by its result: a stored pair with five targets on which
     both solvers are within 5 degrees with zsp-tiny. Of other data, it is the first pair of the first category.
-
-    Raises:
-        InputError: The data has no pose labels.
     """
     chosen = Pair("car", "peugeot_308", 11, "suv", (18, 22, 3, 8, 13))
     folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))

@@ -118,11 +118,7 @@ class PoseEstimate:
         )  # fmt: skip
 
     def world_rotation(self, pose: "Hypothesis | Alternative | None" = None) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from the reference camera's frame to the world of the target views.
-
-        Args:
-            pose: A pose of this estimate; by default the estimate's own.
-        """
+        """Return the rotation from the reference camera's frame to the world of the target views."""
         sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
         return self.target_views[view].frame.camera.R.T @ sim3.R
 

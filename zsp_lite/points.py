@@ -18,17 +18,7 @@ _INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask pr
 
 
 def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
-    """Select the pixels on the object that have known depth; a frame without a mask is all object.
-
-    Args:
-        frame: Frame with a depth map.
-        threshold: A pixel is on the object if its mask probability is above this.
-
-    Raises:
-        InputError: The frame has no depth map.
-    """
-    if frame.depth is None:
-        raise InputError(f"{frame.name or 'frame'}: no depth map, expected one for the object's points")
+    """Select the pixels on the object that have known depth; a frame without a mask is all object."""
     known = frame.depth > 0
     return known if frame.mask is None else known & (frame.mask > threshold)
 
@@ -40,13 +30,9 @@ def object_points(frame: Frame, threshold: float = ON_OBJECT) -> Float[np.ndarra
 
 
 def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:
-    """Select the points that are not outliers.
+    """Select the points that are at most `factor` times the median distance from the median point.
 
     A mask that is too wide by a pixel includes points of the background, far behind the object.
-
-    Args:
-        points: (N, 3) points, N >= 1.
-        factor: Largest distance from the median point, in multiples of the median distance.
     """
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return distance <= factor * np.median(distance)
@@ -77,17 +63,6 @@ def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarra
     """Gather a view's object points for display, without outliers.
 
     The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
-
-    Args:
-        view: Object crop with its foreground.
-        most: Largest number of points; more are subsampled at random.
-        seed: Seed of the subsampling.
-
-    Returns:
-        (N, 3) camera-frame points.
-
-    Raises:
-        InputError: No pixel of the object has a known depth.
     """
     return coloured_cloud(view, most, seed)[0]
 
