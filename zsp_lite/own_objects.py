@@ -28,6 +28,7 @@ from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
 from zsp_lite.importers.convert import READERS, capture_format
 from zsp_lite.importers.fusion import scale_frame
 from zsp_lite.importers.geometry_masks import masks_from_depth
+from zsp_lite.importers.mask_flags import mask_flags
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
@@ -58,7 +59,7 @@ class Source:
         format: "sequence", "image", or the format of a capture.
         numbers: Number of each frame: that of the annotations, or its position in the capture.
         read: Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
-        mask: Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth).
+        mask: Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours).
         box: Bounding box of the object in the first frame, for "box".
         unit_given: Whether the unit of the depth is not the default, but the user's or the format's.
     """
@@ -118,6 +119,11 @@ class Source:
         cure = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {_UNITS.get(self.format, _UNIT_OPTION)}"
         return (f"{self.path}: the object is {distance:.3g} m from the camera, {cure}",)
 
+    def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
+        """Question the unit of length, and the masks of frames if they were not given."""
+        masks = () if self.mask == "given" else mask_flags(frames)
+        return *self.unit_flags(frames), *(f"{self.path}: {flag}" for flag in masks)
+
     def reference(self, number: int | None) -> tuple[int, Frame]:
         """Return the position and the frame of a number; by default, of the first usable one among some."""
         if number not in (None, *self.numbers):
@@ -148,7 +154,7 @@ def estimate_pose(
 
     Each path is a sequence of a data folder, a folder with a capture, or an image with depth. `open_source` explains
     them, and takes the settings that only one of the two has, such as a box around the object. No label is needed.
-    Implausible lengths, and target views that show one side of the object, are flags of the estimates.
+    Implausible lengths, doubtful masks, and target views that show one side of the object, are flags of the estimates.
 
     Args:
         reference: The reference object.
@@ -188,7 +194,7 @@ def estimate_pose(
         ]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         estimates = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
-        flags = *first.unit_flags([frame]), *second.unit_flags(frames), *_side_flags(frames, clouds[1])
+        flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
         estimates = {
             name: replace(_in_units(one, *scales), flags=(*one.flags, *flags)) for name, one in estimates.items()
         }

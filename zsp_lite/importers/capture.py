@@ -12,7 +12,7 @@ from jaxtyping import Float, Real
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.io.files import read_bytes
+from zsp_lite.io.files import path_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -23,25 +23,14 @@ _SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an im
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
-    """Files and camera of a frame.
-
-    Attributes:
-        image: Image file.
-        depth: Depth file: a 16-bit PNG or .npy. A smaller depth map of the image's aspect ratio, as phones store it,
-            is enlarged to the size of the image.
-        camera: Camera of the image.
-        time: Time of the frame, seconds.
-        depth_unit: World units per stored depth value.
-        distortion: OpenCV's coefficients k1, k2, p1, p2, k3, or () for none. Image, depth and mask are undistorted.
-        mask: Mask file, or None.
-    """
+    """Files and camera of a frame."""
 
     image: Path
-    depth: Path
+    depth: Path  # a 16-bit PNG or .npy, of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
-    time: float
-    depth_unit: float = 0.001
-    distortion: tuple[float, ...] = ()
+    time: float  # seconds
+    depth_unit: float = 0.001  # world units per stored depth value
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
 
     def load(self) -> Frame:
@@ -69,6 +58,11 @@ def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFra
     """Select at most `count` evenly spaced frames, with the first and the last."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     return [frames[index] for index in chosen]
+
+
+def files_by_stem(folder: str | Path) -> dict[str, Path]:
+    """Return the files of a folder by their names without extension; links may not lead out of it."""
+    return {path.stem: path_inside(folder, path.name) for path in sorted(Path(folder).glob("*"))}
 
 
 def camera_from_pose(

@@ -8,11 +8,11 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import CaptureFrame, evenly_spaced
+from zsp_lite.importers.capture import CaptureFrame, evenly_spaced, files_by_stem
 from zsp_lite.importers.fusion import fuse, scale_frame
 from zsp_lite.importers.lists import read_lists
 from zsp_lite.importers.mask_flags import mask_flags
-from zsp_lite.importers.masks import masks_from_box, masks_from_files
+from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
@@ -58,17 +58,15 @@ def import_capture(
     """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
-    whose mask is empty are left out. An interrupted import can be repeated. Without a box and masks, the masks of the
-    capture itself are used.
+    whose mask is empty are left out. An interrupted import can be repeated.
 
     Args:
         capture: Frames of one reader in `READERS`.
         root: The data folder, new or existing.
         category: Name of the category.
         sequence: Name of the new sequence.
-        box: Bounding box (top, left, height, width) of the object in the first frame, pixels; GrabCut then segments
-            the object in all frames.
-        masks: Folder of mask files, named like the images.
+        box: Bounding box (top, left, height, width) of the object in the first frame, pixels (see `masks_from_box`).
+        masks: Folder of mask files, named like the images. Without it and a box, the masks of the capture are used.
         max_frames: Maximum number of frames, evenly spaced.
 
     Raises:
@@ -82,12 +80,15 @@ def import_capture(
     if box is not None and masks is not None:
         raise InputError("both a box and a folder of masks are given, expected one of them")
     capture = evenly_spaced(capture, max_frames)
+    if masks is not None:
+        files = files_by_stem(masks)
+        if missing := [frame.image.stem for frame in capture if frame.image.stem not in files]:
+            raise InputError(f"folder {masks} has no mask {missing[0]}.png, expected one named like each image")
+        capture = [replace(frame, mask=files[frame.image.stem]) for frame in capture]
     frames = [frame.load() for frame in capture]
     if box is not None:
         frames = masks_from_box(frames, box)
-    elif masks is not None:
-        frames = masks_from_files(frames, masks)
-    elif any(frame.mask is None for frame in frames):
+    if any(frame.mask is None for frame in frames):
         raise InputError(
             "the capture has no masks of its own, expected a box in its first picture (--box TOP,LEFT,HEIGHT,WIDTH) or "
             "a folder of masks (--masks DIR)"

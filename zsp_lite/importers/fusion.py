@@ -22,11 +22,7 @@ def fuse(
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Fuse the depth maps inside the masks by truncated signed distances (TSDF; Curless and Levoy 1996).
 
-    Returns:
-        Points (n, 3) in world coordinates, RGB colours (n, 3), and normals (n, 3).
-
-    Raises:
-        InputError: No depth is known on the object, or no surface is seen by enough frames.
+    Returns world points (n, 3), RGB colours (n, 3) and normals (n, 3); InputError if too few frames see a surface.
     """
     o3d = load_open3d()
     voxel = 3 * _spread(frames) / _VOXELS

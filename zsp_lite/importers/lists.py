@@ -13,7 +13,7 @@ import numpy as np
 
 from zsp_lite.data.frames import read_image
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
+from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, files_by_stem
 from zsp_lite.io.files import path_inside, read_bytes
 
 _LISTS = ("rgb.txt", "depth.txt", "poses.txt")
@@ -34,7 +34,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
     if len(rows) != 3 or [*rows[2], rows[1][0], rows[0][1]] != [0, 0, 1, 0, 0] or min(rows[0][0], rows[1][1]) <= 0:
         raise InputError(f"intrinsics {folder}/intrinsics.txt are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
     (fx, _, cx), (_, fy, cy), _ = rows
-    masks = {path.stem: f"masks/{path.name}" for path in sorted((Path(folder) / "masks").glob("*"))}
+    masks = files_by_stem(Path(folder) / "masks")
     size, frames = None, []
     for number, (image, depth, numbers) in enumerate(zip(*lists.values()), 1):
         where = f"{folder}/poses.txt, line {number}"
@@ -44,8 +44,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
         image, depth = path_inside(folder, image), path_inside(folder, depth)
         size = size or read_image(image).shape[:2]
         camera = camera_from_pose(pose, (fx, fy), (cx, cy), size, where)
-        mask = path_inside(folder, masks[image.stem]) if image.stem in masks else None
-        frames.append(CaptureFrame(image, depth, camera, float(number - 1), depth_unit, mask=mask))
+        frames.append(CaptureFrame(image, depth, camera, number - 1.0, depth_unit, mask=masks.get(image.stem)))
     return frames
 
 

@@ -1,21 +1,20 @@
-"""Object masks of a capture by colours, from one bounding box (GrabCut), or from mask files."""
+"""Object masks of a capture by colours, from one bounding box (GrabCut)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Box
-from zsp_lite.data.frames import Frame, frame_defect, read_mask
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.geometry import largest_region
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import path_inside
 from zsp_lite.points import object_pixels, object_points
 
 _ITERATIONS = 4  # of GrabCut
+_LONGEST_SIDE = 320  # pixels of an image in GrabCut, whose time is proportional to the area
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # pixels
 _BALL_OFFSET = 0.6  # distance of the ball's centre behind the visible surface, relative to its radius
@@ -23,16 +22,12 @@ _POINTS = 4000
 
 
 def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
-    """Segment the object in all frames, given its bounding box in the first one.
+    """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
     every further frame is the projection of the object points of the previous frames and of a ball as wide as the first
     box, which stands for the parts of the object that are not visible there. A mask is empty where a further frame does
     not show the object.
-
-    Args:
-        frames: Frames with depth, in the order of the capture.
-        box: (top, left, height, width) of the object in the first frame, pixels.
 
     Raises:
         InputError: The box extends beyond the image, or the object is not found in the first frame.
@@ -59,40 +54,28 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     return masked
 
 
-def masks_from_files(frames: Sequence[Frame], folder: str | Path) -> list[Frame]:
-    """Read the masks of frames from files of the same names as the images, with any extension."""
-    files = {path.stem: path.name for path in sorted(Path(folder).glob("*"))}
-    masked = []
-    for frame in frames:
-        stem = Path(frame.name).stem
-        if stem not in files:
-            raise InputError(f"folder {folder} has no mask {stem}.png for the image {frame.name}")
-        masked.append(replace(frame, mask=read_mask(path_inside(folder, files[stem]))))
-    return masked
-
-
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
-    """Segment the object inside a box (top, left, height, width) by colours.
-
-    Two pixels at the border of the image are background, so that there is some.
-
-    Returns:
-        (H, W) mask of 0 and 1: the largest connected foreground region, or 0 everywhere if there is none.
-    """
+    """Return the mask of the largest region in a box (top, left, height, width) with other colours than around it."""
     top, left, height, width = box
     labels = np.full(rgb.shape[:2], cv2.GC_BGD, np.uint8)
     labels[top : top + height, left : left + width] = cv2.GC_PR_FGD
-    labels[[0, 1, -2, -1]] = labels[:, [0, 1, -2, -1]] = cv2.GC_BGD
     return largest_region(separate_colours(rgb, labels)).astype(np.float32)
 
 
 def separate_colours(rgb: UInt8[np.ndarray, "h w 3"], labels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground by GrabCut, given OpenCV's label of each pixel; there must be background and foreground."""
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
-    bgr, labels = np.ascontiguousarray(rgb[..., ::-1]), labels.copy()
-    cv2.grabCut(bgr, labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    """Select the foreground by GrabCut on the image or a smaller copy, given OpenCV's label of each pixel."""
+    height, width = labels.shape
+    shrink = max(1, max(height, width) / _LONGEST_SIDE)
+    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
+    if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
+        cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(bgr, small, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    found = np.isin(small, foreground).astype(np.float32)
+    return cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:

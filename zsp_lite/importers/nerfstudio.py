@@ -4,7 +4,7 @@ Its cameras have OpenGL's axes (+y up, looking along -z), and its pixel centres 
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -12,10 +12,11 @@ import numpy as np
 from zsp_lite.data.cameras import MOST_PIXELS
 from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
-from zsp_lite.io.files import path_inside, read_json
+from zsp_lite.io.files import decode_json, path_inside, read_json
 
 FILE = "transforms.json"
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
 _FocalLength = Annotated[float, msgspec.Meta(ge=1e-3, le=MAX_LENGTH)]  # pixels
 _Position = Annotated[float, msgspec.Meta(ge=-MAX_LENGTH, le=MAX_LENGTH)]  # pixels
@@ -23,34 +24,31 @@ _Side = Annotated[float, msgspec.Meta(ge=1, le=MOST_PIXELS, multiple_of=1)]  # p
 _Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 
 
-class _Intrinsics(msgspec.Struct, kw_only=True):
-    """Intrinsics, given for all frames together or for each frame."""
+class _Frame(msgspec.Struct):
+    """A frame, together with what the file gives for all frames."""
 
-    fl_x: _FocalLength | None = None
-    fl_y: _FocalLength | None = None
-    cx: _Position | None = None
-    cy: _Position | None = None
-    w: _Side | None = None
-    h: _Side | None = None
-    k1: _Coefficient | None = None
-    k2: _Coefficient | None = None
-    p1: _Coefficient | None = None
-    p2: _Coefficient | None = None
-    k3: _Coefficient | None = None
-    k4: Annotated[float, msgspec.Meta(ge=0, le=0)] | None = None  # OpenCV's model has no term of r^8
-
-
-class _Frame(_Intrinsics, kw_only=True):
     file_path: str
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
+    fl_x: _FocalLength
+    cx: _Position
+    cy: _Position
+    w: _Side
+    h: _Side
     depth_file_path: str | None = None
     mask_path: str | None = None
-
-
-class _File(_Intrinsics, kw_only=True):
-    frames: list[_Frame]
-    camera_model: Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"] = "OPENCV"
+    fl_y: _FocalLength | None = None
+    k1: _Coefficient = 0.0
+    k2: _Coefficient = 0.0
+    p1: _Coefficient = 0.0
+    p2: _Coefficient = 0.0
+    k3: _Coefficient = 0.0
+    k4: float = 0.0
+    camera_model: str = "OPENCV"
     depth_unit_scale_factor: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)] = 0.001
+
+
+class _File(msgspec.Struct):
+    frames: list[dict[str, Any]]
 
 
 def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
@@ -64,27 +62,25 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
             k4 is not 0.
     """
     path = path_inside(folder, FILE)
-    content = read_json(path, _File, "capture")
-    common = {name: getattr(content, name) for name in _Intrinsics.__struct_fields__}
+    common, listed = read_json(path, dict[str, Any], "capture"), read_json(path, _File, "capture").frames
+    del common["frames"]
     frames = []
-    for number, frame in enumerate(content.frames):
-        if frame.depth_file_path is None:
+    for number, own in enumerate(listed):
+        if own.get("depth_file_path") is None:
             continue
         where = f"{path}, frame {number}"
-        given = {name: getattr(frame, name) for name in common}
-        given = common | {name: value for name, value in given.items() if value is not None}
-        missing = [name for name in ("fl_x", "cx", "cy", "w", "h") if given[name] is None]
-        if missing:
-            raise InputError(f"{where}: no {', '.join(missing)}, expected intrinsics in pixels")
-        focal_length = given["fl_x"], given["fl_y"] or given["fl_x"]
-        size = int(given["h"]), int(given["w"])
+        frame = decode_json(msgspec.json.encode(common | own), _Frame, where)
+        if frame.camera_model not in _MODELS or frame.k4:
+            found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
+            raise InputError(f"{where}: camera_model is {found}, expected one of {', '.join(_MODELS)} with k4 = 0")
         pose = np.array(frame.transform_matrix) @ _TO_OPENCV
-        camera = camera_from_pose(pose, focal_length, (given["cx"], given["cy"]), size, where)
-        image, depth = (path_inside(folder, name) for name in (frame.file_path, frame.depth_file_path))
+        focal_length, size = (frame.fl_x, frame.fl_y or frame.fl_x), (int(frame.h), int(frame.w))
+        camera = camera_from_pose(pose, focal_length, (frame.cx, frame.cy), size, where)
+        image, depth = path_inside(folder, frame.file_path), path_inside(folder, frame.depth_file_path)
         mask = None if frame.mask_path is None else path_inside(folder, frame.mask_path)
-        distortion = tuple(given[name] or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
-        unit = content.depth_unit_scale_factor
+        distortion = frame.k1, frame.k2, frame.p1, frame.p2, frame.k3  # OpenCV's order; its model has no r^8 term, k4
+        unit = frame.depth_unit_scale_factor
         frames.append(CaptureFrame(image, depth, camera, float(number), unit, distortion, mask))
     if not frames:
-        raise InputError(f"{path}: none of {len(content.frames)} frames has depth_file_path, expected RGB-D frames")
+        raise InputError(f"{path}: none of {len(listed)} frames has depth_file_path, expected RGB-D frames")
     return frames
