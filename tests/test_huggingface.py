@@ -193,14 +193,14 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
 @pytest.mark.parametrize(
     "kind, settings, match",
     [
-        ("siglip", {}, "expected a CLS token"),
+        ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
         ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
         ("swin", {"embed_dim": 8, "depths": [1, 1], "num_heads": [1, 1], "patch_size": 4}, "a swin model"),
         ("bert", {"vocab_size": 99}, "a bert model"),
         ("vit", {"num_channels": 1}, "does not run"),
         ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
         ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
-        ("blip", {}, "is not a supported vision transformer"),
+        ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
     ],
 )
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):

@@ -49,17 +49,23 @@ class HuggingFaceViT(nn.Module):
     def __init__(self, model: nn.Module, config, image_size: int, name: str):
         super().__init__()
         self.vit = model
-        self.patch_size, self.num_heads, self.depth = _sizes(config, name)
-        self.image_size = nearest_multiple(image_size, self.patch_size)
+        patch, self.num_heads, self.depth = (
+            getattr(config, key, None) for key in ("patch_size", "num_attention_heads", "num_hidden_layers")
+        )
+        self.patch_size = patch[0] if isinstance(patch, (list, tuple)) and len(set(patch)) == 1 else patch
+        sizes_known = all(isinstance(size, int) for size in (self.patch_size, self.num_heads, self.depth))
         # In a plain list, so that the modules are not registered a second time.
         self._projections = [found for module in model.modules() if (found := _projections(module))]
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
-        if len(self._projections) != self.depth or not _CLS & special.keys():
+        if not sizes_known or len(self._projections) != self.depth or not _CLS & special.keys():
             raise InputError(
-                f"{name}: {type(model).__name__} is not a supported vision transformer, expected a CLS token and "
-                f"{self.depth} blocks, each with projections {', '.join(map(' or '.join, _PROJECTIONS.values()))}"
+                f"{name}: a {config.model_type} model, expected a vision transformer with one square patch_size, "
+                f"num_attention_heads, a CLS token, and in each of num_hidden_layers blocks the projections "
+                f"{', '.join(map(' or '.join, _PROJECTIONS.values()))}"
             )
+        self.image_size = nearest_multiple(image_size, self.patch_size)
         self.embed_dim = self._projections[0]["query"].in_features
+        # Number of tokens before the patches.
         self._prefix = sum(special[key].numel() // self.embed_dim for key in _BEFORE_PATCHES if key in special)
         self._arguments = inspect.signature(model.forward).parameters.keys()
         self._try(name)
@@ -171,21 +177,6 @@ def model_folder(name: str) -> Path:
 
 def _has_weights(folder: Path) -> bool:
     return any((folder / file).is_file() for file in WEIGHTS)
-
-
-def _sizes(config, name: str) -> tuple[int, int, int]:
-    """Return patch size, number of heads and of blocks; InputError unless it is a plain vision transformer."""
-    patch, heads, depth = (
-        getattr(config, key, None) for key in ("patch_size", "num_attention_heads", "num_hidden_layers")
-    )
-    if isinstance(patch, (list, tuple)) and len(set(patch)) == 1:
-        patch = patch[0]
-    if not all(isinstance(x, int) for x in (patch, heads, depth)):
-        raise InputError(
-            f"{name}: a {config.model_type} model, expected a vision transformer (one square patch_size, "
-            f"num_hidden_layers, num_attention_heads)"
-        )
-    return patch, heads, depth
 
 
 def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
