@@ -85,7 +85,9 @@ def evaluate(
     named = isinstance(backbone, str | BackboneConfig)
     loaded = load_backbone(backbone) if named else backbone
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
-    _check_rows(rows, extractors)
+    for row in rows.values():
+        if row.solve is None:
+            ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
     settings = {
         "data": str(root).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "pairs": pairs,
         "targets": targets, "seed": seed, "library": library_version(),
@@ -167,16 +169,6 @@ def rows_of_pairs(row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, dict[Pai
         for pair in dict.fromkeys(pairs):
             work.setdefault(pair.category, {}).setdefault(pair, []).append(name)
     return work
-
-
-def _check_rows(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> None:
-    """Raise InputError for settings with which `ZeroShotPose` would refuse every pair of a row."""
-    for name, row in rows.items():
-        if row.solve is None:
-            try:
-                ZeroShotPose(extractors[row.features], **row.settings)
-            except InputError as error:
-                raise InputError(f"method {name}: {error}") from error
 
 
 def _identity(row: Method, extractors: Mapping[str, Any]) -> str:
