@@ -12,6 +12,7 @@ from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.io.locks import writing
 from zsp_lite.synthetic.export import export_categories
+from zsp_lite.synthetic.sequences import HEIGHTS
 
 SPLITS = {"training": TRAINING, "validation": VALIDATION}
 
@@ -22,13 +23,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("split", choices=SPLITS)
     for name, default in {"sequences": 4, "frames": 24, "seed": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--heights", type=float, nargs=2, default=HEIGHTS, help="range of the cameras' mean elevation")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args(arguments)
     builders = SPLITS[given.split]
     with writing(given.out):
         export_categories(
-            list(builders), given.out, given.sequences, given.frames, given.seed, progress=tqdm, builders=builders
-        )
+            list(builders), given.out, given.sequences, given.frames, given.seed,
+            progress=tqdm, builders=builders, heights=tuple(given.heights),
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from zsp_lite.synthetic.recording import (
     write_pairs,
     write_sequence,
 )
-from zsp_lite.synthetic.sequences import RenderedSequence
+from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
 _MOST_SEQUENCES = 900  # of a category: their names have three digits
@@ -75,6 +75,7 @@ def export_categories(
     image_size: int = 256,
     progress: Callable[[Iterable], Iterable] = iter,
     builders: Mapping[str, Builder] = CATEGORIES,
+    heights: tuple[float, float] = HEIGHTS,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
@@ -90,6 +91,7 @@ def export_categories(
         image_size: Shorter image side in pixels.
         progress: Wraps the loop over sequences, as tqdm does.
         builders: Builder of each category.
+        heights: Lowest and highest mean elevation of a sequence's cameras, degrees.
 
     Raises:
         InputError: A category is unknown, a number is out of its range, or the folder was written with other settings.
@@ -105,19 +107,25 @@ def export_categories(
     for category, index in progress(jobs):
         name = sequence_name(seed, category, index)
         if name not in read_poses(out, category):
-            recorded = make_sequence(category, index, frames, seed, image_size, builders)
+            recorded = make_sequence(category, index, frames, seed, image_size, builders, heights)
             write_sequence(out, category, make_object(category, index, seed, builders), recorded)
     for category in categories:
         write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 
 
 def make_sequence(
-    category: str, index: int, frames: int, seed: int, image_size: int, builders: Mapping[str, Builder] = CATEGORIES
+    category: str,
+    index: int,
+    frames: int,
+    seed: int,
+    image_size: int,
+    builders: Mapping[str, Builder] = CATEGORIES,
+    heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[SequenceData, RenderedSequence]:
     """Make sequence number `index` of a category, with simulated sensor errors, and its exact rendering."""
     name = sequence_name(seed, category, index)
     key = stable_hash(f"{seed}/{category}/{index}")
-    return record_sequence(make_object(category, index, seed, builders), name, key, frames, image_size)
+    return record_sequence(make_object(category, index, seed, builders), name, key, frames, image_size, heights)
 
 
 def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:

@@ -13,7 +13,7 @@ from zsp_lite.errors import check_integer
 from zsp_lite.io.files import read_json, write_atomic
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import RenderedSequence, render_sequence
+from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence, render_sequence
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _JPEG_QUALITY = 88
@@ -27,13 +27,18 @@ def check_settings(frames: int, image_size: int, seed: int) -> None:
 
 
 def record_sequence(
-    mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int
+    mesh: TexturedMesh,
+    name: str,
+    key: int,
+    frames: int,
+    image_size: int,
+    heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[SequenceData, RenderedSequence]:
     """Render an object and simulate the sensor; `key` is the seed of room, cameras and noise.
 
     Returns the recorded sequence, and the exact one in the same unit.
     """
-    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size)
+    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, heights)
     return simulate_capture(exact, name, np.random.default_rng([key, 2]))
 
 

@@ -14,6 +14,7 @@ from zsp_lite.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.synthetic.room import random_room
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
+HEIGHTS = (19.0, 30.0)  # lowest and highest mean elevation of a sequence's cameras above the object, degrees
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 
 
@@ -47,7 +48,11 @@ def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, t
 
 
 def handheld_sweep(
-    vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator, frames: int, size: tuple[int, int]
+    vertices: Float[np.ndarray, "v 3"],
+    rng: np.random.Generator,
+    frames: int,
+    size: tuple[int, int],
+    heights: tuple[float, float] = HEIGHTS,
 ) -> list[Camera]:
     """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object.
 
@@ -62,8 +67,8 @@ def handheld_sweep(
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
-    elevation = np.radians(rng.uniform(19, 30) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2]))))
-    elevation = np.clip(elevation + np.radians(rng.normal(0, 1, frames)), np.radians(10), np.radians(35))
+    elevation = rng.uniform(*heights) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2])))
+    elevation = np.radians((elevation + rng.normal(0, 1, frames)).clip(heights[0] - 9, heights[1] + 5))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
     aim = (vertices.max(0) + vertices.min(0)) / 2 + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
@@ -81,14 +86,20 @@ def handheld_sweep(
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
 
-def render_sequence(mesh: TexturedMesh, rng: np.random.Generator, frames: int, image_size: int) -> RenderedSequence:
+def render_sequence(
+    mesh: TexturedMesh,
+    rng: np.random.Generator,
+    frames: int,
+    image_size: int,
+    heights: tuple[float, float] = HEIGHTS,
+) -> RenderedSequence:
     """Render views around an object in a random room; `image_size` is the shorter image side.
 
     The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
     """
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
-    cameras = handheld_sweep(mesh.vertices, rng, frames, size)
+    cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
     scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
