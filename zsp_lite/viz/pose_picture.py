@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Wedge
 
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes, view_span
+from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.estimates import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz.plots import BLUE, CHOSEN, VERMILLION, coordinate_colours, draw_points
@@ -92,44 +93,55 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     used = used[used != chosen]
     shown = min(_OTHERS, len(used))
     others = used[np.arange(shown) * len(used) // max(shown, 1)]
-    columns = max(shown, 4)
-    heights = [_WIDTH / 3, _WIDTH / columns, 0.3 * _WIDTH] if shown else [_WIDTH / 3, 0.3 * _WIDTH]
-    figure = plt.figure(figsize=(_WIDTH, sum(heights) + 0.25 * len(heights)), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.05, h_pad=0.06)
-    parts = figure.subfigures(len(heights), 1, height_ratios=heights)
-    reference, target, moved = parts[0].subplots(1, 3)
+    figure, (reference, target, moved), small, drawing, key = _panels(shown)
+    frame = views[chosen].frame
     _show(reference, estimate.reference_view.frame.rgb, "reference")
-    _show(target, views[chosen].frame.rgb, f"target {titles[chosen]}")
-    _show(moved, views[chosen].frame.rgb, f"reference in target view {chosen + 1}")
-    panels = {chosen: moved}
-    if shown:
-        panels |= dict(zip(others, parts[1].subplots(1, columns)))
-        for axis in parts[1].axes:
-            axis.set_axis_off()
-        for view in others:
-            _show(panels[view], views[view].frame.rgb, f"in {titles[view]}", 9)
+    _show(target, frame.rgb, f"target {titles[chosen]}")
+    _show(moved, frame.rgb, f"reference in target view {chosen + 1}")
+    if frame.mask is not None:
+        target.set_title(f"target {titles[chosen]}, mask outlined", fontsize=10)
+        columns, rows = (np.arange(size) + 0.5 for size in frame.mask.shape[::-1])
+        target.contour(columns, rows, frame.mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
+    for view, axis in zip(others, small):
+        _show(axis, views[view].frame.rgb, f"in {titles[view]}", 9)
     cloud = _some(result.reference.camera.to_camera(world_cloud([result.reference])[0]))
     colours = coordinate_colours(cloud)
     _draw_points(reference, estimate.reference_view.frame.camera, cloud, colours, 5)
-    crops = [views[view].frame.camera for view in panels]
-    for axis, camera, pose in zip(panels.values(), crops, estimate.propagate(crops)):
+    crops = [views[view].frame.camera for view in (chosen, *others)]
+    for axis, camera, pose in zip((moved, *small), crops, estimate.propagate(crops)):
         _draw_points(axis, camera, pose.apply(cloud), colours, 5 if axis is moved else 3)
-    drawing, key = parts[-1].subplots(1, 2, width_ratios=(2, 3))
     draw_coverage(drawing, seen, chosen + 1)
-    drawing.set_title("seen from above: target grey, reference coloured", fontsize=10)
     moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
     _draw_from_above(drawing, seen, _some(target_cloud), moved_cloud, colours)
-    key.set_axis_off()
     key.legend(*drawing.get_legend_handles_labels(), loc="center left", fontsize=11, frameon=False, labelspacing=1)
     return figure
+
+
+def _panels(others: int) -> tuple[Figure, list[Axes], list[Axes], Axes, Axes]:
+    """Lay out three large panels, small ones for the other views, and the drawing from above with its key.
+
+    A single other view is beside the drawing.
+    """
+    in_row = max(others, 4)
+    heights = [_WIDTH / 3, _WIDTH / in_row, 0.3 * _WIDTH] if others > 1 else [_WIDTH / 3, 0.3 * _WIDTH]
+    figure = plt.figure(figsize=(_WIDTH, sum(heights) + 0.25 * len(heights)), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.05, h_pad=0.06)
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights)
+    large = list(parts[0].subplots(1, 3))
+    small = list(parts[1].subplots(1, in_row)) if others > 1 else []
+    ratios = (3, 3, 4) if others == 1 else (2, 3)
+    *beside, drawing, key = parts[-1].subplots(1, len(ratios), width_ratios=ratios)
+    for axis in figure.axes:
+        axis.set_axis_off()
+    return figure, large, [*small, *beside], drawing, key
 
 
 def draw_coverage(axis: Axes, seen: Coverage, chosen: int) -> None:
     """Draw the cameras on a circle around the object, and shade the largest arc without a target camera."""
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
-    axis.set_axis_off()
+    axis.set_title("seen from above: target grey, reference coloured", fontsize=10)
     begin, end = seen.gap
-    several = seen.span > 0
+    several = len(seen.numbers) > 1
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
     empty = f"no target view in these {360 - seen.span:.0f}°" if several else "only one target view"
     axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
@@ -143,7 +155,7 @@ def draw_coverage(axis: Axes, seen: Coverage, chosen: int) -> None:
             *(1.23 * place), str(number), color=colour, ha="center", va="center", fontsize=11, weight="bold", zorder=4
         )
     axis.plot(*seen.reference, "*", color=VERMILLION, markersize=20, markeredgecolor="white",
-              label=f"reference under this pose, {seen.angle:.0f}° from target view {seen.nearest}")  # fmt: skip
+              label=f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}")  # fmt: skip
 
 
 def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, moved: np.ndarray, colours: np.ndarray) -> None:
@@ -171,4 +183,3 @@ def _show(axis: Axes, image: np.ndarray, title: str, font: float = 10) -> None:
     height, width = image.shape[:2]
     axis.imshow(image, extent=(0, width, height, 0), interpolation="nearest")
     axis.set_title(title, fontsize=font)
-    axis.set_axis_off()
