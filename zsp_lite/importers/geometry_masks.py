@@ -26,6 +26,9 @@ _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
 _MIN_ON_PLANE = 0.05  # share of the points that must lie on it
+_MIN_SPREAD = (
+    0.7  # least deviation of the points on it, relative to that of the others: a side of the object is smaller
+)
 _POINTS = 20_000
 _MIN_PIXELS = 100
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on each side: pixels of
@@ -85,10 +88,19 @@ def supporting_plane(
         height = cloud @ normal - offset
         on = np.abs(height) < PLANE_DISTANCE * distance
         below = (height < -3 * PLANE_DISTANCE * distance).mean()
-        if on.mean() >= _MIN_ON_PLANE and below <= _MAX_BELOW:
+        if (
+            on.mean() >= _MIN_ON_PLANE
+            and below <= _MAX_BELOW
+            and _spread(cloud[on]) >= _MIN_SPREAD * _spread(cloud[~on])
+        ):
             return normal, offset
         rest = rest[np.abs(rest @ normal - offset) >= PLANE_DISTANCE * distance]
     return None
+
+
+def _spread(points: Float[np.ndarray, "n 3"]) -> float:
+    """Compute the root mean square distance of points from their centre."""
+    return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
 
 
 def _focus(frames: Sequence[Frame], points: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, "3"], float]:
