@@ -22,8 +22,6 @@ from zsp_lite.data.archives import list_archives
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import write_published_pairs
-from zsp_lite.errors import InputError
-from zsp_lite.io.download import remote_size
 
 SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"
 LONG = 1 << 20  # bytes
@@ -223,13 +221,6 @@ def test_an_archive_that_is_longer_than_expected_is_not_kept(server, tmp_path, c
     assert files_of(tmp_path / "v2") == []
 
 
-def test_a_labelled_sequence_that_the_archive_lacks_is_named(server, source, tmp_path, capsys):
-    write_label(tmp_path / "clone", "toaster", PoseLabel(np.eye(4), "400_4_4", SEQUENCES[0]))
-    options = ("--labels", str(tmp_path / "clone"), "--labelled-only")
-    assert download(tmp_path / "v1", *options, dataset="co3d-v1") == 2
-    assert "has no sequence '400_4_4'" in capsys.readouterr().err and not (tmp_path / "v1").exists()
-
-
 def test_without_a_terminal_nothing_is_downloaded_unless_told(server, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
     assert download(tmp_path / "co3d", yes=False) == 2
@@ -290,6 +281,12 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     assert same_files(root / "toaster", source / "toaster")
     assert len(server.ranges) == requests + 1  # the archive that was there is not downloaded again
     assert len(set(written)) == len(files_of(root / "toaster")) - 3
+
+
+def test_a_server_that_cannot_be_reached_gives_one_line(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ZSP_LITE_CO3D_URL", "http://127.0.0.1:9")
+    assert download(tmp_path / "co3d") == 2
+    assert "http://127.0.0.1:9/toaster_000.zip cannot be reached" in capsys.readouterr().err
 
 
 def test_a_truncated_archive_is_kept_for_the_next_call(server, tmp_path, capsys):
@@ -362,7 +359,10 @@ def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path,
     ("words", "message"),
     [
         (["co3d", "--category", "spaceship"], "'spaceship' is not in co3d (full)"),
-        (["co3d-v1", "--category", "toaster", "--single-sequence"], "co3d-v1 (single-sequence), which has no such subset"),
+        (
+            ["co3d-v1", "--category", "toaster", "--single-sequence"],
+            "co3d-v1 (single-sequence), which has no such subset",
+        ),
         (["co3d"], "--category"),
         (["co4d", "--category", "toaster"], "co4d"),
     ],
@@ -372,11 +372,3 @@ def test_bad_requests_give_one_line_and_exit_code_2(server, tmp_path, monkeypatc
     assert main(["data", "download", *words, "--yes"]) == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1 and not (tmp_path / "co3d").exists()
-
-
-def test_a_server_without_the_file_or_that_cannot_be_reached_gives_one_line(server, tmp_path, monkeypatch, capsys):
-    with pytest.raises(InputError, match="HTTP Error 404"):
-        remote_size(server.url + "/missing")
-    monkeypatch.setenv("ZSP_LITE_CO3D_URL", "http://127.0.0.1:9")
-    assert download(tmp_path / "co3d") == 2
-    assert "http://127.0.0.1:9/toaster_000.zip cannot be reached" in capsys.readouterr().err

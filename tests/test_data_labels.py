@@ -59,17 +59,6 @@ def packed(clone, kind):
     return path
 
 
-def check_arrived(root):
-    assert list(read_labels(root, "chair")) == ["a", "b"]
-    assert len(shipped_pairs(Co3D(root), "chair", 2)) == 3
-
-
-def test_labels_and_pairs_come_from_a_clone(clone, root):
-    assert import_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
-    check_arrived(root)
-    assert not (root / "README.md").exists()
-
-
 def test_an_import_replaces_other_labels_only_on_request(clone, root):
     import_labels(clone, root)
     import_labels(clone, root)  # a repeated import changes nothing
@@ -84,10 +73,15 @@ def test_an_import_replaces_other_labels_only_on_request(clone, root):
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
-@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
-def test_labels_and_pairs_come_from_an_archive(clone, root, kind):
-    import_labels(packed(clone, kind), root)
-    check_arrived(root)
+@pytest.mark.parametrize("kind", ["folder", "zip", "tar.gz"])
+@pytest.mark.parametrize("folder", [".", "data"])
+def test_labels_and_pairs_come_from_a_clone_or_an_archive_into_the_folder_that_is_there(clone, root, kind, folder):
+    write_label(root / folder, "chair", PoseLabel(np.eye(4), "a", "a"))
+    source = clone if kind == "folder" else packed(clone, kind)
+    assert import_labels(source, root) == {"class_labels": 2, "determ_eval": 1}
+    assert list(read_labels(root, "chair")) == ["a", "b"]
+    assert len(shipped_pairs(Co3D(root), "chair", 2)) == 3
+    assert not (root / "README.md").exists()
 
 
 @pytest.mark.parametrize(
@@ -146,12 +140,6 @@ def test_a_category_cannot_get_labels_of_two_reference_sequences(clone, root, tm
     with pytest.raises(InputError, match="have reference sequences a, z"):
         transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert list(read_labels(tmp_path / "v2", "chair")) == ["z"]
-
-
-def test_labels_are_imported_into_the_existing_label_folder(clone, root):
-    write_label(root / "data", "chair", PoseLabel(np.eye(4), "c", "a"))
-    import_labels(clone, root)
-    assert list(read_labels(root, "chair")) == ["a", "b", "c"]
 
 
 def test_sources_without_labels_are_refused(root, tmp_path):
@@ -227,15 +215,3 @@ def test_missing_labels_and_sequences_are_input_errors(tmp_path):
     write_co3d(tmp_path / "v2b", "chair", [sequence_data("a", frames=6)])
     with pytest.raises(InputError, match="no frames of a sequence 'b'"):
         transfer_labels(tmp_path / "v1", tmp_path / "v2b", "chair")
-
-
-def test_a_transfer_replaces_other_labels_only_on_request(tmp_path):
-    two_layouts(tmp_path)
-    mine = PoseLabel(np.eye(4), "b", "a")
-    path = write_label(tmp_path / "v2", "chair", mine)
-    before = path.read_bytes()
-    with pytest.raises(InputError, match=r"b\.json would be replaced"):
-        transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
-    assert everything(tmp_path / "v2" / "class_labels") == {path.relative_to(tmp_path / "v2" / "class_labels"): before}
-    transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair", replace=True)
-    assert not np.array_equal(read_labels(tmp_path / "v2", "chair")["b"].trans, mine.trans)

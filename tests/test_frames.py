@@ -41,28 +41,23 @@ def square_mask(top, left, height, width, value=1.0):
     return mask
 
 
-def test_the_box_grows_by_a_tenth_half_of_it_on_each_side():
-    assert mask_to_bbox(square_mask(20, 40, 40, 60)) == (18, 37, 44, 66)
-
-
-def test_the_box_stays_in_the_image():
-    assert mask_to_bbox(square_mask(0, 0, 100, 200)) == (0, 0, 100, 200)
-    assert mask_to_bbox(square_mask(0, 180, 40, 20)) == (0, 179, 42, 21)
-
-
-def test_pixels_at_the_threshold_do_not_count():
-    mask = square_mask(20, 40, 40, 60) + square_mask(0, 0, 5, 5, 0.4)
-    assert mask_to_bbox(mask, padding=0) == (20, 40, 40, 60)
+@pytest.mark.parametrize(
+    ("parts", "padding", "box"),
+    [
+        ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
+        ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
+        ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
+        ([(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)], 0, (20, 40, 40, 60)),  # pixels at the threshold do not count
+        ([(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)], 0, (30, 50, 10, 10)),  # a lowered threshold
+    ],
+)
+def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
+    assert mask_to_bbox(sum(square_mask(*part) for part in parts), padding=padding) == box
 
 
 @given(st.floats(0.002, 1))
 def test_the_threshold_is_lowered_until_a_pixel_passes(value):
     assert mask_to_bbox(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
-
-
-def test_a_lowered_threshold_keeps_the_most_probable_pixels():
-    mask = square_mask(20, 40, 40, 60, 0.1) + square_mask(30, 50, 10, 10, 0.2)
-    assert mask_to_bbox(mask, padding=0) == (30, 50, 10, 10)
 
 
 def test_an_empty_mask_has_no_box():
@@ -162,10 +157,3 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
         write_atomic(tmp_path / "file", b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert (tmp_path / "file").read_bytes() == b"old"
-
-
-def test_the_repr_is_one_line_with_the_size_and_what_is_known():
-    assert repr(frame(name="a/0")) == "Frame('a/0', 24 x 32 pixels, no depth, no mask)"
-    half = np.zeros(SIZE, np.float32)
-    half[:12] = 1
-    assert repr(frame(depth=half, mask=half)).endswith("depth known at 50% of the pixels, mask above 0.5 at 50%)")

@@ -33,12 +33,6 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     np.testing.assert_allclose(pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9)
 
 
-@given(seeds)
-def test_the_relative_pose_of_a_view_to_itself_is_the_identity(seed):
-    label, camera = random_label(seed), random_camera(seed)
-    np.testing.assert_allclose(relative_pose(label, camera, label, camera), np.eye(4), atol=1e-9)
-
-
 def test_the_relative_pose_is_the_papers_composition_from_left_to_right():
     labels, cameras = [random_label(1), random_label(2, "b")], [random_camera(1), random_camera(2)]
     point = np.array([0.3, -0.2, 1.5, 1.0])  # seen by camera a

@@ -104,12 +104,9 @@ class RemoteFile(io.RawIOBase):
         self.url, self.size, self._position = url, remote_size(url) or 0, 0
 
     def readable(self) -> bool:
-        """Return True."""
         return True
 
-    def seekable(self) -> bool:
-        """Return True."""
-        return True
+    seekable = readable
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Set the position, as for every file."""
@@ -149,7 +146,7 @@ def _is_part(response: http.client.HTTPResponse, start: int) -> bool:
 
 
 def _read(response: http.client.HTTPResponse, count: int) -> bytes:
-    """Read up to `count` bytes, or those that came before the connection was closed."""
+    """Read `count` bytes, or those that came before the connection was closed."""
     try:
         return response.read(count)
     except http.client.IncompleteRead as error:
