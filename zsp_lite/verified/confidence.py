@@ -13,14 +13,22 @@ the probability of none of these. The confidence of an estimate is p_1. `metrics
 probabilities are calibrated.
 """
 
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from zsp_lite.estimates import Hypothesis
+
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
 MODE_ANGLE = 30.0
 TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, another pose is nearly as probable
+# The estimate is flagged below this fraction of points that lie on an observed surface, in both directions.
+_MIN_OVERLAP = 0.05
+# The estimate is flagged below this similarity term, in both directions. Correct and wrong hypotheses have 0.06 and
+# more, views that share no side of the object 0.01.
+_MIN_SIMILARITY = 0.02
 
 
 @dataclass(frozen=True)
@@ -98,3 +106,25 @@ def is_one_of_two(
     """
     likely = nearly_as_probable(probability, mode)
     return bool(len(likely) == 2 and probability[likely].sum() > 0.5 and angle[likely[0], likely[1]] > 2 * MODE_ANGLE)
+
+
+def reliability_flags(
+    hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
+) -> tuple[tuple[str, ...], bool]:
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
+    terms, flags = hypotheses[0].terms, []
+    probability = np.array([one.confidence for one in hypotheses])
+    mode = np.array([one.mode for one in hypotheses])
+    tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
+    shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
+    if len(tied) > 1:
+        start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
+        flags.append(
+            f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
+            "symmetric"
+        )
+    if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
+        flags.append("no view confirms the pose: nearly no point lies on an observed surface")
+    if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
+        flags.append("no view confirms the pose: features of points that coincide are not similar")
+    return tuple(flags), one_of_two

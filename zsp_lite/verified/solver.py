@@ -11,35 +11,17 @@ from jaxtyping import Float
 
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.confidence import (
-    Calibration,
-    Evidence,
-    hypothesis_probabilities,
-    is_one_of_two,
-    modes,
-    nearly_as_probable,
-)
+from zsp_lite.verified.confidence import Calibration, Evidence, hypothesis_probabilities, modes, reliability_flags
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import (
-    TERM_NAMES,
-    VIEWPOINT_SIGMA,
-    ScoreCoefficients,
-    ScoreTerms,
-    score_terms,
-)
+from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients, ScoreTerms, score_terms
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
 _MAX_REFINED, _MIN_ANGLE_REFINED = 12, 20.0
-# The estimate is flagged below this fraction of points that lie on an observed surface, in both directions.
-_MIN_OVERLAP = 0.05
-# The estimate is flagged below this similarity term, in both directions. Correct and wrong hypotheses have 0.06 and
-# more, views that share no side of the object 0.01.
-_MIN_SIMILARITY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,28 +127,6 @@ class VerifiedSolver:
         named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
         parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
         return tuple(Hypothesis(*one) for one in zip(*parts))
-
-
-def reliability_flags(
-    hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
-) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
-    terms, flags = hypotheses[0].terms, []
-    probability = np.array([one.confidence for one in hypotheses])
-    mode = np.array([one.mode for one in hypotheses])
-    tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
-    shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
-    if len(tied) > 1:
-        start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
-        flags.append(
-            f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
-            "symmetric"
-        )
-    if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
-        flags.append("no view confirms the pose: nearly no point lies on an observed surface")
-    if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
-        flags.append("no view confirms the pose: features of points that coincide are not similar")
-    return tuple(flags), one_of_two
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
