@@ -186,7 +186,8 @@ class ZeroShotPose:
         if not found:
             raise failures[0]
         _, quarters, best = max(found, key=lambda one: one[0])
-        return replace(turn_reference_back(best, reference, quarters), timings=dict(timings))
+        best = turn_reference_back(best, reference, quarters) if quarters else best
+        return replace(best, timings=dict(timings))
 
     def _views(self, crops: Sequence[Frame]) -> list[View]:
         return extract_views(self.backbone, crops, self.foreground)
