@@ -1,16 +1,21 @@
 """The rows of the paper's tables on a folder whose features are perfect."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from benchmark_folder import small_folder
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import extractors
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
+from zsp_lite.benchmark.problem import Problem
 from zsp_lite.benchmark.records import read_records
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows
+from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -71,6 +76,16 @@ def test_rows_differ_as_their_names_say(run):
     assert len(fitted) >= 4 and all("translation_error" not in one and one["inliers"] >= 5 for one in fitted)
     for key, found in records["ours"].items():
         assert records["icp"][key]["view"] == 0 and records["icp-bv"][key]["view"] == found["view"]
+
+
+@pytest.mark.parametrize("row", ["icp", "sift"])
+def test_a_pair_without_depth_fails(row, monkeypatch):
+    (pair,) = pairs_of_rows(small_folder(), resolve([row]), 1, 2, categories=["pebble"])[row]
+    problem = Problem(pair, FrameStore(Co3D(small_folder()), "pebble", {"sift": Sift()}))
+    frames = [replace(frame, depth=None) for frame in problem.frames()]
+    monkeypatch.setattr(problem, "frames", lambda: frames)
+    with pytest.raises(InputError, match="no depth map: 100_a"):
+        METHODS[row].solve(problem)
 
 
 def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):

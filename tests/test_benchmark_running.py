@@ -352,12 +352,12 @@ def test_frames_are_cropped_at_the_size_that_the_backbone_takes():
 
 def test_the_points_behind_a_frames_patches_are_computed_once():
     frames = FrameStore(Co3D(small_folder()), "lump", {"backbone": BACKBONE, "other": BACKBONE})
-    first = frames.view("backbone", ("100_a", 0), "saliency", 0.05)
+    first = frames.view("backbone", ("100_a", 0), "saliency")
     points, measured = first.patch_points, first.measured_points
     for features, foreground in (("backbone", "mask"), ("other", "mask")):
-        view = frames.view(features, ("100_a", 0), foreground, 0.05)
+        view = frames.view(features, ("100_a", 0), foreground)
         assert view.patch_points is points and view.measured_points is measured
-    assert frames.view("other", ("100_a", 1), "mask", 0.05).patch_points is not points
+    assert frames.view("other", ("100_a", 1), "mask").patch_points is not points
 
 
 def test_only_the_last_used_frames_stay_in_memory(monkeypatch):

@@ -10,6 +10,7 @@ from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches, unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 
 _K = 50
@@ -26,7 +27,7 @@ def icp_best_view(problem: Problem) -> Answer:
 
 
 def _icp(problem: Problem, view: int) -> Answer:
-    reference, *targets = problem.frames()
+    reference, *targets = _frames_with_depth(problem)
     try:
         sim3 = align(reference, targets, view, problem.first_cameras(), problem.seed)
     except InputError as error:
@@ -36,7 +37,7 @@ def _icp(problem: Problem, view: int) -> Answer:
 
 def sift(problem: Problem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
-    reference, *targets = problem.frames()
+    reference, *targets = _frames_with_depth(problem)
     first: Keypoints
     first, *others = problem.descriptions("sift")
     found = [mutual_matches(first, other, _K) for other in others]
@@ -52,6 +53,14 @@ def sift(problem: Problem) -> Answer:
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
     return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})
+
+
+def _frames_with_depth(problem: Problem) -> list[Frame]:
+    """The crops of a problem; InputError, which fails the pair, if one has no depth map."""
+    frames = problem.frames()
+    if missing := [frame.name for frame in frames if frame.depth is None]:
+        raise InputError(f"no depth map: {', '.join(missing)}")
+    return frames
 
 
 def posecontrast(problem: Problem) -> Answer:
