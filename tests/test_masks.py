@@ -126,8 +126,8 @@ def test_an_object_without_a_floor_is_found_and_flagged():
 def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
     (first, truth), (second, other) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     away = ball_on_floor((-1, 0.2, 0.6))[0].camera
-    box = bounding(truth, 5)
-    box = box[0].start, box[1].start, box[0].stop - box[0].start, box[1].stop - box[1].start
+    rows, columns = bounding(truth, 5)
+    box = tuple(map(int, (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)))
     away = replace(second, camera=replace(away, t=away.t - (0, 0, 9)))  # behind the camera
     black = replace(second, rgb=np.zeros_like(second.rgb))
     masked = masks_from_box([first, away, black, second], box)

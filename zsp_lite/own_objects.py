@@ -374,10 +374,9 @@ def _open_image(
     if not found:
         names = " or ".join(file.name for file in beside)
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
-    fx, fy, cx, cy = intrinsics
-    camera = camera_from_pose(np.eye(4), (fx, fy), (cx, cy), size, f"image {path}, --intrinsics")
+    camera = camera_from_pose(np.eye(4), intrinsics, size, f"image {path}")
     mask = path.with_name(f"{path.stem}_mask.png")
-    return CaptureFrame(path, found[0], camera, 0.0, depth_unit, mask=mask if mask.is_file() else None)
+    return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 
 
 def _errors(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
@@ -28,7 +28,6 @@ class CaptureFrame:
     image: Path
     depth: Path  # a 16-bit PNG or .npy, of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
-    time: float  # seconds
     depth_unit: float = 0.001  # world units per stored depth value
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
@@ -66,15 +65,11 @@ def files_by_stem(folder: str | Path) -> dict[str, Path]:
 
 
 def camera_from_pose(
-    pose: Float[np.ndarray, "4 4"],
-    focal_length: Sequence[float] | Real[np.ndarray, "2"],
-    principal_point: Sequence[float] | Real[np.ndarray, "2"],
-    size: tuple[int, int],
-    where: str,
+    pose: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], size: tuple[int, int], where: str
 ) -> Camera:
     """Create a camera, with the nearest exact rotation, from its camera-to-world pose in OpenCV's axes.
 
-    InputError, which begins with `where`, the file and line of the pose, if the pose is not rigid.
+    The intrinsics are fx, fy, cx, cy in pixels. InputError, which begins with `where`, if the pose is not rigid.
     """
     rotation = pose[:3, :3]
     if (
@@ -86,8 +81,8 @@ def camera_from_pose(
         raise InputError(f"{where}: pose is {pose.tolist()}, expected a finite rigid camera-to-world matrix")
     left, _, right = np.linalg.svd(rotation)
     rotation = left @ right
-    focal_length, principal_point = np.array(focal_length, float), np.array(principal_point, float)
-    return Camera(rotation.T, -rotation.T @ pose[:3, 3], focal_length, principal_point, size)
+    fx, fy, cx, cy = intrinsics
+    return Camera(rotation.T, -rotation.T @ pose[:3, 3], np.array([fx, fy]), np.array([cx, cy]), size)
 
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:

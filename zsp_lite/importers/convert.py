@@ -20,7 +20,6 @@ from zsp_lite.points import unit_scale
 
 READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
 _SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
-MAX_FRAMES = 100  # about the length of CO3D's sequences
 
 
 def capture_format(folder: str | Path) -> str:
@@ -53,7 +52,7 @@ def import_capture(
     sequence: str,
     box: Box | None = None,
     masks: str | Path | None = None,
-    max_frames: int = MAX_FRAMES,
+    max_frames: int = 100,
 ) -> ImportResult:
     """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
@@ -67,7 +66,7 @@ def import_capture(
         sequence: Name of the new sequence.
         box: Bounding box (top, left, height, width) of the object in the first frame, pixels (see `masks_from_box`).
         masks: Folder of mask files, named like the images. Without it and a box, the masks of the capture are used.
-        max_frames: Maximum number of frames, evenly spaced.
+        max_frames: Maximum number of frames, evenly spaced; CO3D's sequences have about 100.
 
     Raises:
         InputError: The capture cannot be read, segmented or fused, the sequence exists, or another process imports into
@@ -101,8 +100,7 @@ def import_capture(
     points, colours, normals = fuse(frames)
     scale = unit_scale(points)
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
-    times = [capture[index].time - capture[0].time for index in seen]
-    data = SequenceData(sequence, scaled, times, points * scale, colours, normals)
+    data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):
         folder.mkdir(parents=True, exist_ok=True)
         unfinished.touch()

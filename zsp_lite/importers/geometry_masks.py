@@ -91,14 +91,14 @@ def supporting_plane(
         if (
             on.mean() >= _MIN_ON_PLANE
             and below <= _MAX_BELOW
-            and _spread(cloud[on]) >= _MIN_SPREAD * _spread(cloud[~on])
+            and _extent(cloud[on]) >= _MIN_SPREAD * _extent(cloud[~on])
         ):
             return normal, offset
         rest = rest[np.abs(rest @ normal - offset) >= PLANE_DISTANCE * distance]
     return None
 
 
-def _spread(points: Float[np.ndarray, "n 3"]) -> float:
+def _extent(points: Float[np.ndarray, "n 3"]) -> float:
     """Compute the root mean square distance of points from their centre."""
     return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
 

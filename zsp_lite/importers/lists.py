@@ -43,8 +43,8 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
         pose[: len(values)] = values
         image, depth = path_inside(folder, image), path_inside(folder, depth)
         size = size or read_image(image).shape[:2]
-        camera = camera_from_pose(pose, (fx, fy), (cx, cy), size, where)
-        frames.append(CaptureFrame(image, depth, camera, number - 1.0, depth_unit, mask=masks.get(image.stem)))
+        camera = camera_from_pose(pose, (fx, fy, cx, cy), size, where)
+        frames.append(CaptureFrame(image, depth, camera, depth_unit, mask=masks.get(image.stem)))
     return frames
 
 

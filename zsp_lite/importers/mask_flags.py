@@ -67,14 +67,12 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
 
 def _plane_around(frames: Sequence[Frame]) -> tuple[Plane | None, float]:
     """Fit the plane that an object stands on to points outside of its masks; return also the cameras' distance."""
-    around, distances = [], []
-    for frame in frames:
-        points, mask = world_points(frame), (frame.mask > ON_OBJECT).astype(np.uint8)
-        centre = np.nanmedian(points[mask > 0], axis=0)
-        distances.append(np.linalg.norm(centre - frame.camera.centre))
-        outside = cv2.dilate(mask, np.ones((5, 5), np.uint8)) == 0
-        around.append(points[outside & (np.linalg.norm(points - centre, axis=-1) < REACH * distances[-1])])
-    distance = float(np.nanmean(distances))
+    points, masks = [world_points(frame) for frame in frames], [frame.mask > ON_OBJECT for frame in frames]
+    centre = np.nanmedian(np.concatenate([one[mask] for one, mask in zip(points, masks)]), axis=0)
+    distance = float(np.mean([np.linalg.norm(frame.camera.centre - centre) for frame in frames]))
+    widened = [cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for mask in masks]
+    near = [np.linalg.norm(one - centre, axis=-1) < REACH * distance for one in points]  # False for NaN
+    around = [one[chosen & ~mask] for one, chosen, mask in zip(points, near, widened)]
     return supporting_plane(frames, around, distance), distance
 
 

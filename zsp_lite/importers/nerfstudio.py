@@ -74,13 +74,12 @@ def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
             found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
             raise InputError(f"{where}: camera_model is {found}, expected one of {', '.join(_MODELS)} with k4 = 0")
         pose = np.array(frame.transform_matrix) @ _TO_OPENCV
-        focal_length, size = (frame.fl_x, frame.fl_y or frame.fl_x), (int(frame.h), int(frame.w))
-        camera = camera_from_pose(pose, focal_length, (frame.cx, frame.cy), size, where)
+        intrinsics, size = (frame.fl_x, frame.fl_y or frame.fl_x, frame.cx, frame.cy), (int(frame.h), int(frame.w))
+        camera = camera_from_pose(pose, intrinsics, size, where)
         image, depth = path_inside(folder, frame.file_path), path_inside(folder, frame.depth_file_path)
         mask = None if frame.mask_path is None else path_inside(folder, frame.mask_path)
         distortion = frame.k1, frame.k2, frame.p1, frame.p2, frame.k3  # OpenCV's order; its model has no r^8 term, k4
-        unit = frame.depth_unit_scale_factor
-        frames.append(CaptureFrame(image, depth, camera, float(number), unit, distortion, mask))
+        frames.append(CaptureFrame(image, depth, camera, frame.depth_unit_scale_factor, distortion, mask))
     if not frames:
         raise InputError(f"{path}: none of {len(listed)} frames has depth_file_path, expected RGB-D frames")
     return frames
