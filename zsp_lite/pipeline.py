@@ -224,10 +224,16 @@ class ZeroShotPose:
 
 
 def solve_pair(
-    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str]
+    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
 ) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers, by name; crops and features are computed once."""
+    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own.
+
+    Crops and features are computed once.
+    """
     first, *others = method.views([reference, *targets])
+    if solvers is None:
+        name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
+        return {name: method.estimate_from_views(first, others)}
     return {name: replace(method, solver=name).estimate_from_views(first, others) for name in solvers}
 
 
