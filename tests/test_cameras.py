@@ -65,7 +65,7 @@ def test_a_rounded_rotation_is_replaced_by_the_nearest_rotation():
 
 @pytest.mark.parametrize(
     ("intrinsics_format", "focal_length", "principal_point"),
-    zip(FORMATS, ([200, 150], [100, 150]), ([90, 60], [95, 60])),
+    [(FORMATS[0], [200, 150], [90, 60]), (FORMATS[1], [100, 150], [95, 60])],
 )
 def test_intrinsics_worked_out_by_hand(intrinsics_format, focal_length, principal_point):
     camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200), intrinsics_format)

@@ -28,17 +28,13 @@ def frame_file(root, part, sequence="a"):
 def test_a_complete_folder_has_no_problems(root):
     dataset = Co3D(root)
     write_published_pairs(pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
-    (check,) = check_folder(root, deep=True)
-    assert not check.problems
+    write_co3d(root, "stool", [sequence_data("c")], intrinsics_format="ndc_isotropic")
+    check, stool = check_folder(root, deep=True)
+    assert not check.problems and stool.layout == "v2"
     assert (check.category, check.layout, check.sequences, check.frames) == ("chair", "v1", 2, 8)
     assert (check.complete, check.labelled, check.usable, check.pairs) == (2, 2, 2, 1)
     files = [path for path in (root / "chair").rglob("*") if path.is_file() and path.suffix != ".jgz"]
     assert check.size == sum(path.stat().st_size for path in files)
-
-
-def test_v2_is_recognised(tmp_path):
-    write_co3d(tmp_path, "chair", [sequence_data("a")], intrinsics_format="ndc_isotropic")
-    assert check_folder(tmp_path)[0].layout == "v2"
 
 
 @pytest.mark.parametrize("part", ["images", "masks", "depths", "depth_masks"])

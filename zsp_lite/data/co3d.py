@@ -87,14 +87,7 @@ class Co3D:
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 
     def __repr__(self) -> str:
-        names = self.categories()
-        lines = [f"Co3D({str(self.root)!r}, categories: {len(names)}"]
-        if names:
-            lines.append(textwrap.shorten(", ".join(names), 110, placeholder=" ..."))
-        if self._index is not None:
-            category, index = self._index
-            lines.append(f"in memory: {category}, {len(index.by_sequence)} sequences, {len(index.keys)} frames")
-        return "\n     ".join(lines) + ")"
+        return f"Co3D({str(self.root)!r}, categories: {textwrap.shorten(', '.join(self.categories()), 110)})"
 
     def categories(self) -> list[str]:
         """List the folders that have frame annotations, sorted by name."""
