@@ -116,7 +116,7 @@ class Co3D:
         return selected[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
-        """List the frames in the order of the annotation file, to which the ids of upstream's pairs refer."""
+        """List the frames in the order of the annotation file, to which the ids of published pairs refer."""
         return self._frame_index(category).keys
 
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
