@@ -36,7 +36,7 @@ def _four_finite(values: tuple[float, ...]) -> bool:
 COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
 PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
 NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
-LENGTH = Parsed("metres", float, lambda length: 0 < length < math.inf, "a positive number")
+LENGTH = Parsed("metres", float, lambda length: 0 < length < 1e9, "a positive number below 1e9")
 BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _four_finite, "four integers")
 INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _four_finite, "four numbers")
 
