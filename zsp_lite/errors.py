@@ -33,9 +33,8 @@ class FatalError(InputError):
 
 def describe_failure(error: BaseException) -> str:
     """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f"{frames[-1].filename}, line {frames[-1].lineno}: " if frames else ""
-    return " ".join(f"{place}{type(error).__name__}: {error}".split())
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:

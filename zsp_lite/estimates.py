@@ -56,37 +56,25 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Pose of the reference object in one of the target views, with the intermediate results behind it.
+    """Pose of the reference object in one of the target views, with the intermediate results behind it."""
 
-    Attributes:
-        sim3: Reference-camera points to camera points of the chosen target view.
-        view: Index of the chosen target view.
-        matches: Matches between the reference and the chosen view.
-        inliers: (K,) the matches that agree with the pose; with the verified solver, of those with measured depth on
-            both sides.
-        view_scores: (N,) score of every target view, higher is better; -inf for views that were left out.
-        reference_view: Crop, features and foreground of the reference.
-        target_views: The same of all N target views.
-        timings: Seconds per stage.
-        flags: One line per reason not to trust the estimate.
-        hypotheses: Candidate poses of the solver, best first; empty for the paper's solver.
-        one_of_two: Whether the solver cannot decide between the estimate and its first alternative: both are nearly
-            equally probable and far apart, such as by a half turn (see `verified.confidence.is_one_of_two`).
-        reference_turn: By how many degrees the reference crop was turned counterclockwise for its features (see
-            `ZeroShotPose.upright`). The pose is that of the image as given.
-    """
-
-    sim3: Sim3
-    view: int
-    matches: Matches
+    sim3: Sim3  # reference-camera points to camera points of the chosen target view
+    view: int  # index of the chosen target view
+    matches: Matches  # matches between the reference and the chosen view
+    # (K,) the matches that agree with the pose; with the verified solver, of those with measured depth on both sides
     inliers: Bool[np.ndarray, " k"]
+    # (N,) score of every target view, higher is better; -inf for views that were left out
     view_scores: Float[np.ndarray, " n"]
-    reference_view: View
-    target_views: tuple[View, ...]
-    timings: dict[str, float] = field(default_factory=dict)
-    flags: tuple[str, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()
+    reference_view: View  # crop, features and foreground of the reference
+    target_views: tuple[View, ...]  # the same of all N target views
+    timings: dict[str, float] = field(default_factory=dict)  # seconds per stage
+    flags: tuple[str, ...] = ()  # one line per reason not to trust the estimate
+    hypotheses: tuple[Hypothesis, ...] = ()  # candidate poses of the solver, best first; empty for the paper's solver
+    # whether the solver cannot decide between the estimate and its first alternative: both are nearly equally probable
+    # and far apart, such as by a half turn (see `verified.confidence.is_one_of_two`)
     one_of_two: bool = False
+    # by how many degrees the reference crop was turned counterclockwise for its features (see `ZeroShotPose.upright`).
+    # The pose is that of the image as given
     reference_turn: int = 0
 
     @property
@@ -147,14 +135,7 @@ class PoseEstimate:
         return picture_html(repr(self), self.reference_view.frame.rgb, self.target_views[self.view].frame.rgb)
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
-        """Express the pose in other cameras of the target sequence (sec. 5.6).
-
-        Args:
-            cameras: Cameras in the world of the target sequence.
-
-        Returns:
-            For each camera, the similarity from reference-camera points to its camera points.
-        """
+        """Express the pose in other cameras of the target sequence (sec. 5.6)."""
         best = self.target_camera
         poses = []
         for camera in cameras:
@@ -267,25 +248,11 @@ class Solver(Protocol):
     def __call__(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
-        """Estimate the pose of the reference object.
+        """Estimate the pose of the reference object from N >= 1 target views, each with its matches to the reference.
 
-        `ZeroShotPose` leaves out unusable targets before the call (see `views.usable_targets`). It maps the views of
-        the result back to all targets, and adds its own flags and timings.
-
-        Args:
-            reference: Reference view, with known depth in at least one pixel.
-            targets: N >= 1 target views, each with known depth in at least one pixel and a foreground patch.
-            matched: For each target view, its similarities to the reference and their matches.
-            seed: Seed of everything that is drawn; the same seed gives the same pose.
-            threshold: Largest residual of an inlier for an object of unit standard deviation, as the scenes of CO3D
-                are scaled. (The paper's solver takes it in scene units; the verified solver multiplies it by the
-                target object's standard deviation.)
-
-        Returns:
-            The estimate, in terms of the views given.
-
-        Raises:
-            InputError: The views do not determine a pose.
+        All views have known depth in at least one pixel, and the targets a foreground patch. The same `seed` gives the
+        same pose. `threshold` is the largest residual of an inlier for an object of unit standard deviation, as the
+        scenes of CO3D are scaled. InputError if the views do not determine a pose.
         """
         ...
 

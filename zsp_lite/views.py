@@ -50,15 +50,12 @@ class View:
 
         Computed on first use: of N target views the paper's solver needs only those of the chosen one.
         """
-        return self._patch_points(inpaint=True)
+        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
 
     @cached_property
     def measured_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
         """`patch_points` without in-painting: the point of a patch without measured depth is the origin."""
-        return self._patch_points(inpaint=False)
-
-    def _patch_points(self, inpaint: bool) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint)
+        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=False)
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
