@@ -32,32 +32,19 @@ MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Everything that determines the result of a run, except the images and the initial backbone.
+    """Everything that determines the result of a run, except the images and the initial backbone."""
 
-    Attributes:
-        seed: Seed of crops and of the random head.
-        steps: Number of steps.
-        images: Images per step.
-        local_crops: Local crops per image, in addition to two global ones.
-        global_side, local_side: Sides of the crops in pixels.
-        outputs: Number K of outputs. DINO has 65,536.
-        teacher_temperature: Temperature of the teacher's softmax.
-        learning_rate: Largest learning rate.
-        centring: If false, the centre stays 0.
-        sharpening: If false, the teacher has the student's temperature.
-    """
-
-    seed: int = 0
+    seed: int = 0  # of crops and of the random head
     steps: int = 300
-    images: int = 16
-    local_crops: int = 4
-    global_side: int = 96
+    images: int = 16  # per step
+    local_crops: int = 4  # per image, in addition to two global ones
+    global_side: int = 96  # of the crops, pixels
     local_side: int = 48
-    outputs: int = 512
-    teacher_temperature: float = 0.04
-    learning_rate: float = 1e-3
-    centring: bool = True
-    sharpening: bool = True
+    outputs: int = 512  # K; DINO has 65,536
+    teacher_temperature: float = 0.04  # of the teacher's softmax
+    learning_rate: float = 1e-3  # the largest
+    centring: bool = True  # if false, the centre stays 0
+    sharpening: bool = True  # if false, the teacher has the student's temperature
 
 
 class Head(nn.Module):
@@ -118,13 +105,9 @@ def distillation_loss(
     """Compute the cross-entropy between the teacher's and the student's distributions of different crops (eq. 3).
 
     The arguments are logits; the first two crops of the student are the global ones. `centre`, the average of the
-    teacher's logits, is subtracted.
-
-    Returns:
-        The loss, and figures in nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl",
-        divergence of the student's distributions from them (loss = teacher_entropy + kl); "information", entropy of the
-        teacher's mean distribution minus teacher_entropy, which is the mutual information of output and image: 0 for
-        both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
+    teacher's logits, is subtracted. The figures are in nats: "loss"; "teacher_entropy", mean entropy of the teacher's
+    distributions; "kl", divergence of the student's from them; and "information", the mutual information of output and
+    image: 0 for both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()

@@ -26,10 +26,8 @@ def correspondence_loss(
     The target of a query patch is a distribution over the patches of the object's other views: a Gaussian of the
     distance between the surface points with standard deviation `radius` (object units), 0 beyond 2.4 of these. At most
     `queries` random patches of an object are queries. The descriptors are unit vectors, ordered by object and view.
-
-    Returns:
-        The loss, as the divergence from the targets, so that 0 is its minimum; and the fraction of queries whose
-        nearest descriptor has a non-zero target.
+    The loss is the divergence from the targets, so that 0 is its minimum; the second result is the fraction of queries
+    whose nearest descriptor has a non-zero target.
     """
     crops, n, dim = descriptors.shape
     views = crops // objects
