@@ -7,9 +7,8 @@ import numpy as np
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
-from zsp_lite.synthetic.photography import CheapCamera
 from zsp_lite.synthetic.primitives import Mesh, box
-from zsp_lite.synthetic.room import Room
+from zsp_lite.synthetic.room import CheapCamera, Room
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training.renders import framed_camera
 

@@ -14,11 +14,9 @@ from tools import same_shape
 from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from tools.same_shape import CATALOGUE, copy_same_shape
-from tools.training_categories import TRAINING
-from tools.validation_categories import VALIDATION
 from zsp_lite.backbones.pretrained import WEIGHTS
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic.categories import CATEGORIES
+from zsp_lite.synthetic.meshes import read_mesh
 from zsp_lite.synthetic.models import list_models
 
 TOOLS = Path(__file__).parents[1] / "tools"
@@ -105,12 +103,7 @@ def test_no_file_is_in_two_catalogues():
         assert len(set(files)) == len(files)
 
 
-def test_no_evaluated_category_is_trained_on_or_used_for_model_selection():
-    assert not set(read_catalogue(ARTISTS).models) & {*TRAINING, *VALIDATION}
-    assert set(read_catalogue(SAMPLES).models) <= set(CATEGORIES)
-
-
-def test_models_of_one_shape_are_of_the_catalogue_of_their_side(tmp_path):
+def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under_their_class(tmp_path, monkeypatch):
     listed = json.loads(CATALOGUE.read_text())
     assert listed.keys() == {"training", "validation"}
     for side, path in (("training", TRAINED), ("validation", CHOSEN_BY)):
@@ -118,16 +111,11 @@ def test_models_of_one_shape_are_of_the_catalogue_of_their_side(tmp_path):
         known = {f"{category}/{name}" for category, entries in models.items() for name in entries}
         names = [name for some in listed[side].values() for name in some]
         assert len(set(names)) == len(names) and set(names) <= known
-    with pytest.raises(InputError, match="side is 'evaluation', expected one of training, validation"):
-        copy_same_shape("evaluation", tmp_path, tmp_path / "out")
-    with pytest.raises(InputError, match="no model .*, expected the folder that tools/models.py made of training.json"):
-        copy_same_shape("training", tmp_path / "absent", tmp_path / "out")
-
-
-def test_models_of_one_shape_are_copied_under_their_class(tmp_path, monkeypatch):
     (tmp_path / "list.json").write_text('{"training": {"stool": ["chair_kind/oak"]}}')
     monkeypatch.setattr(same_shape, "CATALOGUE", tmp_path / "list.json")
     models = tmp_path / "models"
+    with pytest.raises(InputError, match="no model .*, expected the folder that tools/models.py made of training.json"):
+        copy_same_shape("training", models, tmp_path / "out")
     for name in ("oak", "elm"):
         (models / "chair_kind" / name).mkdir(parents=True)
         (models / "chair_kind" / name / f"{name}.obj").write_text("v 0 0 0")
@@ -138,15 +126,11 @@ def test_models_of_one_shape_are_copied_under_their_class(tmp_path, monkeypatch)
 
 
 def test_an_ac3d_model_keeps_its_placement_texture_and_opacity(aircraft, tmp_path):
-    from zsp_lite.synthetic.meshes import read_mesh
-
     out = tmp_path / "out" / "plane.obj"
     convert(aircraft, out, [aircraft.parent / "liveries"])
     mesh = read_mesh(out)
     assert len(mesh.faces) == 2  # a line is no surface
-    assert mesh.vertices.mean(0) == pytest.approx([10, 0, 0]) and np.ptp(mesh.vertices, axis=0) == pytest.approx(
-        [0, 2, 2]
-    )
+    assert mesh.vertices.min(0) == pytest.approx([10, -1, -1]) and mesh.vertices.max(0) == pytest.approx([10, 1, 1])
     assert mesh.uv.max((0, 1)).tolist() == [2, 1]  # the texture repeats twice
     (material,) = mesh.materials
     assert material.colour == pytest.approx([1, 0, 0, 0.75], abs=0.01) and material.texture.shape == (8, 8, 4)
@@ -174,10 +158,8 @@ def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
     out = tmp_path / "models"
     build(packages, out, catalogue)
     page = (out / "ATTRIBUTION.md").read_text()
-    assert (
-        "| sign/stop | | Ann | [CC0 1.0](" in page
-        and "| aircraft/plane | | Bob | GPL-2+ | plane.ac | converted" in page
-    )
+    assert "| sign/stop | | Ann | [CC0 1.0](" in page
+    assert "| aircraft/plane | | Bob | GPL-2+ | plane.ac | converted" in page
     build(packages, out, catalogue)  # again into the same folder
     aircraft_model, sign_model = list_models(out)
     assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D, -x taken as front"

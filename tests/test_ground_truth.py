@@ -10,12 +10,7 @@ from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.samples import sample_data
 from zsp_lite.synthetic.export import export_categories, make_object
-from zsp_lite.synthetic.ground_truth import (
-    correct_matches,
-    ground_truth_matches,
-    object_poses,
-    patch_coordinates,
-)
+from zsp_lite.synthetic.ground_truth import correct_matches, ground_truth_matches, object_poses, patch_coordinates
 from zsp_lite.views import object_crop
 
 GRID = (28, 28)
@@ -46,7 +41,7 @@ def test_patch_coordinates_lie_on_the_mesh_of_the_object(tmp_path):
     ((sequence, pose),) = object_poses(exported, "toytruck").items()
     (frame,) = exported.frames("toytruck", sequence)
     coordinates, known = patch_coordinates(object_crop(exported.load(frame)), pose, GRID)
-    points = coordinates[known] * (pose.high - pose.low) + pose.low
+    points = coordinates[known] * np.subtract(pose.high, pose.low) + pose.low
     mesh = surface(make_object("toytruck", 0, seed=0))
     distance = NearestNeighbors(n_neighbors=1).fit(mesh).kneighbors(points)[0]
     assert known.sum() > 100
@@ -83,14 +78,18 @@ def test_a_correct_match_is_at_most_one_row_and_one_column_off():
     assert correct_matches(cells, np.full((5, 2), 4), tolerance=2).all()
 
 
-def test_a_folder_without_object_poses_is_an_input_error(tmp_path, dataset):
-    with pytest.raises(InputError, match="expected a synthetic export"):
-        object_poses(Co3D(tmp_path), "chair")
-
-
-@pytest.mark.parametrize("content", ['{"a": {"trans": []}}', '{"a": ', '{"a": {"scale": 1.0}}'])
-def test_damaged_object_poses_are_an_input_error_with_the_name_of_the_file(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "expected a synthetic export"),
+        ('{"a": {"trans": []}}', "object_poses.json"),
+        ('{"a": ', "object_poses.json"),
+        ('{"a": {"scale": 1.0}}', "object_poses.json"),
+    ],
+)
+def test_missing_and_damaged_object_poses_are_input_errors(tmp_path, content, message):
     (tmp_path / "chair").mkdir()
-    (tmp_path / "chair/object_poses.json").write_text(content)
-    with pytest.raises(InputError, match="object_poses.json"):
+    if content:
+        (tmp_path / "chair/object_poses.json").write_text(content)
+    with pytest.raises(InputError, match=message):
         object_poses(Co3D(tmp_path), "chair")

@@ -1,4 +1,4 @@
-"""The renderer's geometry is exact, and its pictures obey light, texture, holes, glass and exposure."""
+"""The renderer's geometry is exact, and its pictures obey light, texture, holes and glass."""
 
 from dataclasses import replace
 
@@ -9,11 +9,9 @@ from model_files import painted, studio, view, wedge, write_quad
 from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo
-from zsp_lite.synthetic.photography import CheapCamera
 from zsp_lite.synthetic.raytracing import MeshScene
 from zsp_lite.synthetic.room import random_room
 from zsp_lite.synthetic.sequences import orbit_pose
-from zsp_lite.synthetic.textures import srgb_to_linear
 from zsp_lite.training.renders import framed_camera
 
 STUDIO = RoomLight(studio())
@@ -138,26 +136,6 @@ def test_the_object_shades_the_floor_on_the_side_away_from_the_light():
     assert key[0] < 0.1 and key[1] > 0.9 and around[2] < 0.6 < around[1]
 
 
-def test_a_larger_light_has_softer_shadows():
-    half_shades = []
-    for radius in (0.001, 0.3):
-        room = RoomLight(replace(studio(), light_radius=radius))
-        key, _ = MeshScene(painted(wedge()), room, 0).shadow(np.random.default_rng(0).uniform(-3, 3, (2000, 2)))
-        half_shades.append(((key > 0.1) & (key < 0.9)).mean())
-    assert half_shades[1] > 1.5 * half_shades[0] > 0
-
-
-def test_a_mirror_shows_more_of_the_room_than_a_matte_surface():
-    mesh = painted(wedge(), colour=(0.9, 0.2, 0.1, 1))
-    camera = view(mesh.vertices)
-    glossy = replace(mesh, materials=(replace(mesh.materials[0], specular=0.5, roughness=0.2),))
-    matte_blue, glossy_blue = (
-        srgb_to_linear(drawn.rgb[drawn.mask] / 255)[:, 2].mean()
-        for drawn in (render(mesh, camera), render(glossy, camera))
-    )
-    assert glossy_blue > 1.5 * matte_blue  # the white room on the red surface
-
-
 def test_the_same_seed_gives_the_same_picture_and_vertices_may_have_colours():
     mesh = painted(wedge())
     camera = view(mesh.vertices)
@@ -167,23 +145,3 @@ def test_the_same_seed_gives_the_same_picture_and_vertices_may_have_colours():
     blue = replace(mesh, colours=mesh.colours * np.float32([0.1, 0.1, 1]), materials=(Material(np.ones(4)),))
     drawn = render(blue, camera)
     assert (drawn.rgb[drawn.mask].argmax(-1) == 2).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_random_room_has_finite_light_and_a_floor_that_reflects_less_than_it_receives(seed):
-    room = random_room(seed)
-    assert np.linalg.norm(room.light) == pytest.approx(1) and room.light[2] > 0.4
-    for image in room.images:
-        assert np.isfinite(image).all() and image.min() >= 0 and image.dtype == np.float32
-    assert room.images[4].max() <= 0.93 and 0.02 < room.images[4].mean() < 0.7
-
-
-def test_the_camera_exposes_for_mid_grey_and_its_noise_is_as_given():
-    camera = CheapCamera(noise=0.03, vignetting=0.0)
-    for radiance in (0.01, 1.0, 50.0):
-        flat = np.full((64, 64, 3), radiance, np.float32)
-        picture = camera.develop(flat, camera.exposure_gain(flat), np.random.default_rng(0))
-        assert 90 < picture.mean() < 150 and 0.3 < picture.std() < 8
-    silent = replace(camera, noise=0.0, white_balance=(1.2, 1, 0.8))
-    picture = silent.develop(flat, silent.exposure_gain(flat), np.random.default_rng(0)).reshape(-1, 3)
-    assert np.ptp(picture, axis=0).max() <= 1 and picture[0, 0] > picture[0, 1] > picture[0, 2]

@@ -8,7 +8,7 @@ Textures are looked for beside the model and in the given folders, and written a
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,25 +19,17 @@ from zsp_lite.errors import InputError
 
 @dataclass
 class Ac3dObject:
-    """One object of the file, in the coordinates of the file's world.
+    """One object of the file, in the coordinates of the file's world."""
 
-    Attributes:
-        vertices: Vertices (v, 3).
-        texture: Name of the texture, or None.
-        faces: Polygons: index of the material, and (vertex, u, v) of each corner.
-    """
-
-    vertices: np.ndarray
-    texture: str | None
-    faces: list[tuple[int, list[tuple[int, float, float]]]] = field(default_factory=list)
+    vertices: np.ndarray  # (v, 3)
+    texture: str | None  # its name
+    faces: list[
+        tuple[int, list[tuple[int, float, float]]]
+    ]  # polygons: index of the material, (vertex, u, v) of corners
 
 
 def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject]]:
-    """Return the materials (each a dict of numbers by keyword) and the objects of an AC3D file.
-
-    Raises:
-        InputError: If the file is not an AC3D file or ends early.
-    """
+    """Return the materials (each a dict of numbers by keyword) and the objects of an AC3D file."""
     lines = iter([line for line in path.read_bytes().decode("latin-1").splitlines() if line.strip()])
     if not next(lines, "").startswith("AC3D"):
         raise InputError(f"{path} does not begin with AC3D")
@@ -56,16 +48,7 @@ def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject
 
 
 def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None:
-    """Write an AC3D model as OBJ with MTL and PNG files.
-
-    Args:
-        path: AC3D file.
-        out: OBJ file; its folder is created.
-        texture_folders: Where to look for textures that are not beside the model.
-
-    Raises:
-        InputError: If the file is damaged or a texture is missing.
-    """
+    """Write an AC3D model as OBJ with MTL and PNG files; textures may be beside it or in `texture_folders`."""
     materials, objects = read_ac3d(path)
     out.parent.mkdir(parents=True, exist_ok=True)
     obj, used, start, corner = [f"mtllib {out.stem}.mtl"], {}, 1, 1
@@ -103,14 +86,8 @@ def _material(words: list[str]) -> dict[str, list[float]]:
 
 def _read_object(lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, objects: list[Ac3dObject]) -> None:
     """Read one object and its children, which move with it."""
-    turn, offset, vertices, texture, repeat, displacement = (
-        np.eye(3),
-        np.zeros(3),
-        np.zeros((0, 3)),
-        None,
-        (1, 1),
-        (0, 0),
-    )
+    turn, offset, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
+    texture, repeat, displacement = None, (1, 1), (0, 0)
     faces: list[tuple[int, list[tuple[int, float, float]]]] = []
     for line in lines:
         words = shlex.split(line) if '"' in line else line.split()

@@ -13,11 +13,7 @@ DATA_HELP = "folder of categories in CO3D's layout with pose labels, and number 
 
 
 def folder_and_pairs(text: str) -> tuple[Path, int]:
-    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its categories.
-
-    Raises:
-        ArgumentTypeError: The text has another form.
-    """
+    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its categories."""
     folder, _, pairs = text.rpartition(":")
     if not folder or not pairs.isdecimal() or int(pairs) < 1:
         raise ArgumentTypeError(f"{text}: expected FOLDER:PAIRS, PAIRS at least 1")

@@ -58,20 +58,13 @@ PLACES = {
 
 @dataclass(frozen=True)
 class Photo:
-    """A chair in a square picture.
-
-    Attributes:
-        chair: Its parts.
-        azimuth: Direction from which it is seen, in degrees; 0 is its front.
-        x, y: Upper left corner of the picture in the drawing.
-        size: Side of the picture.
-    """
+    """A chair in a square picture."""
 
     chair: Chair
-    azimuth: float
-    x: float
+    azimuth: float  # direction from which it is seen, in degrees; 0 is its front
+    x: float  # upper left corner of the picture in the drawing
     y: float
-    size: float
+    size: float  # side of the picture
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the places (N, 2) of points (N, 3) in the drawing, and their distances (N,) from the camera."""

@@ -39,27 +39,16 @@ LICENCES = {
 
 
 class Source(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One work of a package.
-
-    Attributes:
-        package: Package.
-        file: File in the package.
-        sha256: Checksum of the work's own file (that of the archive member where `member` is given).
-        licence: Licence of the work.
-        author: Author of the work.
-        licence_file: Where the licence was read: in the package, or in the archive beside the work.
-        member: Path of the work in the archive `file`.
-        title: Title that the author gave to the work, where there is one.
-    """
+    """One work of a package."""
 
     package: str
-    file: str
-    sha256: str
+    file: str  # in the package
+    sha256: str  # of the work's own file (of the archive member where `member` is given)
     licence: str
     author: str
-    licence_file: str
-    member: str = ""
-    title: str = ""
+    licence_file: str  # where the licence was read: in the package, or in the archive beside the work
+    member: str = ""  # path of the work in the archive `file`
+    title: str = ""  # that the author gave to the work
 
     def path(self, packages: Path) -> Path:
         """Return the path of `file`. Raises InputError if it is missing."""
@@ -87,15 +76,10 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Entry(Source, frozen=True, omit_defaults=True):
-    """One model of the catalogue.
+    """One model of the catalogue."""
 
-    Attributes:
-        textures: Folder of the package with textures that are not beside the model.
-        front: Front in the axes of the file; the top is +y.
-    """
-
-    textures: str = ""
-    front: str = "+z"
+    textures: str = ""  # folder of the package with textures that are not beside the model
+    front: str = "+z"  # in the axes of the file; the top is +y
 
 
 class Catalogue(msgspec.Struct, frozen=True):
@@ -111,17 +95,9 @@ def read_catalogue(path: Path) -> Catalogue:
 
 
 def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
-    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/`.
+    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/`; write its `models.json` and attribution.
 
-    `out` also receives `models.json` and `ATTRIBUTION.md`.
-
-    Args:
-        packages: Folder with one folder per unpacked package.
-        out: Folder to write.
-        catalogue: The models.
-
-    Raises:
-        InputError: If a package or a file is missing, or a file is another one than that of the catalogue.
+    `packages` has one folder per unpacked package.
     """
     infos = {}
     for category, models in catalogue.models.items():
@@ -161,15 +137,8 @@ def attribution(catalogue: Catalogue) -> str:
         for name, entry in models.items():
             licence = f"[{entry.licence}]({LICENCES[entry.licence]})" if entry.licence in LICENCES else entry.licence
             file = f"{entry.file.rpartition('/')[2]}: {entry.member}" if entry.member else entry.file
-            columns = (
-                f"{category}/{name}",
-                entry.title,
-                entry.author,
-                licence,
-                file,
-                _changes(entry),
-                entry.licence_file,
-            )
+            model, changes = f"{category}/{name}", _changes(entry)
+            columns = (model, entry.title, entry.author, licence, file, changes, entry.licence_file)
             lines.append(f"| {' | '.join(columns)} |".replace("|  |", "| |"))
     return "\n".join(lines) + "\n"
 

@@ -23,23 +23,13 @@ CATALOGUE = Path(__file__).with_suffix(".json")
 
 
 def copy_same_shape(side: str, models: Path, out: Path) -> None:
-    """Copy the models of a side, "training" or "validation", from the folder `models` to `out`.
-
-    Raises:
-        InputError: There is no such side, or `models` lacks a model of the list.
-    """
-    catalogue = json.loads(CATALOGUE.read_text())
-    if side not in catalogue:
-        raise InputError(f"side is {side!r}, expected one of {', '.join(catalogue)}")
-    names = [name for listed in catalogue[side].values() for name in listed]
-    infos = read_infos(models)
-    if missing := [name for name in names if name not in infos or not (models / name).is_dir()]:
-        raise InputError(
-            f"{models}: no model {missing[0]}, expected the folder that tools/models.py made of {side}.json"
-        )
-    kept = {}
-    for category, listed in catalogue[side].items():
+    """Copy the models of a side, "training" or "validation", from the folder `models` to `out`."""
+    infos, kept = read_infos(models), {}
+    for category, listed in json.loads(CATALOGUE.read_text())[side].items():
         for name in listed:
+            if name not in infos or not (models / name).is_dir():
+                made = f"the folder that tools/models.py made of {side}.json"
+                raise InputError(f"{models}: no model {name}, expected {made}")
             copy = f"{category}/{Path(name).name}"
             shutil.copytree(models / name, out / copy, dirs_exist_ok=True)
             kept[copy] = infos[name]
@@ -47,7 +37,7 @@ def copy_same_shape(side: str, models: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 4:
+    if len(sys.argv) != 4 or sys.argv[1] not in ("training", "validation"):
         sys.exit(__doc__)
     try:
         copy_same_shape(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

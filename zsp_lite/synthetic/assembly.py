@@ -6,22 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from zsp_lite.synthetic.primitives import Mesh
+from zsp_lite.synthetic.primitives import Mesh, joined
 
 N_MATERIALS = 8
 
 
 @dataclass(frozen=True)
 class Shape:
-    """The mesh of one object, with the part of each vertex and the material of each face.
-
-    The origin is the centre of the bounding box. The surface has unit standard deviation, averaged over the three
-    axes (CO3D's convention for point clouds).
-    """
+    """The mesh of one object: its bounding box is centred at the origin, its `surface_spread` is 1."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    part: Int[np.ndarray, " v"]
     material: Int[np.ndarray, " f"]
 
 
@@ -34,8 +29,8 @@ class Assembly:
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
         self.rng, self._variation = rng, variation
-        self._meshes: list[Mesh] = []
-        self._materials: list[int] = []
+        self.meshes: list[Mesh] = []
+        self.materials: list[int] = []  # of each mesh
 
     def u(self, low: float, high: float) -> float:
         """Draw a proportion uniformly from [low, high)."""
@@ -54,22 +49,10 @@ class Assembly:
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
         """Add a part of one of the materials 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
-        self._meshes.append(mesh)
-        self._materials.append(material)
+        self.meshes.append(mesh)
+        self.materials.append(material)
         if mirror:
             self.add(mesh.mirrored(), material)
-
-    def shape(self) -> Shape:
-        """Return the finished object, with a small random scale along each axis."""
-        counts = [len(m.vertices) for m in self._meshes]
-        starts = np.cumsum([0, *counts[:-1]])
-        vertices = np.concatenate([m.vertices for m in self._meshes])
-        faces = np.concatenate([m.faces + s for m, s in zip(self._meshes, starts, strict=True)])
-        part = np.repeat(np.arange(len(counts)), counts)
-        material = np.repeat(self._materials, [len(m.faces) for m in self._meshes])
-        vertices = vertices * np.exp(self.rng.normal(0, 0.08, 3))
-        vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
-        return Shape(vertices / surface_spread(vertices, faces), faces, part, material)
 
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
@@ -85,11 +68,14 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> Shape:
-    """Return the object that `build` composes; the same seed gives the same object.
+    """Return the object that `build` composes, with other proportions if `variation` is given (see `Assembly`).
 
-    With `variation`, it has other proportions (see `Assembly`), but vertex i stays the same point of the same part, if
-    the parts depend on the builder's choices only.
+    Vertex i stays the same point of the same part, if the parts depend on the builder's choices only.
     """
     assembly = Assembly(np.random.default_rng(seed), variation)
     build(assembly)
-    return assembly.shape()
+    vertices, faces = joined(assembly.meshes)
+    material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
+    vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))  # a small random scale along each axis
+    vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
+    return Shape(vertices / surface_spread(vertices, faces), faces, material)

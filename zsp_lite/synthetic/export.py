@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsp_lite.data.co3d import SequenceData
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.recording import (
-    check_settings,
+    check_same_settings,
     read_poses,
     record_sequence,
     write_labels,
@@ -23,7 +23,6 @@ from zsp_lite.synthetic.recording import (
 from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
-_MOST_SEQUENCES = 900  # of a category: their names have three digits
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,9 @@ class Preset:
     targets: tuple[int, ...]  # numbers of target views; each has its own file of pairs
 
 
-# Half of the paper's twenty categories: the five of its Table 1 and five others.
-_EVAL = (
-    "bicycle", "car", "chair", "hairdryer", "hydrant", "motorcycle", "teddybear", "toaster", "toyplane", "toytruck"
-)  # fmt: skip
-
 PRESETS = {
     # The sample data outside the repository, made in some 15 s: the photograph of the demo needs a motorcycle.
     "demo": Preset(("bicycle", "chair", "motorcycle"), 2, 12, 176, pairs=10, targets=(1, 3, 5)),
-    "samples": Preset(("bicycle", "chair", "teddybear", "toytruck"), 4, 24, 176, pairs=20, targets=(1, 3, 5)),
-    "eval": Preset(_EVAL, 10, 24, 256, pairs=50, targets=(1, 3, 5, 20)),
     # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
     "paper": Preset(tuple(CATEGORIES), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
     "paper-small": Preset(tuple(CATEGORIES), 5, 24, 256, pairs=25, targets=(1, 3, 5, 10, 20)),
@@ -55,15 +47,13 @@ PRESETS = {
 
 
 def export_preset(preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] = iter) -> None:
-    """Write a preset with its evaluation pairs to a folder; arguments and errors as of `export_categories`."""
+    """Write a preset with its evaluation pairs to a folder; see `export_categories`."""
     if preset not in PRESETS:
         raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
-    wanted = PRESETS[preset]
-    export_categories(
-        wanted.categories, out, wanted.sequences, wanted.frames, seed, wanted.image_size, progress=progress
-    )
-    for category in wanted.categories:
-        write_pairs(Path(out), category, wanted.pairs, wanted.targets, seed)
+    size = PRESETS[preset]
+    export_categories(size.categories, out, size.sequences, size.frames, seed, size.image_size, progress)
+    for category in size.categories:
+        write_pairs(Path(out), category, size.pairs, size.targets, seed)
 
 
 def export_categories(
@@ -80,29 +70,18 @@ def export_categories(
     """Write sequences of procedural categories to a folder, with pose labels.
 
     A sequence depends only on the seed, its category and its index. An incomplete export is completed; complete
-    sequences are not rendered again. The first sequence of a category is the reference of its labels.
-
-    Args:
-        categories: Names of categories.
-        out: Data folder to write.
-        sequences: Sequences per category.
-        frames: Frames per sequence.
-        seed: Seed of objects, rooms, cameras and noise.
-        image_size: Shorter image side in pixels.
-        progress: Wraps the loop over sequences, as tqdm does.
-        builders: Builder of each category.
-        heights: Lowest and highest mean elevation of a sequence's cameras, degrees.
-
-    Raises:
-        InputError: A category is unknown, a number is out of its range, or the folder was written with other settings.
+    sequences are not rendered again. The first sequence of a category is the reference of its labels. `image_size` is
+    the shorter image side in pixels, `heights` the range of the mean elevation of a sequence's cameras in degrees;
+    `progress` wraps the loop over sequences, as tqdm does. InputError if a category is unknown, or if the folder was
+    written with other settings.
     """
     for category in categories:
         if category not in builders:
             raise InputError(f"category is {category!r}, expected one of {', '.join(builders)}")
-    check_integer("sequences", sequences, 1, _MOST_SEQUENCES)
-    check_settings(frames, image_size, seed)
-    out = Path(out)
-    _write_settings(out, {"seed": seed, "frames": frames, "image_size": image_size})
+    out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
+    if (out / SETTINGS_FILE).is_file():
+        check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)
+    write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs):
         name = sequence_name(seed, category, index)
@@ -138,12 +117,3 @@ def sequence_name(seed: int, category: str, index: int) -> str:
     """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
     digits = stable_hash(f"{seed}/{category}/{index}")
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
-
-
-def _write_settings(out: Path, settings: dict[str, int]) -> None:
-    """Write the settings of the export; InputError if the folder has others."""
-    path = out / SETTINGS_FILE
-    found = read_json(path, dict[str, int], "settings") if path.is_file() else settings
-    if found != settings:
-        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
-    write_atomic(path, json.dumps(settings).encode())

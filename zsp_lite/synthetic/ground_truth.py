@@ -6,7 +6,6 @@ Instances of a category have different proportions. Their points are therefore c
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.neighbors import NearestNeighbors
@@ -15,40 +14,11 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_json
-from zsp_lite.synthetic.recording import POSES_FILE
+from zsp_lite.synthetic.recording import POSES_FILE, ObjectPose, read_poses
 from zsp_lite.views import object_crop, patch_mask
 
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
-
-_Row = tuple[float, float, float, float]
-
-
-class _Pose(msgspec.Struct):
-    trans: tuple[_Row, _Row, _Row, _Row]
-    scale: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectPose:
-    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box."""
-
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, "3"]
-    scale: float
-    low: Float[np.ndarray, "3"]  # corners of the box in object coordinates
-    high: Float[np.ndarray, "3"]
-
-    def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
-        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
-
-    def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map world points to box coordinates, 0 to 1 along each object axis."""
-        return (self.to_object(world) - self.low) / (self.high - self.low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,22 +33,11 @@ class GroundTruthPair:
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
-    """Read the object pose of every sequence of a category; the box is that of the exact mesh.
-
-    Returns:
-        Sequence name to pose.
-
-    Raises:
-        InputError: The folder is not a synthetic export, or a file of the export is damaged.
-    """
-    path = dataset.root / category / POSES_FILE
-    if not path.is_file():
+    """Read the object pose of every sequence of a category; InputError if the folder is not a synthetic export."""
+    if not (poses := read_poses(dataset.root, category)):
+        path = dataset.root / category / POSES_FILE
         raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
-    found = {}
-    for sequence, pose in read_json(path, dict[str, _Pose], "object poses").items():
-        trans = np.array(pose.trans)
-        found[sequence] = ObjectPose(trans[:3, :3], trans[:3, 3], pose.scale, np.array(pose.low), np.array(pose.high))
-    return found
+    return poses
 
 
 def patch_coordinates(
@@ -86,8 +45,8 @@ def patch_coordinates(
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
     """Return the box coordinates of the object point that each patch shows, and the patches where they are known.
 
-    They are known where the mask covers a quarter of the patch, an object pixel of the patch has depth, and the point
-    is inside the box. The frame is a whole one or an object crop, with depth and mask.
+    They are known where the mask covers a quarter of the patch, one of its object pixels has depth, and the point is
+    inside the box.
     """
     # Object pixels only: the floor between the spokes of a bicycle is inside the box as well.
     points, measured = patch_points(np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid)
@@ -101,11 +60,10 @@ def ground_truth_matches(
     target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
     tolerance: float = 0.1,
 ) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
-    """Match each reference patch to the target patch with the nearest box coordinates.
+    """Match each reference patch to the target patch with the nearest box coordinates, at most `tolerance` away.
 
-    `reference` and `target` are results of `patch_coordinates`, `tolerance` is the largest distance of a match. Returns
-    the target patch (row, col) of each reference patch, and the reference patches that have a match; patches without
-    a match (not visible in the target view, or unknown) have the cell (0, 0).
+    `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col) of each reference
+    patch, (0, 0) without a match, and the reference patches that have one.
     """
     (points, known), (target_points, target_known) = reference, target
     cells, valid = np.zeros((*known.shape, 2), int), np.zeros_like(known)
@@ -126,11 +84,7 @@ def correct_matches(
 
 
 def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
-    """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has the most of them.
-
-    Raises:
-        InputError: The folder is not a synthetic export, or lacks a frame of the pair.
-    """
+    """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has the most of them."""
     grid = (28, 28)
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)

@@ -1,7 +1,4 @@
-"""Random materials of procedural objects: paint, plastic, wood, cloth, metal and rubber.
-
-They are drawn independently of the category and of the shape of the object.
-"""
+"""Random materials of procedural objects, drawn independently of their category and of their shape."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -40,15 +37,12 @@ _KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class WavePattern:
-    """Two sRGB colours, mixed by k sine waves through the object: stripes, grain, checks, a weave or patches.
-
-    Wave vectors are in radians per unit of object coordinates; `warp` is that of the displacement that bends all waves.
-    """
+    """Two sRGB colours, mixed by k sine waves through the object: stripes, grain, checks, a weave or patches."""
 
     colours: Float[np.ndarray, "2 3"]
-    waves: Float[np.ndarray, "k 3"]
+    waves: Float[np.ndarray, "k 3"]  # wave vectors, in radians per unit of object coordinates
     phases: Float[np.ndarray, " k"]
-    warp: Float[np.ndarray, "3"]
+    warp: Float[np.ndarray, "3"]  # wave vector of the displacement that bends all waves
     sharpness: float  # 1 for a sine, more for clear edges
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

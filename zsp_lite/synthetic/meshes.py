@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import file_size, read_bytes
 from zsp_lite.synthetic.assembly import surface_spread
+from zsp_lite.synthetic.primitives import joined
 from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
@@ -24,14 +25,11 @@ _INVISIBLE = 0.02  # opacity below which a face is removed
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`, all sRGB.
-
-    A pattern maps points (n, 3) in object coordinates to colours (n, 3) in [0, 1].
-    """
+    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`, all sRGB."""
 
     colour: Float[np.ndarray, "4"]  # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
     texture: UInt8[np.ndarray, "h w 4"] | None = None  # rows from top to bottom; opacity below 128 means a hole
-    pattern: Callable[[np.ndarray], np.ndarray] | None = None
+    pattern: Callable[[np.ndarray], np.ndarray] | None = None  # colours (n, 3) of points (n, 3) in object coordinates
     specular: float = 0.04  # reflectance at normal incidence
     roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
 
@@ -54,22 +52,18 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     import trimesh  # slow to import
 
     path = Path(path)
-    extension = path.suffix.lower()
-    if extension not in EXTENSIONS:
-        raise InputError(f"model {path} has the extension {path.suffix!r}, expected one of {', '.join(EXTENSIONS)}")
     file_size(path, "model", MAX_BYTES)
-    if extension == ".dae" and not find_spec("collada"):
+    if path.suffix.lower() == ".dae" and not find_spec("collada"):
         raise InputError(f"model {path} needs the package pycollada: pip install pycollada")
-    if extension == ".obj" and (missing := _missing_textures(path)):
+    if path.suffix.lower() == ".obj" and (missing := _missing_file(path)):
         raise InputError(f"model {path} lacks its {missing}")
     try:
         scene = trimesh.load_scene(path, process=False)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]  # transforms and names of geometries
-        meshes = [(scene.geometry[name], transform) for transform, name in placed]
         parts = [
-            _part(mesh, transform)
-            for mesh, transform in meshes
-            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+            _part(scene.geometry[name], transform)
+            for transform, name in placed
+            if len(getattr(scene.geometry[name], "faces", ()))
         ]
     except Exception as error:  # trimesh raises many types of exceptions for damaged files
         raise InputError(f"model {path} cannot be read: {type(error).__name__}: {error}") from error
@@ -78,7 +72,9 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         raise InputError(f"model {path} has {n_faces:,} faces, expected 1 to {MAX_FACES:,}")
     mesh = _joined(parts)
     check_magnitude(f"model {path}: vertices", mesh.vertices)
-    visible = _visible_faces(mesh)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] / _size(mesh.vertices), 1, 0)
+    opacity = np.array([material.colour[3] for material in mesh.materials])
+    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[mesh.material] >= _INVISIBLE)
     if not visible.any():
         raise InputError(f"model {path} has no visible face with an area")
     used, faces = np.unique(mesh.faces[visible], return_inverse=True)
@@ -88,18 +84,15 @@ def read_mesh(path: str | Path) -> TexturedMesh:
 
 
 def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
-    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to unit spread.
-
-    The spread is the standard deviation of the surface, averaged over the three axes.
-    """
+    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to unit spread."""
     vertices = mesh.vertices @ rotation.T
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
     spread = surface_spread(vertices, mesh.faces)
     return replace(mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32))
 
 
-def _missing_textures(path: Path) -> str:
-    """Return the first file that an OBJ file refers to and that is missing; trimesh does not report it."""
+def _missing_file(path: Path) -> str:
+    """Return the first material file or texture of an OBJ file that is missing; trimesh does not report it."""
     for name in _values(path, b"mtllib"):
         library = path.parent / name
         if not library.is_file():
@@ -157,9 +150,8 @@ def _gltf_material(given) -> Material:
         colour[3] = 1
         if texture is not None:
             texture[..., 3] = 255
-    metallic, roughness = (
-        1.0 if value is None else float(value) for value in (given.metallicFactor, given.roughnessFactor)
-    )
+    factors = given.metallicFactor, given.roughnessFactor
+    metallic, roughness = (1.0 if factor is None else float(factor) for factor in factors)
     if given.metallicRoughnessTexture is not None:
         mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
         metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
@@ -183,27 +175,21 @@ def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
 
 
 def _joined(parts: list[TexturedMesh]) -> TexturedMesh:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    counts = [len(part.faces) for part in parts]
-    join = lambda field: np.concatenate([getattr(part, field) for part in parts])  # noqa: E731
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
-    materials = tuple(part.materials[0] for part in parts)
-    material = np.repeat(np.arange(len(parts)), counts)
-    return TexturedMesh(join("vertices"), faces, join("normals"), join("uv"), join("colours"), material, materials)
+    """Return the parts, each of one material, as one mesh."""
+    corners = [np.concatenate([getattr(part, name) for part in parts]) for name in ("normals", "uv", "colours")]
+    material = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    return TexturedMesh(*joined(parts), *corners, material, tuple(part.materials[0] for part in parts))
 
 
-def _visible_faces(mesh: TexturedMesh) -> np.ndarray:
-    """Return which faces (f,) have an area and are not transparent."""
-    size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-30)
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] / size for i in range(3))
-    opacity = np.array([material.colour[3] for material in mesh.materials])
-    return (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[mesh.material] >= _INVISIBLE)
+def _size(vertices: np.ndarray) -> float:
+    """Return the longest side of the bounding box, at least a tiny one."""
+    return max(float(np.ptp(vertices, axis=0).max()), 1e-30)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
     """Return corner normals: the mean normal of the faces around the corner that meet at less than 40 degrees."""
-    size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
-    a, b, c = (vertices[faces[:, i]] / size for i in range(3))
+    size = _size(vertices)
+    a, b, c = np.moveaxis(vertices[faces] / size, 1, 0)
     weighted = np.cross(b - a, c - a)  # by area
     unit = _unit(weighted)
     # Corners in the order of their points, and in `first` the position of the first corner of the same point.
@@ -219,11 +205,8 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
         other = face[first[of[several]] + step]
         close = np.einsum("nd,nd->n", unit[face[several]], unit[other]) > _CREASE
         total[corner[several[close]]] += weighted[other[close]]
-    return (
-        _unit(np.where(total.any(1, keepdims=True), total, np.repeat(unit, 3, axis=0)))
-        .reshape(-1, 3, 3)
-        .astype(np.float32)
-    )
+    normals = _unit(np.where(total.any(1, keepdims=True), total, np.repeat(unit, 3, axis=0)))
+    return normals.reshape(-1, 3, 3).astype(np.float32)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

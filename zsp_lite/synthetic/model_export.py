@@ -11,7 +11,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.recording import (
-    check_settings,
+    check_same_settings,
     read_poses,
     record_sequence,
     write_labels,
@@ -54,26 +54,10 @@ def export_models(
 
     A sequence has the name of its model, and depends only on the seed, the model and its orientation. An incomplete
     export is completed; complete sequences are not rendered again, unless the model or its orientation changed. The
-    first model of a category is the reference of its labels.
-
-    Args:
-        folder: Folder of models, see `list_models`.
-        out: Data folder to write.
-        frames: Frames per sequence.
-        seed: Seed of rooms, cameras and noise.
-        image_size: Shorter image side in pixels.
-        front: Front of the models in the axes of their files, for those that `models.json` does not orient.
-        up: Their upper side.
-        progress: Wraps the loop over models, as tqdm does.
-
-    Returns:
-        The models that were left out ("CATEGORY/NAME"), with the reason.
-
-    Raises:
-        InputError: The folder holds no usable model, a setting is out of its range, or `out` was written with other
-            settings.
+    first model of a category is the reference of its labels. `image_size` is the shorter image side in pixels, `front`
+    and `up` are as of `list_models`; `progress` wraps the loop over models, as tqdm does. Returns the models that were
+    left out ("CATEGORY/NAME"), with the reason. InputError if no model is usable, or if `out` holds other data.
     """
-    check_settings(frames, image_size, seed)
     models, out = list_models(folder, front, up), Path(out)
     rendered = _read_rendered(out, {"seed": seed, "frames": frames, "image_size": image_size})
     left_out = {}
@@ -114,6 +98,5 @@ def _read_rendered(out: Path, settings: dict[str, int | str]) -> _Rendered:
             raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
         return _Rendered(settings, {})
     found = read_json(path, _Rendered, "records")
-    if found.settings != settings:
-        raise InputError(f"folder {out} was written with {found.settings}, expected {settings} or another folder")
+    check_same_settings(out, found.settings, settings)
     return found

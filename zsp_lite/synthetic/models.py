@@ -1,11 +1,11 @@
-"""A folder of models: `FOLDER/CATEGORY/NAME.obj` (or another extension of `EXTENSIONS`).
+"""A folder of models: `FOLDER/CATEGORY/NAME.obj`, or `FOLDER/CATEGORY/NAME/FILE.obj` for one of several files.
 
-A model with several files may have its own folder, `FOLDER/CATEGORY/NAME/FILE.obj`. The optional file
-`models.json` gives the orientation and the origin of each model, see `ModelInfo`.
+The optional file `models.json` gives the orientation and the origin of each model, see `ModelInfo`.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -16,17 +16,14 @@ from zsp_lite.io.files import plain_name, read_json
 from zsp_lite.synthetic.meshes import EXTENSIONS, TexturedMesh, canonical_mesh, read_mesh
 
 MODELS_FILE = "models.json"
-_AXES = dict(zip(["x", "y", "z", "+x", "+y", "+z", "-x", "-y", "-z"], np.vstack([np.eye(3), np.eye(3), -np.eye(3)])))
-_Direction = str | tuple[float, float, float]
+_AXES = dict(zip(["+x", "+y", "+z", "-x", "-y", "-z"], np.vstack([np.eye(3), -np.eye(3)])))
+_Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"] | tuple[float, float, float]
 
 
 class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Entry of `models.json` for one model; every field is optional.
+    """Entry of `models.json` for one model; every field is optional."""
 
-    `front` and `up` are directions in the axes of the file: "+x", "-x", ... "-z", or three numbers.
-    """
-
-    front: _Direction | None = None
+    front: _Direction | None = None  # in the axes of the file
     up: _Direction | None = None
     author: str = ""
     licence: str = ""
@@ -40,10 +37,11 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
         """
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         front, up = self.front or front, self.up or up
-        x, z = _direction(front), _direction(up)
-        if abs(x @ z) > 1e-3:
-            raise InputError(f"front is {front} and up is {up}, expected perpendicular axes")
+        given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
+        x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
         y = np.cross(z, x)
+        if not np.linalg.norm(y) > 1 - 5e-7:  # of unit vectors at 90 degrees, to 0.06 degrees
+            raise InputError(f"front is {front} and up is {up}, expected perpendicular axes")
         return np.stack([np.cross(y, z), y, z])
 
 
@@ -68,8 +66,6 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
     no model, `models.json` is damaged or names a model that does not exist, or two files have the same name.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"folder of models {folder} does not exist")
     infos, models = read_infos(folder), {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
     files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
@@ -83,10 +79,8 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
         models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
     if not models:
-        raise InputError(
-            f"{folder} holds no model, expected CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of "
-            f"{', '.join(EXTENSIONS)}"
-        )
+        kinds = f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
+        raise InputError(f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected {kinds}")
     if infos:
         raise InputError(f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}")
     return [models[key] for key in sorted(models)]
@@ -96,14 +90,3 @@ def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
     """Return the entries of a folder's `models.json` by "CATEGORY/NAME"; empty without the file."""
     path = Path(folder) / MODELS_FILE
     return read_json(path, dict[str, ModelInfo], "model list") if path.is_file() else {}
-
-
-def _direction(given: _Direction) -> Float[np.ndarray, "3"]:
-    """Return the unit vector of "+x" ... "-z" or of three numbers."""
-    vector = _AXES.get(given, np.zeros(3)) if isinstance(given, str) else np.array(given)
-    length = np.linalg.norm(vector)
-    if not 1e-6 < length < np.inf:
-        raise InputError(
-            f"direction is {given!r}, expected +x, -x, +y, -y, +z, -z or three finite numbers, not all zero"
-        )
-    return vector / length

@@ -1,5 +1,6 @@
 """Triangle meshes of simple solids, the parts of every procedural object."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,13 @@ class Mesh:
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
+def joined(meshes: Sequence) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Return the vertices and the faces of several meshes as those of one."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
+
+
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -84,20 +92,20 @@ def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18) -> Mesh:
 
 def rod(start, end, radius: float, end_radius: float | None = None, sides: int = 12) -> Mesh:
     """Return a closed cone frustum from point `start` (3,) to point `end` (3,)."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
-    mesh = cylinder(radius, end_radius or radius, np.linalg.norm(end - start), sides)
-    return mesh.pointing(end - start).translated((start + end) / 2)
+    along = np.subtract(end, start)
+    mesh = cylinder(radius, end_radius or radius, np.linalg.norm(along), sides)
+    return mesh.pointing(along).translated(np.add(start, end) / 2)
 
 
 def capsule(start, end, radius: float, end_radius: float | None = None, sides: int = 14) -> Mesh:
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
-    half = np.linalg.norm(end - start) / 2
+    along = np.subtract(end, start)
+    half = np.linalg.norm(along) / 2
     t = np.linspace(0, np.pi / 2, 5)
     round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
     tail, head = round_end[::-1] * [radius, -radius], round_end * (end_radius or radius)
     mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides)
-    return mesh.pointing(end - start).translated((start + end) / 2)
+    return mesh.pointing(along).translated(np.add(start, end) / 2)
 
 
 def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.0, stop=TAU, sides=24) -> Mesh:
@@ -108,10 +116,7 @@ def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.
 
 
 def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:
-    """Extrude an outline (n, 2) in the plane "xz", "xy" or "yz" to a slab of the given thickness.
-
-    The outline must be star-shaped about its mean. The slab is centred at `offset` along the normal of the plane.
-    """
+    """Extrude an outline (n, 2), star-shaped about its mean, in the plane "xz", "xy" or "yz", to a slab at `offset`."""
     outline = np.asarray(outline, float)
     n = len(outline)
     flat = np.concatenate([outline, [outline.mean(0)]])

@@ -1,8 +1,7 @@
 """Renderer of textured meshes on the CPU: Open3D intersects rays, NumPy and OpenCV shade the hits.
 
-The picture is anti-aliased by several samples per pixel. A sample receives the key light with a soft shadow, the light
-of the room that other parts of the object do not block, and reflections by the roughness of its material. Depth, mask
-and object coordinates are exact: those of the ray through the centre of each pixel.
+A sample of the picture receives the key light with a soft shadow, the light of the room that the object does not block,
+and reflections. Depth, mask and object coordinates are exact: those of the ray through the centre of each pixel.
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.open3d import load_open3d
 from zsp_lite.synthetic.lighting import FLOOR_REACH, RoomLight
-from zsp_lite.synthetic.meshes import Material, TexturedMesh
+from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.sampling import dot, pyramid, sample_image, sample_pyramid, spread_directions, unit
 from zsp_lite.synthetic.textures import srgb_to_linear
 
@@ -67,57 +66,46 @@ class MeshScene:
         self._rng, self._samples = np.random.default_rng(seed), samples
         self._tensor = o3d.core.Tensor
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._rays.add_triangles(
-            self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32))
-        )
+        triangles = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+        self._rays.add_triangles(*map(self._tensor, triangles))
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
-        self._corners = mesh.vertices[mesh.faces].astype(np.float32)
-        one, two = self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0]
-        self._flat = unit(np.cross(one, two))
-        self._coordinates = self._corners if coordinates is None else coordinates[mesh.faces].astype(np.float32)
-        self._surfaces = [_Surface(material) for material in mesh.materials]
+        first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
+        cross = np.cross(second - first, third - first)  # normal, with twice the area of the face as its length
+        self._flat = unit(cross)
+        self._coordinates = (mesh.vertices if coordinates is None else coordinates)[mesh.faces].astype(np.float32)
+        self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
+        self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
         self._properties = np.array([[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32)
-        self._with_holes = any(surface.has_holes for surface in self._surfaces)
-        area = np.linalg.norm(np.cross(one, two), axis=1)
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
-        self._texture_scale = np.sqrt(uv_area / np.maximum(area, 1e-12))  # lengths of the texture per unit, by face
+        self._texture_scale = np.sqrt(
+            uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12)
+        )  # lengths of the texture per unit, by face
         self._shadow, self._shadow_width = self._shadow_on_the_floor()
         self._gain: float | None = None
 
     def render(self, camera: Camera) -> Rendering:
         """Render one view; the exposure is measured on the first view and varies little after it."""
-        box = top, left, bottom, right = self._object_box(camera)
-        centres = _pixel_rays(camera, (0, 0, *camera.size), 1)
-        radiance, depth = self._background(camera, centres)
-        area = np.s_[top:bottom, left:right]
-        hits = self._cast_from(camera, centres[area])
-        exact = self._exact(camera, (top, left), centres[area], hits, depth)
-        samples = centres[area]
+        rays = _pixel_rays(camera, 1)
+        radiance, floor_depth = self._background(camera, rays)
+        hits = self._cast(camera.centre, rays)
+        exact = self._exact(camera, rays, hits, floor_depth)
         if self._samples > 1:
-            samples = _pixel_rays(camera, box, self._samples)
-            hits = self._cast_from(camera, samples)
-        shaded = cv2.resize(
-            self._shade(camera, samples, hits), (right - left, bottom - top), interpolation=cv2.INTER_AREA
-        )
-        radiance[area] = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance[area]
+            rays = _pixel_rays(camera, self._samples)
+            hits = self._cast(camera.centre, rays)
+        shaded = cv2.resize(self._shade(camera, rays, hits), camera.size[::-1], interpolation=cv2.INTER_AREA)
+        radiance = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
         return Rendering(rgb=rgb, camera=camera, **exact)
 
-    def _object_box(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Return the pixels (top, left, bottom, right) that the object can cover."""
-        pixels, _ = camera.project(self.mesh.vertices)
-        low = np.clip(np.floor(pixels.min(0)) - 1, 0, camera.size[::-1]).astype(int)
-        high = np.clip(np.ceil(pixels.max(0)) + 1, 0, camera.size[::-1]).astype(int)
-        (left, top), (right, bottom) = low.tolist(), high.tolist()
-        return top, left, bottom, right
-
     # Geometry
 
-    def _cast(self, origin: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> _Hits:
+    def _cast(self, origin: Float[np.ndarray, "#*n 3"], rays: Float[np.ndarray, "*n 3"]) -> _Hits:
         """Return the first point that each ray meets; a ray passes through the holes of textures."""
+        origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
+        rays = rays.reshape(-1, 3)
         start, active, found = np.zeros(len(rays), np.float32), np.arange(len(rays)), []
         for _ in range(_LAYERS):
             points = origin[active] + start[active, None] * rays[active]
@@ -136,48 +124,28 @@ class MeshScene:
                 break
         return _Hits(*map(np.concatenate, zip(*found, strict=True)))
 
-    def _cast_from(self, camera: Camera, rays: Float[np.ndarray, "h w 3"]) -> _Hits:
-        rays = rays.reshape(-1, 3)
-        return self._cast(np.broadcast_to(camera.centre.astype(np.float32), rays.shape), rays)
-
     def _is_hole(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return at which surface points (n,) the texture has a hole."""
         hole = np.zeros(len(face), bool)
-        if self._with_holes:
-            material = self.mesh.material[face]
-            for index, surface in enumerate(self._surfaces):
-                on = np.flatnonzero(material == index)
-                if surface.has_holes:
-                    u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-                    hole[on] = sample_image(surface.texture[0], u, 1 - v, cv2.BORDER_WRAP)[:, 3] < 128
+        for index in np.flatnonzero(self._has_holes):
+            on = np.flatnonzero(self.mesh.material[face] == index)
+            u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
+            hole[on] = sample_image(self._textures[index][0], u, 1 - v, cv2.BORDER_WRAP)[:, 3] < 128
         return hole
 
     def _visible_share(self, point: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n k 3"]) -> np.ndarray:
         """Return the share (n,) of the directions from each point that the object does not block."""
-        rays = np.empty((*directions.shape[:2], 6), np.float32)
-        rays[..., :3], rays[..., 3:] = point[:, None], directions
-        if self._with_holes:
-            origin, towards = rays.reshape(-1, 6)[:, :3], rays.reshape(-1, 6)[:, 3:]
-            blocked = np.bincount(self._cast(origin, towards).ray, minlength=len(origin)).reshape(directions.shape[:2])
-        elif len(point):
-            blocked = self._rays.test_occlusions(self._tensor(rays)).numpy()
-        else:
-            blocked = np.zeros(directions.shape[:2])
-        return 1 - blocked.mean(1, dtype=np.float32)
+        n, count = directions.shape[:2]
+        blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
+        return 1 - blocked.astype(np.float32) / np.float32(count)
 
     def _exact(
-        self,
-        camera: Camera,
-        corner: tuple[int, int],
-        rays: Float[np.ndarray, "h w 3"],
-        hits: _Hits,
-        floor_depth: Float[np.ndarray, "height width"],
+        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits, floor_depth: Float[np.ndarray, "h w"]
     ) -> dict:
-        """Return depth, mask, object coordinates and normals; `corner` is the pixel (row, col) of the first ray."""
+        """Return depth, mask, object coordinates and normals of the pixels."""
         depth, mask = floor_depth.copy(), np.zeros(camera.size, bool)
         canonical, normals = np.full((*camera.size, 3), np.nan, np.float32), np.zeros((*camera.size, 3), np.float32)
-        row, col = np.unravel_index(hits.ray, rays.shape[:2])
-        pixel = row + corner[0], col + corner[1]
+        pixel = np.unravel_index(hits.ray, camera.size)
         mask[pixel] = True
         depth[pixel] = hits.distance  # rays have unit z in the camera frame
         canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
@@ -233,16 +201,17 @@ class MeshScene:
         """Return the linear colours of surface points; `footprint` is the width of a sample, in units."""
         face, weights, material = hits.face, hits.weights, self.mesh.material[hits.face]
         albedo = srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
-        for index, surface in enumerate(self._surfaces):
+        for index in np.unique(material):
             on = np.flatnonzero(material == index)
-            albedo[on] *= srgb_to_linear(surface.material.colour[:3])
-            if surface.material.pattern and len(on):
+            look, texture = self.mesh.materials[index], self._textures[index]
+            albedo[on] *= srgb_to_linear(look.colour[:3])
+            if look.pattern:
                 points = _interpolated(weights[on], self._coordinates[face[on]])
-                albedo[on] *= srgb_to_linear(surface.material.pattern(points))
-            if surface.texture and len(on):
+                albedo[on] *= srgb_to_linear(look.pattern(points))
+            if texture:
                 u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-                texels = footprint[on] * self._texture_scale[face[on]] * np.sqrt(np.prod(surface.texture[0].shape[:2]))
-                sample = sample_pyramid(surface.texture, u, 1 - v, texels, cv2.BORDER_WRAP)
+                texels = footprint[on] * self._texture_scale[face[on]] * np.sqrt(np.prod(texture[0].shape[:2]))
+                sample = sample_pyramid(texture, u, 1 - v, texels, cv2.BORDER_WRAP)
                 albedo[on] *= srgb_to_linear(sample[:, :3] / 255)
         # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of all colours.
         return 0.015 + 0.8 * albedo
@@ -286,22 +255,11 @@ class MeshScene:
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
 
-class _Surface:
-    """A material with the pyramid of its texture."""
-
-    def __init__(self, material: Material):
-        self.material = material
-        self.texture = None if material.texture is None else pyramid(material.texture)
-        self.has_holes = material.texture is not None and bool(material.texture[..., 3].min() < 128)
-
-
-def _pixel_rays(camera: Camera, box: tuple[int, int, int, int], n: int) -> Float[np.ndarray, "h w 3"]:
-    """Return rays of unit z in the camera frame through n x n points of each pixel of a box."""
-    top, left, bottom, right = box
-    x = left + (np.arange((right - left) * n) + 0.5) / n
-    y = top + (np.arange((bottom - top) * n) + 0.5) / n
-    x = (x - camera.principal_point[0]) / camera.focal_length[0]
-    y = (y - camera.principal_point[1]) / camera.focal_length[1]
+def _pixel_rays(camera: Camera, n: int) -> Float[np.ndarray, "h w 3"]:
+    """Return rays of unit z in the camera frame through n x n points of each pixel."""
+    height, width = camera.size
+    x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
+    y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
     return (x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])).astype(np.float32)
 
 

@@ -1,15 +1,17 @@
 """Recording of one object as a sequence of a data folder, with object pose, labels and evaluation pairs."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
-from zsp_lite.errors import check_integer
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, write_atomic
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.sensor import simulate_capture
@@ -19,25 +21,45 @@ POSES_FILE = "object_poses.json"  # in each category folder: the pose of each se
 _JPEG_QUALITY = 88
 
 
-def check_settings(frames: int, image_size: int, seed: int) -> None:
-    """Raise InputError if the number of frames, the shorter image side or the seed is out of its range."""
-    check_integer("frames", frames, 1, 10_000)
-    check_integer("image_size", image_size, 32, 4096)
-    check_integer("seed", seed, 0)
+_Vector = tuple[float, float, float]
+_Row = tuple[float, float, float, float]
+
+
+class ObjectPose(msgspec.Struct):
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in object coordinates."""
+
+    trans: tuple[_Row, _Row, _Row, _Row]  # the matrix [R t]
+    scale: float
+    low: _Vector  # corners of the box
+    high: _Vector
+
+    @property
+    def R(self) -> Float[np.ndarray, "3 3"]:
+        return np.array(self.trans)[:3, :3]
+
+    @property
+    def t(self) -> Float[np.ndarray, "3"]:
+        return np.array(self.trans)[:3, 3]
+
+    def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
+        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
+
+    def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to box coordinates, 0 to 1 along each object axis."""
+        return (self.to_object(world) - self.low) / np.subtract(self.high, self.low)
+
+
+def check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
+    """Raise InputError if a folder was written with other settings."""
+    if found != settings:
+        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
 
 
 def record_sequence(
-    mesh: TexturedMesh,
-    name: str,
-    key: int,
-    frames: int,
-    image_size: int,
-    heights: tuple[float, float] = HEIGHTS,
+    mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Render an object and simulate the sensor; `key` is the seed of room, cameras and noise.
-
-    Returns the recorded sequence, and the exact one in the same unit.
-    """
+    """Return a sequence of an object, as the sensor records it and exact; `key` seeds room, cameras and noise."""
     exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, heights)
     return simulate_capture(exact, name, np.random.default_rng([key, 2]))
 
@@ -45,27 +67,24 @@ def record_sequence(
 def write_sequence(
     out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, RenderedSequence]
 ) -> None:
-    """Add a recorded sequence, with the pose and the bounding box of its object, to a data folder.
-
-    The pose is written last: a sequence with a pose is complete.
-    """
+    """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with one is complete."""
     data, exact = recorded
     write_co3d(out, category, [data], _JPEG_QUALITY)
     low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
-    poses[data.name] = {"trans": exact.object_pose.tolist(), "scale": exact.scale, "low": low, "high": high}
-    write_atomic(out / category / POSES_FILE, json.dumps(poses, indent=1).encode())
+    poses[data.name] = ObjectPose(exact.object_pose.tolist(), exact.scale, low, high)
+    write_atomic(out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode())
 
 
-def read_poses(out: Path, category: str) -> dict:
-    """Return the entries of a category's file of object poses by sequence; empty without the file."""
+def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
+    """Return the object pose of every sequence of a category; none without the file."""
     path = out / category / POSES_FILE
-    return read_json(path, dict, "object poses") if path.is_file() else {}
+    return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
 
 
 def write_labels(out: Path, category: str, names: Iterable[str]) -> None:
     """Write the pose labels of sequences from their object poses; the first name is the reference."""
-    poses = {name: np.array(pose["trans"]) for name, pose in read_poses(out, category).items()}
+    poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
     reference, *others = names
     write_label(out, category, PoseLabel(np.eye(4), reference, reference))
     for name in others:

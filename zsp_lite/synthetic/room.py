@@ -1,4 +1,4 @@
-"""A random room around an object: a textured floor, furnished walls, and a lamp or a window as key light.
+"""A random room around an object: a textured floor, furnished walls, a key light, and a cheap camera in it.
 
 All colours are linear unless a name says sRGB. Lengths are in units of the object, whose surface has unit spread.
 """
@@ -7,22 +7,53 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from zsp_lite.synthetic.photography import CheapCamera
-from zsp_lite.synthetic.textures import hsv, srgb_to_linear, surface
+from zsp_lite.synthetic.textures import blur, hsv, linear_to_srgb, srgb_to_linear, surface
 
 _FLOOR_PIXELS = 1024  # along each side of the floor's image
 _WALL_DENSITY = 20  # pixels per unit
 
 
 @dataclass(frozen=True, eq=False)
+class CheapCamera:
+    """Response of a camera: from linear radiance to 8-bit sRGB."""
+
+    exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # error of automatic balance, a factor per channel
+    noise: float = 0.01  # standard deviation at mid-grey, relative to white
+    vignetting: float = 0.1  # loss of light in the corners, as a fraction
+
+    def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
+        """Return the factor of automatic exposure, from mean and median, which limits the effect of bright windows."""
+        luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])
+        median = np.median(luminance)
+        return float(2 * self.exposure / max(median + np.minimum(luminance, 4 * median).mean(), 1e-6))
+
+    def develop(
+        self, radiance: Float[np.ndarray, "h w 3"], gain: float, rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
+        height, width = radiance.shape[:2]
+        pixel = min(height, width) / 256  # blurs are those of a picture of 256 pixels
+        y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
+        falloff = 1 - self.vignetting * (x**2 + y**2) / 2
+        image = (radiance * (gain * falloff)[..., None] * self.white_balance).astype(np.float32)
+        image = blur(image, 0.4 * pixel)  # of the lens
+        noise = blur(rng.standard_normal((height, width, 3), np.float32), 0.5 * pixel)  # smoothed by demosaicing
+        image = np.maximum(image + 1.6 * self.noise * noise * np.sqrt(0.16 * image + 0.006), 0)
+        # A filmic tone curve, Narkowicz's fit to ACES.
+        image = linear_to_srgb(np.clip(image * (2.26 * image + 0.03) / (image * (2.19 * image + 0.59) + 0.16), 0, 1))
+        image += 0.35 * (image - blur(image, 0.9 * pixel))  # sharpening by the camera
+        return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
 class Room:
     """A box around the object, and the light on the object; the origin is on the floor below the object.
 
-    `images` are those of the faces -x, +x, -y, +y, floor, ceiling. The floor's is an albedo, the others are radiances.
-    The rows of a wall run from the ceiling to the floor, those of the floor and of the ceiling along y; the columns run
-    along y on the first two walls, along x elsewhere.
+    `images` are those of the faces -x, +x, -y, +y, floor, ceiling: an albedo of the floor, else radiances. The rows of
+    a wall run down, those of floor and ceiling along y; the columns run along y on the first two walls, else along x.
     """
 
     low: Float[np.ndarray, "3"]  # corners of the box; low[2] is 0

@@ -50,10 +50,7 @@ def sample_pyramid(
 
 
 def sample_image(image: np.ndarray, u: np.ndarray, v: np.ndarray, border: int) -> Float[np.ndarray, "n c"]:
-    """Interpolate an image bilinearly at points (u, v) in [0, 1] (v from the top), with OpenCV's rule for the border.
-
-    BORDER_CONSTANT means 1 outside the image; BORDER_WRAP repeats the image.
-    """
+    """Interpolate an image bilinearly at (u, v) in [0, 1] (v from the top); outside, BORDER_CONSTANT means 1."""
     if border == cv2.BORDER_WRAP:
         u, v = u % 1, v % 1
     height, width = image.shape[:2]

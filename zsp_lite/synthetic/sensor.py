@@ -15,11 +15,14 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
 from zsp_lite.synthetic.raytracing import Rendering
 from zsp_lite.synthetic.sequences import RenderedSequence, rescaled
-from zsp_lite.synthetic.textures import smooth_noise
+from zsp_lite.synthetic.textures import blur, smooth_noise
 
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
 _OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
+# Ranges of CO3D's viewpoint quality and point cloud quality in the sequences that the paper labels, and of CO3D's
+# factor from stored depth to depth.
+_SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
 
 
 def stereo_depth(
@@ -27,8 +30,8 @@ def stereo_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Simulate the depth map of multi-view stereo, 0 where there is no measurement.
 
-    The holes are fractions of the pixels of the object and of the floor. The noise is mostly correlated between
-    pixels. It is 0.5 % of the depth at the object and grows with the square of the depth.
+    The holes are fractions of the pixels of the object and of the floor. The noise, mostly correlated between pixels,
+    is 0.5 % of the depth at the object and grows with the square of the depth.
     """
     confidence = _stereo_confidence(view, rng)
     known = np.zeros(view.mask.shape, bool)
@@ -44,13 +47,13 @@ def stereo_depth(
 def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
     scale = min(view.mask.shape) / 100
-    grey = _blur(view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]), 0.6 * scale)
+    grey = blur(view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]), max(0.6 * scale, 0.3))
     energy = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
-    texture = np.log(np.sqrt(_blur(energy, 2.5 * scale)) + 1)
+    texture = np.log(np.sqrt(blur(energy, 2.5 * scale)) + 1)
     texture = (texture - texture.mean()) / (texture.std() + 1e-6)
     far = np.where(view.depth > 0, view.depth, view.depth.max())
     jump = cv2.dilate(far, np.ones((3, 3))) / cv2.erode(far, np.ones((3, 3))) - 1
-    edge = np.minimum(_blur((jump > 0.03).astype(np.float32), 0.5 * scale) * 2, 1)
+    edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
     h, w = view.mask.shape
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     ray = view.camera.unproject_camera(np.stack([x, y], -1), np.ones((h, w)))
@@ -86,11 +89,7 @@ def fused_cloud(
 def simulate_capture(
     sequence: RenderedSequence, name: str, rng: np.random.Generator
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Return a rendering as a sequence with the errors of CO3D's data, and the exact rendering in the same unit.
-
-    The world is scaled so that the point cloud has unit standard deviation, averaged over its axes. The quality
-    scores are drawn from the range of the sequences that the paper labels.
-    """
+    """Return a sequence with the errors of CO3D's data, and the exact one; the point cloud has CO3D's unit spread."""
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
     depths, masks = [], []
     for view in sequence.views:
@@ -104,19 +103,5 @@ def simulate_capture(
         Frame(view.rgb, depth * np.float32(factor), mask, view.camera, f"{name}/{number}")
         for number, (view, depth, mask) in enumerate(zip(exact.views, depths, masks, strict=True))
     ]
-    data = SequenceData(
-        name=name,
-        frames=frames,
-        timestamps=sequence.timestamps,
-        points=points * factor,
-        colours=colours,
-        normals=normals,
-        viewpoint_quality=round(rng.uniform(1.3, 3.0), 4),
-        point_cloud_quality=round(rng.uniform(0.35, 1.0), 4),
-        depth_scale_adjustment=round(rng.uniform(0.4, 2.5), 4),
-    )
-    return data, exact
-
-
-def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), max(sigma, 0.3), borderType=cv2.BORDER_REFLECT)
+    scores = [round(rng.uniform(*limits), 4) for limits in _SCORES]
+    return SequenceData(name, frames, sequence.timestamps, points * factor, colours, normals, *scores), exact

@@ -27,16 +27,11 @@ class RenderedSequence:
     object_pose: Float[np.ndarray, "4 4"]  # rigid transform [R t]: `world = R @ (scale * canonical) + t`
     scale: float
 
-    def to_world(self, canonical: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map canonical object coordinates to world coordinates."""
-        return self.scale * np.asarray(canonical, np.float64) @ self.object_pose[:3, :3].T + self.object_pose[:3, 3]
-
 
 def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of a camera on a sphere around `target` (3,) that looks at its centre; angles in radians.
+    """Return rotation (3, 3) and translation (3,), world to camera, of a camera that looks at `target` (3,).
 
-    The azimuth is the angle about z, 0 in front of the object at +x; the elevation is the angle above the horizontal
-    plane, the roll the rotation about the optical axis. Returns world-to-camera rotation (3, 3) and translation (3,).
+    Angles are in radians: azimuth about z, 0 at +x; elevation above the horizontal plane; roll about the optical axis.
     """
     away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     forward = -away
@@ -56,9 +51,8 @@ def handheld_sweep(
 ) -> list[Camera]:
     """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object.
 
-    The start and the direction are random. Elevation, distance, viewing direction and roll change smoothly, with
-    jitter. All cameras share one focal length: the object fills 55 to 75 % of the shorter image side in the median
-    view and is inside the image in all views.
+    All share one focal length: the object fills 55 to 75 % of the shorter image side in the median view and is inside
+    the image in all views.
     """
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
@@ -87,11 +81,7 @@ def handheld_sweep(
 
 
 def render_sequence(
-    mesh: TexturedMesh,
-    rng: np.random.Generator,
-    frames: int,
-    image_size: int,
-    heights: tuple[float, float] = HEIGHTS,
+    mesh: TexturedMesh, rng: np.random.Generator, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
 ) -> RenderedSequence:
     """Render views around an object in a random room; `image_size` is the shorter image side.
 

@@ -23,6 +23,11 @@ def hsv(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"]:
     return value - value * saturation * np.clip(np.minimum(k, 4 - k), 0, 1)
 
 
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Blur an image by a Gaussian of at least 0.2 pixels."""
+    return cv2.GaussianBlur(image, (0, 0), max(sigma, 0.2), borderType=cv2.BORDER_REFLECT)
+
+
 def smooth_noise(
     rng: np.random.Generator, size: tuple[int, int], sigma: float, stretch: float = 1.0
 ) -> Float[np.ndarray, "h w"]:
@@ -40,10 +45,7 @@ def smooth_noise(
 def surface(
     rng: np.random.Generator, size: tuple[int, int], colour: Float[np.ndarray, "3"], grain: float, laid: bool = False
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return the linear colours of a surface around an sRGB colour, with grain and stains of the given contrast.
-
-    With `laid`, it is laid with boards or tiles, each of its own brightness.
-    """
+    """Return the linear colours of a surface around an sRGB colour, with grain, and with boards or tiles if `laid`."""
     height, width = size
     stretch = 1.0
     value = np.ones(size, np.float32)

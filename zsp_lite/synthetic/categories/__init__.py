@@ -4,10 +4,13 @@ No backbone is trained on them, and no setting is chosen by them.
 """
 
 from zsp_lite.synthetic.assembly import Builder
-from zsp_lite.synthetic.categories.belongings import BELONGINGS
-from zsp_lite.synthetic.categories.household import HOUSEHOLD
-from zsp_lite.synthetic.categories.street import STREET
-from zsp_lite.synthetic.categories.toys import TOYS
+from zsp_lite.synthetic.categories.belongings import backpack, book, handbag, keyboard, laptop, mouse, remote
+from zsp_lite.synthetic.categories.household import chair, hairdryer, toaster, toilet
+from zsp_lite.synthetic.categories.street import bicycle, car, hydrant, motorcycle
+from zsp_lite.synthetic.categories.toys import teddybear, toybus, toyplane, toytrain, toytruck
 
-_BUILDERS = {build.__name__: build for build in (*BELONGINGS, *HOUSEHOLD, *STREET, *TOYS)}
-CATEGORIES: dict[str, Builder] = dict(sorted(_BUILDERS.items()))
+_BUILDERS = (
+    *(backpack, bicycle, book, car, chair, hairdryer, handbag, hydrant, keyboard, laptop, motorcycle, mouse),
+    *(remote, teddybear, toaster, toilet, toybus, toyplane, toytrain, toytruck),
+)
+CATEGORIES: dict[str, Builder] = {build.__name__: build for build in _BUILDERS}

@@ -188,6 +188,3 @@ def remote(a: Assembly) -> None:
             place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * waist, top)
             a.add(key.translated(place), 1 if row < n_rows - 1 else 2)
     a.add(box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), 2, mirror=True)
-
-
-BELONGINGS = (backpack, book, handbag, keyboard, laptop, mouse, remote)

@@ -140,6 +140,3 @@ def toaster(a: Assembly) -> None:
         a.add(cylinder(0.06, 0.07, feet * 2).translated((x * length, width * 0.32, feet / 2)), 3, mirror=True)
     if a.chance(0.6):
         a.add(capsule((-end, 0.1, feet + 0.1), (-end - a.u(0.1, 0.25), a.u(-0.2, 0.2), 0.03), 0.025), 3)
-
-
-HOUSEHOLD = (chair, hairdryer, toaster, toilet)

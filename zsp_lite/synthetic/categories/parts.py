@@ -9,11 +9,8 @@ Y = (0.0, 1.0, 0.0)
 
 
 def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0) -> Mesh:
-    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10.
-
-    Each side of a cube becomes a grid of 10 x 10 cells, denser at the edges, where the curvature is largest.
-    """
-    n = 11  # points along a side
+    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10."""
+    n = 11  # points along a side of a cube, denser at the edges, where the curvature is largest
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
     corner = np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()  # of each cell, the one with the lowest index

@@ -155,6 +155,3 @@ def hydrant(a: Assembly) -> None:
         a.add(cylinder(0.035, 0.035, 0.05, 6).translated((radius * 1.27, 0, 0.11)).rotated("z", angle), 2)
     if a.chance(0.6):
         a.add(torus(a.u(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), 3)
-
-
-STREET = (bicycle, car, hydrant, motorcycle)

@@ -196,6 +196,3 @@ def toytrain(a: Assembly) -> None:
     for x in axles:
         add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
     a.add(box((axles[-1] - axles[0], 0.03, 0.05), (axles.mean(), width / 2 + 0.06, wheel)), 7, mirror=True)
-
-
-TOYS = (teddybear, toybus, toyplane, toytrain, toytruck)
