@@ -127,7 +127,7 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
 
 @pytest.mark.slow
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path, monkeypatch):
-    head, path = ViewpointHead(), tmp_path / "posecontrast.pth"
+    head, path = ViewpointHead().eval().requires_grad_(False), tmp_path / "posecontrast.pth"
     features = random_state(torchvision_shapes() | {"fc.weight": (128, 2048), "fc.bias": (128,)})
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head.state_dict()}, path)
     monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))

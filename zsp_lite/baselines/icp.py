@@ -42,8 +42,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
 def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int) -> Sim3:
     """Estimate the pose of a reference frame in target `view` by ICP, from camera points to camera points.
 
-    Initially, both clouds are placed as if their camera (of the reference, of target `view`) were the first camera of
-    its sequence. Both camera frames then coincide, up to the difference of the first cameras of the two sequences.
+    Initially, both cameras are placed where the first camera of their sequence is.
     """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera

@@ -1,8 +1,4 @@
-"""PoseContrast: absolute viewpoints by a network trained on pose labels (Xiao et al. 2021; paper sec. 5.2).
-
-A ResNet-50 computes a feature of the image. A small head predicts azimuth, elevation and in-plane rotation, each as a
-bin and an offset inside the bin.
-"""
+"""PoseContrast: absolute viewpoints by a network trained on pose labels (Xiao et al. 2021; paper sec. 5.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +15,6 @@ from zsp_lite.backbones.backbone import normalize, prepare_images
 from zsp_lite.backbones.checkpoints import load_weights
 from zsp_lite.baselines.resnet import ResNet50, checkpoint_path
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.io.tensors import load_torch
 
 URL = "https://github.com/YoungXIAO13/PoseContrast"  # the authors' repository links the checkpoint
@@ -40,7 +35,7 @@ class Viewpoint:
 
 
 class ViewpointHead(nn.Module):
-    """Classifier of the bins of each angle, and regression of the offset inside each bin as a fraction of its width."""
+    """Azimuth, elevation and in-plane rotation: a bin of each, and the offset in the bin as a fraction of its width."""
 
     def __init__(self):
         super().__init__()
@@ -48,13 +43,12 @@ class ViewpointHead(nn.Module):
         for inputs, outputs in pairwise(_WIDTHS):
             layers += [nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]
         self.compress = nn.Sequential(*layers)
-        for kind in ("cls", "reg"):
-            for angle, bins in _BINS.items():
-                setattr(self, f"fc_{kind}_{angle}", nn.Linear(_WIDTHS[-1], bins))
-        self.eval().requires_grad_(False)
+        for angle, bins in _BINS.items():
+            for kind in ("cls", "reg"):
+                self.add_module(f"fc_{kind}_{angle}", nn.Linear(_WIDTHS[-1], bins))
 
     def forward(self, feature: Float[Tensor, "b d"]) -> Float[Tensor, "b 3"]:
-        """Compute azimuth, elevation and in-plane rotation in degrees: the most probable bin and its offset."""
+        """Compute the three angles in degrees: the most probable bin and its offset."""
         x = self.compress(feature)
         angles = []
         for angle in _BINS:
@@ -64,42 +58,37 @@ class ViewpointHead(nn.Module):
         return torch.stack(angles, dim=1).clamp(0, 360)
 
 
-class PoseContrast:
-    """Estimator of absolute viewpoints."""
+class PoseContrast(nn.Module):
+    """Estimator of absolute viewpoints; its parts have the names of the published checkpoint."""
 
     name = "posecontrast"
 
-    def __init__(self, network: ResNet50, head: ViewpointHead):
-        self.network, self.head = network, head
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the weights, which identify the estimator in the benchmark."""
-        return self.network.state_dict() | self.head.state_dict(prefix="head.")
+    def __init__(self):
+        super().__init__()
+        self.net_feat, self.net_vp = ResNet50(), ViewpointHead()
+        self.eval().requires_grad_(False)
 
     def describe(self, frames: Sequence[Frame]) -> list[Viewpoint]:
         """Estimate the viewpoints of object crops."""
         viewpoints = []
         for frame in frames:
-            with torch.inference_mode():
-                layers = self.network(normalize(prepare_images([square_crop(frame)], IMAGE_SIZE)))
-                feature = layers[-1].mean((2, 3))
-                angles = self.head(feature)[0].numpy()
-            viewpoints.append(Viewpoint(euler_to_rotation(angles), feature[0].clone()))
+            feature = self.net_feat(normalize(prepare_images([square_crop(frame)], IMAGE_SIZE)))[-1].mean((2, 3))
+            viewpoints.append(Viewpoint(euler_to_rotation(self.net_vp(feature)[0].numpy()), feature[0]))
         return viewpoints
 
 
 def load_posecontrast() -> PoseContrast:
-    """Load the published network, {"net_feat": ..., "net_vp": ...}, from $ZSP_LITE_POSECONTRAST or the cache folder."""
-    path = checkpoint_path(URL, "ZSP_LITE_POSECONTRAST", "posecontrast.pth")
+    """Load the published network from $ZSP_LITE_POSECONTRAST or the cache folder."""
+    path, model = checkpoint_path(URL, "ZSP_LITE_POSECONTRAST", "posecontrast.pth"), PoseContrast()
     content = load_torch(path, "posecontrast")
-    network, head = ResNet50(), ViewpointHead()
-    for part, module in (("net_feat", network), ("net_vp", head)):
-        weights = content.get(part) if isinstance(content, dict) else None
-        if not isinstance(weights, dict):
-            raise InputError(f"posecontrast {path}: expected a dict with net_feat and net_vp")
-        weights = {str(key).removeprefix("module."): value for key, value in weights.items()}
-        load_weights(module, weights, f"posecontrast {path}", ignored=("fc.",))
-    return PoseContrast(network, head)
+    parts = {part: content.get(part) if isinstance(content, dict) else None for part in ("net_feat", "net_vp")}
+    weights = {
+        f"{part}.{str(key).removeprefix('module.')}": value
+        for part, values in parts.items()
+        for key, value in (values.items() if isinstance(values, dict) else ())
+    }
+    load_weights(model, weights, f"posecontrast {path}", ignored=("net_feat.fc.",))
+    return model
 
 
 def euler_to_rotation(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -117,12 +106,10 @@ def square_crop(frame: Frame) -> UInt8[np.ndarray, "s s 3"]:
 
     The aspect ratio follows from the camera of the crop, because the pixels of the photograph are square.
     """
-    size = IMAGE_SIZE
-    x, y = frame.camera.focal_length * (1 / frame.camera.size[1], 1 / frame.camera.size[0])
-    aspect = y / x  # width : height
-    width, height = (size, max(1, round(size / aspect))) if aspect > 1 else (max(1, round(size * aspect)), size)
-    square = np.zeros((size, size, 3), np.uint8)
-    top, left = (size - height) // 2, (size - width) // 2
+    extent = frame.camera.size[::-1] / frame.camera.focal_length  # width and height at depth 1
+    width, height = np.maximum(1, np.round(IMAGE_SIZE * extent / extent.max())).astype(int).tolist()
+    square = np.zeros((IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    top, left = (IMAGE_SIZE - height) // 2, (IMAGE_SIZE - width) // 2
     resized = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     square[top : top + height, left : left + width] = resized
     return square

@@ -19,12 +19,11 @@ class ResNet50(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
-        self.bn1 = nn.BatchNorm2d(64)
+        self.conv1, self.bn1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False), nn.BatchNorm2d(64)
         self.layer1 = _layer(64, 256, blocks=3, stride=1)
-        self.layer2 = _layer(256, 512, blocks=4, stride=2)
-        self.layer3 = _layer(512, 1024, blocks=6, stride=2)
-        self.layer4 = _layer(1024, 2048, blocks=3, stride=2)
+        self.layer2 = _layer(256, 512, blocks=4)
+        self.layer3 = _layer(512, 1024, blocks=6)
+        self.layer4 = _layer(1024, 2048, blocks=3)
         self.eval().requires_grad_(False)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b _ _ _"]]:
@@ -45,20 +44,18 @@ class _Block(nn.Module):
         self.conv1, self.bn1 = nn.Conv2d(inputs, width, 1, bias=False), nn.BatchNorm2d(width)
         self.conv2, self.bn2 = nn.Conv2d(width, width, 3, stride, padding=1, bias=False), nn.BatchNorm2d(width)
         self.conv3, self.bn3 = nn.Conv2d(width, outputs, 1, bias=False), nn.BatchNorm2d(outputs)
-        self.downsample = None
+        self.downsample = nn.Sequential()
         if inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+            self.downsample.extend([nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)])
 
     def forward(self, x: Tensor) -> Tensor:
-        shortcut = x if self.downsample is None else self.downsample(x)
-        x = torch.relu(self.bn1(self.conv1(x)))
-        x = torch.relu(self.bn2(self.conv2(x)))
-        return torch.relu(self.bn3(self.conv3(x)) + shortcut)
+        y = torch.relu(self.bn1(self.conv1(x)))
+        y = torch.relu(self.bn2(self.conv2(y)))
+        return torch.relu(self.bn3(self.conv3(y)) + self.downsample(x))
 
 
-def _layer(inputs: int, outputs: int, blocks: int, stride: int) -> nn.Sequential:
-    others = [_Block(outputs, outputs, stride=1) for _ in range(blocks - 1)]
-    return nn.Sequential(_Block(inputs, outputs, stride), *others)
+def _layer(inputs: int, outputs: int, blocks: int, stride: int = 2) -> nn.Sequential:
+    return nn.Sequential(_Block(inputs, outputs, stride), *(_Block(outputs, outputs, 1) for _ in range(blocks - 1)))
 
 
 def checkpoint_path(url: str, variable: str, name: str) -> Path:

@@ -53,8 +53,7 @@ def dense_sift(
 ) -> Float[np.ndarray, "side side 128"]:
     """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding.
 
-    The weights of the histograms are separable in rows and columns, so two small matrix products compute all of them,
-    faster than OpenCV's loop over keypoints.
+    The weights of the histograms are separable in rows and columns: two small matrix products compute all of them.
     """
     n, side = len(grey), len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)

@@ -13,22 +13,19 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of an image: positions (x, y) with pixel centres at half-integers, and descriptors of unit length."""
+    """Keypoints of an image."""
 
-    pixels: Float[np.ndarray, "n 2"]
-    descriptors: Float[np.ndarray, "n 128"]
+    pixels: Float[np.ndarray, "n 2"]  # (x, y), pixel centres at half-integers
+    descriptors: Float[np.ndarray, "n 128"]  # of unit length
 
 
 class Sift:
-    """Detector and descriptor of keypoints on the object, by OpenCV with its default parameters.
-
-    SIFT has no saliency, so the object mask selects the keypoints, as in the supplement for the other baselines.
-    """
+    """Detector and descriptor of keypoints in the mask or, without a mask, in the whole image: OpenCV's defaults."""
 
     name = "sift"
 
     def describe(self, frames: Sequence[Frame]) -> list[Keypoints]:
-        """Detect the keypoints of object crops, in the mask or, without a mask, in the whole image."""
+        """Detect the keypoints of object crops."""
         return [self._describe(frame) for frame in frames]
 
     def _describe(self, frame: Frame) -> Keypoints:
@@ -46,10 +43,7 @@ class Sift:
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Match keypoints as mutual nearest neighbours of their descriptors.
-
-    Returns the indices in `first` and in `second` and the cosine similarities of the k best matches, the best first.
-    """
+    """Indices in both images, and cosine similarities, of the k most similar mutual nearest neighbours, best first."""
     if not len(first.pixels) or not len(second.pixels):
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     similarity = first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from zsp_lite.backbones.backbone import Image, normalize, prepare_images
 from zsp_lite.backbones.checkpoints import load_weights, read_checkpoint
@@ -27,22 +26,16 @@ class Swav:
     image_size = 448
 
     def __init__(self, model: ResNet50):
-        self.model = model
+        self.model, self.state_dict = model, model.state_dict  # the weights identify the extractor in the benchmark
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
         maps = []
         for index, image in enumerate(images):
-            with torch.inference_mode():
-                layers = self.model(normalize(prepare_images([image], self.image_size, index)))
-                keys, pooled = layers[_LAYER][0].permute(1, 2, 0), layers[-1].mean((2, 3))[0]
-            keys, pooled = keys.clone(), pooled.clone()  # ordinary tensors, outside inference mode
-            maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), pooled))
+            layers = self.model(normalize(prepare_images([image], self.image_size, index)))
+            keys = layers[_LAYER][0].permute(1, 2, 0)
+            maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), layers[-1].mean((2, 3))[0]))
         return maps
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the weights of the network, which identify the extractor in the benchmark."""
-        return self.model.state_dict()
 
 
 def load_swav() -> Swav:

@@ -15,20 +15,14 @@ from zsp_lite.metrics import accuracy, median
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference between row `first` of run A and row `second` of run B on their `n` common pairs.
-
-    Attributes:
-        acc30: Acc30 of A and of B in percent.
-        median: Median error of A and of B in degrees.
-        test: Result of `benchmark.statistics.paired_test`, with bootstrap intervals and p values over objects.
-    """
+    """Difference between row `first` of run A and row `second` of run B on their `n` common pairs."""
 
     first: str
     second: str
     n: int
-    acc30: tuple[float, float]
-    median: tuple[float, float]
-    test: dict
+    acc30: tuple[float, float]  # Acc30 of A and of B in percent
+    median: tuple[float, float]  # median error of A and of B in degrees
+    test: dict  # result of `benchmark.statistics.paired_test`, with bootstrap intervals and p values over objects
 
 
 def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | None = None) -> list[Difference]:

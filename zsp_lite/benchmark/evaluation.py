@@ -32,23 +32,9 @@ def evaluate_pair(
 ) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results.
 
-    Args:
-        pair: The pair.
-        methods: The rows by name.
-        store: Frames and features.
-        labels: Pose labels by sequence.
-        keep_hypotheses: Store the ranked candidate poses of solvers that have them, with their errors.
-
-    Returns:
-        {"pair": its key, "results": by row, {"error": degrees, and where the row has them "translation_error",
-        "scale", "view", "note", "timings", "hypotheses" and its details, and of solvers that have hypotheses
-        "one_of_two" and the error of the second pose, "second_error"; or "error": 180 and "failed": the reason},
-        "seconds": of this call, "timings": see `FrameStore.timings`, "saliency_iou": by frame, IoU of the backbone's
-        foreground with the mask}.
-
-    Raises:
-        InputError: If a file is damaged. (Rows that raise InputError count as failed.)
-        FatalError: If features are not finite, or the function of a row raises another exception.
+    Its "results" are by row {"error": degrees, and where the row has them "translation_error", "scale", "view", "note",
+    "timings", "hypotheses" and its details, and of solvers with hypotheses "one_of_two" and the error of the second
+    pose, "second_error"}, or {"error": 180, "failed": the reason} for a row that raises InputError.
     """
     start = time.perf_counter()
     store.timings.clear()
@@ -56,11 +42,9 @@ def evaluate_pair(
     truths = _true_poses(problem, labels)
     results = {name: _evaluate(method, problem, truths, keep_hypotheses) for name, method in methods.items()}
     saliency_iou = _saliency_iou(problem, store)
-    seconds = round(time.perf_counter() - start, 5)
-    timings = dict(store.timings)
-    return {
-        "pair": pair.key, "results": results, "seconds": seconds, "timings": timings, "saliency_iou": saliency_iou,
-    }  # fmt: skip
+    seconds, timings = round(time.perf_counter() - start, 5), dict(store.timings)
+    cost = {"seconds": seconds, "timings": timings, "saliency_iou": saliency_iou}
+    return {"pair": pair.key, "results": results} | cost
 
 
 def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Float[np.ndarray, "n 4 4"]:
@@ -98,12 +82,10 @@ def _evaluate(
         result |= {"second_error": error_of(one.sim3.R, one.view) for one in different[1:2]}
     if keep_hypotheses and answer.hypotheses:
         result["hypotheses"] = [
-            {
-                "error": error_of(one.sim3.R, one.view), "view": one.view, "scale": one.sim3.scale, "score": one.score,
-                "confidence": one.confidence, "terms": one.terms,
-            }
+            {"error": error_of(one.sim3.R, one.view), "view": one.view, "scale": one.sim3.scale}
+            | {"score": one.score, "confidence": one.confidence, "terms": one.terms}
             for one in answer.hypotheses
-        ]  # fmt: skip
+        ]
     timings = {stage: round(seconds, 5) for stage, seconds in details.pop("timings").items()}
     return result | details | {"note": answer.note, "timings": timings}
 

@@ -1,7 +1,6 @@
 """Evaluate chunks of pairs in this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
 
-A chunk is a few pairs of one category that share frames. Workers return the records of a whole chunk, so a killed run
-loses the chunks that were being evaluated.
+A chunk is a few pairs of one category that share frames. A killed run loses the chunks that were being evaluated.
 """
 
 import os
@@ -131,19 +130,16 @@ def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[W
         with _dask(executor.removeprefix("dask://")) as workers:
             yield workers
     else:
-        with _make_executor(executor, number) as opened:
-            yield Workers(opened, number)
-
-
-def _make_executor(path: str, number: int) -> Executor:
-    """Call the class "module:Class" of an executor with the number of workers."""
-    maker = import_object(path) if ":" in path else None
-    if not (isinstance(maker, type) and issubclass(maker, Executor)):
-        raise InputError(f"executor {path!r}: expected dask://HOST:PORT or module:Class of an executor")
-    try:
-        return maker(number)
-    except Exception as error:  # it is not of this library
-        raise InputError(f"executor {path!r} cannot be made for {number} workers: {describe_failure(error)}") from error
+        maker = import_object(executor) if ":" in executor else None
+        if not (isinstance(maker, type) and issubclass(maker, Executor)):
+            raise InputError(f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor")
+        try:
+            own = maker(number)
+        except Exception as error:  # it is not of this library
+            told = f"executor {executor!r} cannot be made for {number} workers: {describe_failure(error)}"
+            raise InputError(told) from error
+        with own:
+            yield Workers(own, number)
 
 
 def evaluate_chunks(
@@ -253,11 +249,10 @@ def _dask(address: str) -> Iterator[Workers]:
         raise InputError("executor dask://: needs Dask: pip install dask distributed") from error
     try:
         client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_DASK_TIMEOUT)
-        number = sum(client.nthreads().values())
+        client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
     except (OSError, ValueError) as error:
-        raise InputError(f"executor dask://{address}: no scheduler answers there ({error})") from error
+        raise InputError(f"executor dask://{address}: no scheduler with workers answers there ({error})") from error
     with client:
-        if number == 0:
-            raise InputError(f"executor dask://{address}: the scheduler has no workers, expected at least one")
         # A chunk depends on files: equal arguments need not give equal results.
-        yield Workers(client.get_executor(pure=False), number, (BrokenExecutor, KilledWorker))
+        executor = client.get_executor(pure=False)
+        yield Workers(executor, sum(client.nthreads().values()), (BrokenExecutor, KilledWorker))

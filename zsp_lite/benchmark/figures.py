@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from zsp_lite.benchmark import published
+from zsp_lite.benchmark.published import ACCURACIES, TARGETS, VIEWS_FIGURES
 from zsp_lite.benchmark.results import Results
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import reliability
@@ -59,7 +59,7 @@ def accuracy_against_views(results: Results) -> Figure:
     if len(lines["verified solver"][0]) < 2:
         del lines["verified solver"]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
-    for axis, name, title in zip(axes, ("acc30", "acc15"), published.ACCURACIES, strict=True):
+    for axis, name, title in zip(axes, ("acc30", "acc15"), ACCURACIES, strict=True):
         for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN, VERMILLION)):
             numbers = list(found)
             low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
@@ -68,8 +68,8 @@ def accuracy_against_views(results: Results) -> Figure:
             axis.plot(numbers, [found[n][name] for n in numbers], style, color=colour, label=label)
             if printed is None:
                 continue
-            column = published.TARGETS.columns.index(f"{printed}: {title}")
-            values = [published.TARGETS.rows[str(n)][column] for n in _VIEWS]
+            column = 2 + VIEWS_FIGURES.index(f"{printed}: {title}")  # after the names of the rows
+            values = [TARGETS[str(n)][column] for n in _VIEWS]
             axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=f"{label}, published on CO3D")
         axis.set(xlabel="target views N", ylabel=title, xticks=_VIEWS, ylim=(0, None))
         axis.grid(alpha=0.3)

@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,11 +36,7 @@ def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
 
 
 def described(value: Any) -> str:
-    """Describe a setting or a function as text.
-
-    Functions, classes and objects are described by "module:name"; for a dataclass, its public fields follow. A change
-    of their code does not change the text.
-    """
+    """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with its public fields."""
     if value is None or isinstance(value, bool | int | float | str):
         return str(value)
     if isinstance(value, list | tuple):
@@ -53,11 +50,7 @@ def described(value: Any) -> str:
 
 
 def fingerprint(extractor: Any) -> str:
-    """Return the name of an extractor, and a hash of its weights and settings where it has any.
-
-    The name of a user-defined extractor is its attribute `name`, by default "module:name". Weights are those of its
-    `state_dict`.
-    """
+    """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict` and settings."""
     if extractor is None:
         return "None"
     name, settings = getattr(extractor, "name", None) or described(extractor), ""
@@ -83,10 +76,8 @@ def environment() -> dict[str, Any]:
     program = Path(sys.argv[0]).name
     versions = {"python": platform.python_version(), "zsp-lite": __version__}
     for package in _DEPENDENCIES:
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],

@@ -19,22 +19,15 @@ from zsp_lite.errors import InputError, describe_failure
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the tables.
+    """A row of the tables."""
 
-    Attributes:
-        features: Name of the feature extractor in `extractors.EXTRACTORS`.
-        answer: "pose" for the fitted pose, "best view" for the best view without a fit ("Ours-BV"), "true view" for the
-            pose fitted in the target view that is nearest in rotation to the ground truth, or "essential matrix" for
-            the rotation between the reference and the best view without depth.
-        settings: Settings of `ZeroShotPose` that differ from the paper's.
-        targets: Number of target views per pair; None for that of the run.
-        solve: Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
-    """
-
-    features: str = "backbone"
+    features: str = "backbone"  # name of the feature extractor in `extractors.EXTRACTORS`
+    # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
+    # rotation to the ground truth; or the rotation between the reference and the best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    targets: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of `ZeroShotPose` that differ from the paper's
+    targets: int | None = None  # number of target views per pair; None for that of the run
+    # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     solve: Callable[[Any], Any] | None = None
 
 
@@ -98,14 +91,12 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "table3": ("ours-cyclicaliou", "ours-globalsim", "ours-saliencyiou", "ours"),
     "views": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5, 10, 20)),
     "matchers": ("ours-transport", "ours-dualsoftmax", "ours"),
-    "correspondences": (
-        "ours-k30-nokmeans", "ours-k50-nokmeans", "ours-k70-nokmeans", "ours-k30", "ours", "ours-k70",
-    ),
+    "correspondences": (*(f"ours-k{k}-nokmeans" for k in (30, 50, 70)), "ours-k30", "ours", "ours-k70"),
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
     "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
-}  # fmt: skip
+}
 
 
 def _union(*names: str) -> tuple[str, ...]:
@@ -150,8 +141,7 @@ def description(method: Method) -> str:
     """
     settings = ", ".join(f"{name}={described(value)}" for name, value in sorted(method.settings.items()))
     parts = [method.features, method.answer, settings, f"{method.targets} views" if method.targets else ""]
-    parts.append("" if method.solve is None else described(method.solve))
-    return "; ".join(part for part in parts if part)
+    return "; ".join(filter(None, [*parts, "" if method.solve is None else described(method.solve)]))
 
 
 def _method(name: str, meant: Any) -> Method:

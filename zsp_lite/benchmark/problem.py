@@ -19,37 +19,24 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
 # Members of a stored result; an answer's details must have other names.
-RESERVED = (
-    "error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two",
-)  # fmt: skip
+RESERVED = ("error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two")
 # What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
 _MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Pose of the reference object in one of the target views.
+    """Pose of the reference object in one of the target views."""
 
-    Attributes:
-        rotation: From the reference's camera to the camera of the target view.
-        view: Index of the target view.
-        translation: In the target's unit, if the method estimates it.
-        scale: If the method estimates it.
-        note: Warning about the pose; "" for none.
-        details: Numbers and texts to store with the result, such as {"inliers": 12}. "timings" in it are seconds per
-            stage.
-        hypotheses: Ranked candidate poses, of solvers that have them.
-        one_of_two: Whether the solver cannot decide between the two best poses (see `PoseEstimate.one_of_two`).
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    view: int = 0
-    translation: Float[np.ndarray, "3"] | None = None
-    scale: float | None = None
-    note: str = ""
+    rotation: Float[np.ndarray, "3 3"]  # from the reference's camera to the camera of the target view
+    view: int = 0  # index of the target view
+    translation: Float[np.ndarray, "3"] | None = None  # in the target's unit, if the method estimates it
+    scale: float | None = None  # if the method estimates it
+    note: str = ""  # warning about the pose; "" for none
+    # Numbers and texts to store with the result, such as {"inliers": 12}; "timings" in it are seconds per stage.
     details: Mapping[str, Any] = field(default_factory=dict)
-    hypotheses: tuple[Hypothesis, ...] = ()
-    one_of_two: bool = False
+    hypotheses: tuple[Hypothesis, ...] = ()  # ranked candidate poses, of solvers that have them
+    one_of_two: bool = False  # whether the solver cannot decide between the two best poses
 
 
 class Row(Protocol):
@@ -115,19 +102,13 @@ def _details(details: Mapping[str, Any]) -> dict[str, Any]:
 class Problem:
     """One pair as a method sees it: everything but the true pose. Results are computed once and shared by all methods.
 
-    Args:
-        pair: The frames.
-        store: Where they are read and their features computed.
-
-    Attributes:
-        pair: The frames.
-        seed: Seed for the method's random draws.
-        keys: (sequence, frame number) of the reference and of each target.
+    `pair` names the frames, `seed` is for the method's random draws.
     """
 
     def __init__(self, pair: Pair, store: FrameStore):
         self.pair, self.seed, self.store = pair, pair.seed, store
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
+        # (sequence, frame number) of the reference and of each target
         self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
         self._shared: dict[tuple, Any] = {}
 

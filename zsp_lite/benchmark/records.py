@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -30,17 +30,12 @@ _GROWING = {"methods": "method", "labels": "pose label"}  # parts of the setting
 
 @dataclass(frozen=True)
 class Records:
-    """Lines of a run, by what they are about.
+    """Lines of a run, by what they are about."""
 
-    Attributes:
-        rows: By row and pair key, what the row found.
-        evaluations: By pair key, what each evaluation cost: "seconds", "timings", "saliency_iou" (see `evaluate_pair`).
-        invocations: Calls of `evaluate`, the latest last.
-    """
-
-    rows: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    rows: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)  # by row and pair key, what the row found
+    # By pair key, what each evaluation cost: "seconds", "timings", "saliency_iou" (see `evaluate_pair`).
     evaluations: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    invocations: list[dict[str, Any]] = field(default_factory=list)
+    invocations: list[dict[str, Any]] = field(default_factory=list)  # calls of `evaluate`, the latest last
 
 
 class _Line(msgspec.Struct):
@@ -61,7 +56,7 @@ class _Settings(msgspec.Struct):
     backbone: str
     targets: int
     seed: int
-    library: list[dict[str, str | None]]
+    library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]
     methods: dict[str, str] = {}
     labels: dict[str, str] = {}
 
@@ -90,10 +85,10 @@ def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
         raise InputError(f"{Path(out) / RECORDS} cannot be written: {error}") from error
 
 
-def checked_json(data: bytes, kind: Any, what: str) -> Any:
-    """Decode JSON that Python wrote, with NaN; InputError, which begins with `what`, if it is damaged or no `kind`."""
+def checked_json(data: bytes | Any, kind: Any, what: str) -> Any:
+    """Check that JSON that Python wrote (with NaN), or its content, is of a `kind`; else InputError(`what`: ...)."""
     try:
-        content = json.loads(data)
+        content = json.loads(data) if isinstance(data, bytes) else data
         msgspec.convert(content, kind)
         return content
     except (ValueError, RecursionError, msgspec.ValidationError) as error:
@@ -123,37 +118,33 @@ def read_settings(out: str | Path) -> dict[str, Any]:
 
 
 def merged_settings(out: str | Path, settings: Mapping[str, Any], allow_other_version: bool) -> dict[str, Any]:
-    """Return the settings to write: with all rows, labels and library versions of the run that the folder holds.
-
-    Raises:
-        InputError: The run cannot be continued with these settings.
-    """
+    """Return the settings to write: with all rows, labels and library versions of the run that the folder holds."""
     out, library = Path(out), settings["library"]
     if not os.path.lexists(out / SETTINGS):  # a broken link is no new run
         if (out / RECORDS).exists():
             raise InputError(f"{out} holds results in {RECORDS} without {SETTINGS}; choose another folder")
         return dict(settings) | {"library": [library]}
     before = read_settings(out)
-    if difference := _difference(before, settings):
-        raise InputError(f"{out} holds {difference}; choose another folder")
-    versions = before["library"] + [library] * (library not in before["library"])
-    if len(versions) > len(before["library"]) and not allow_other_version:
-        older, this = (f"zsp-lite {one.get('version')} (source {one.get('source')})" for one in versions[-2:])
-        raise InputError(
-            f"{out} was measured with {older}, this is {this}; choose another folder, or continue with "
-            "--allow-other-version"
-        )
+    if problem := _cannot_continue(before, settings, allow_other_version):
+        raise InputError(f"{out} {problem}")
     grown = {group: before.get(group, {}) | settings.get(group, {}) for group in _GROWING}
+    versions = before["library"] + [library] * (library not in before["library"])
     return dict(settings) | grown | {"library": versions}
 
 
-def _difference(before: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+def _cannot_continue(before: Mapping[str, Any], settings: Mapping[str, Any], allow_other_version: bool) -> str:
     """Say what keeps a run from being continued; "" for nothing."""
     for key, value in settings.items():
         if key not in (*_GROWING, "library") and before.get(key) != value:
-            return f"a run with other settings ({key})"
+            return f"holds a run with other settings ({key}); choose another folder"
     for group, what in _GROWING.items():
         known, wanted = before.get(group, {}), settings.get(group, {})
         if changed := sorted(name for name, value in wanted.items() if known.get(name, value) != value):
-            return f"other results of {', '.join(changed)}: the {what} has changed since"
-    return ""
+            names = ", ".join(changed)
+            return f"holds other results of {names}: the {what} has changed since; choose another folder"
+    if settings["library"] in before["library"] or allow_other_version:
+        return ""
+    versions = before["library"][-1], settings["library"]
+    older, this = (f"zsp-lite {one.get('version')} (source {one.get('source')})" for one in versions)
+    other = "choose another folder, or continue with --allow-other-version"
+    return f"was measured with {older}, this is {this}; {other}"

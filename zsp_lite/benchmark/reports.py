@@ -9,18 +9,7 @@ from zsp_lite.benchmark.tables import every_table
 
 
 def write_reports(run: str | Path | Sequence[str | Path], out: str | Path | None = None) -> Results:
-    """Write tables and figures of a run, and its `results.json.gz`.
-
-    Args:
-        run: A run's folder or its `results.json.gz`, or several, which are pooled.
-        out: Folder to write to. Default: that of the (first) run.
-
-    Returns:
-        The run.
-
-    Raises:
-        InputError: If `run` is not a run.
-    """
+    """Write tables, figures and `results.json.gz` of a run, or of several that are pooled; by default to its folder."""
     # Imported here, because matplotlib takes a second to import.
     from zsp_lite.benchmark.figures import write_figures
 

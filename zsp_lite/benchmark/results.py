@@ -19,27 +19,18 @@ logger = logging.getLogger(__name__)
 
 RESULTS = "results.json.gz"
 _DECIMALS = 4  # of degrees and lengths in an export
-_EXPORTED = (
-    "error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note", "second_error",
-    "one_of_two",
-)  # fmt: skip
+_EXPORTED = ("error", "translation_error", "scale", "view", "inliers", "confidence", "failed", "note")
+_EXPORTED += ("second_error", "one_of_two")
 
 
 @dataclass(frozen=True)
 class Results:
-    """Results of a run.
+    """Results of a run."""
 
-    Attributes:
-        summary: The content of summary.json.
-        settings: What decided the results (see `records.merged_settings`).
-        invocations: Calls of `evaluate`.
-        rows: By row and pair key, what the row found: "error" in degrees, and where it has them "translation_error",
-            "scale", "view", "inliers", "confidence", "failed", "note", "second_error", "one_of_two".
-    """
-
-    summary: dict[str, Any]
-    settings: dict[str, Any]
-    invocations: list[dict[str, Any]]
+    summary: dict[str, Any]  # the content of summary.json
+    settings: dict[str, Any]  # what decided the results (see `records.merged_settings`)
+    invocations: list[dict[str, Any]]  # calls of `evaluate`
+    # By row and pair key, what the row found: "error" in degrees, and those of `_EXPORTED` that it has.
     rows: dict[str, dict[str, dict[str, Any]]]
 
     def errors(self, row: str) -> dict[str, float]:
@@ -65,6 +56,9 @@ class _Found(msgspec.Struct):
     confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0
     one_of_two: bool = False
     note: str = ""
+
+
+_Rows = dict[str, dict[_Key, _Found]]
 
 
 class _Figures(msgspec.Struct):
@@ -123,8 +117,7 @@ def read_results(path: str | Path) -> Results:
     counts = {name: len(row) for name, row in rows.items()}
     if not counts or counts != {name: row["n"] for name, row in summary["methods"].items()}:
         raise InputError(f"{what}: summary and rows do not fit, expected the rows {', '.join(rows)}, each pair once")
-    _check_rows(rows, what)
-    return Results(summary, content["settings"], content["invocations"], rows)
+    return Results(summary, content["settings"], content["invocations"], checked_json(rows, _Rows, what))
 
 
 def _row(columns: Mapping[str, list[Any]], pairs: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -139,14 +132,6 @@ def _row(columns: Mapping[str, list[Any]], pairs: Sequence[str]) -> dict[str, di
         return {}
 
 
-def _check_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], what: str) -> None:
-    """Raise InputError if an error is not an angle from 0 to 180 degrees, or another value is out of range."""
-    try:
-        msgspec.convert(rows, dict[str, dict[_Key, _Found]])
-    except msgspec.ValidationError as error:
-        raise InputError(f"{what}: {error}") from error
-
-
 def results_of(settings: Mapping[str, Any], records: Records) -> Results:
     """Summarise the rows and categories of the last call of `evaluate`, as far as they are finished."""
     call = records.invocations[-1] if records.invocations else {"rows": [], "categories": []}
@@ -159,11 +144,9 @@ def results_of(settings: Mapping[str, Any], records: Records) -> Results:
             rows[name] = {key: found[key] for _, key in keys}
     if not rows:
         raise InputError(f"{settings['data']}: the run has no finished pair yet")
-    _check_rows(rows, f"results of {settings['data']}")
-    data = {
-        "root": settings["data"], "categories": call["categories"], "pairs": max(map(len, rows.values())),
-        "targets": settings["targets"], "seed": settings["seed"],
-    }  # fmt: skip
+    checked_json(rows, _Rows, f"results of {settings['data']}")
+    data = {"root": settings["data"], "categories": call["categories"], "pairs": max(map(len, rows.values()))}
+    data |= {"targets": settings["targets"], "seed": settings["seed"]}
     # A backbone's fingerprint is its name and a hash.
     backbone = settings["backbone"].rpartition(" ")[0] or settings["backbone"]
     summary = summarise_run(rows, records.evaluations, data, backbone)
@@ -177,16 +160,11 @@ def read_runs(paths: Sequence[str | Path]) -> Results:
 
 
 def pool(runs: Sequence[Results]) -> Results:
-    """Pool runs of one benchmark on different objects, such as folders of different seeds, into one.
+    """Pool runs of one benchmark on different objects, such as folders of different seeds, into one without timings.
 
-    Rows that not all of the runs have are left out. Sequences of one category and name are one object.
-
-    Returns:
-        All pairs of the runs, summarised together. The summary has no timings.
-
-    Raises:
-        InputError: If the runs have no row in common, share a pair, or differ in the backbone, the number of target
-            views or a row's settings.
+    Rows that not all of the runs have are left out. Sequences of one category and name are one object. InputError if
+    the runs have no row in common, share a pair, or differ in the backbone, the number of target views or the settings
+    of a row.
     """
     names = [name for name in runs[0].rows if all(name in run.rows for run in runs)]
     if missing := sorted({name for run in runs for name in run.rows} - set(names)):
@@ -233,10 +211,8 @@ def export_results(results: Results, path: str | Path) -> Path:
             if any(value is not None for value in column):
                 columns[part] = column
         rows[name] = columns
-    content = {
-        "summary": results.summary, "settings": results.settings, "invocations": results.invocations,
-        "pairs": keys, "rows": rows,
-    }  # fmt: skip
+    content = {"summary": results.summary, "settings": results.settings, "invocations": results.invocations}
+    content |= {"pairs": keys, "rows": rows}
     write_atomic(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
     return Path(path)
 

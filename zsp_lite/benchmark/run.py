@@ -88,29 +88,22 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
-    settings = {
-        "data": str(root).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "pairs": pairs,
-        "targets": targets, "seed": seed, "library": library_version(),
-        "methods": {name: _identity(row, extractors) for name, row in rows.items()}, "labels": _labels(root, work),
-    }  # fmt: skip
+    settings = {"data": str(root).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "pairs": pairs}
+    settings |= {"targets": targets, "seed": seed, "library": library_version()}
+    settings |= {"methods": {name: _identity(row, extractors) for name, row in rows.items()}}
+    settings |= {"labels": _labels(root, work)}
     if threads is not None:
         check_integer("threads", threads, 1, MOST_WORKERS)
     if cache is not None:
         cache = make_folder(cache, "cache folder").resolve()  # before anything is written
     with open_run(out, settings, allow_other_version), open_workers(executor, workers) as opened:
         threads = threads or max(1, available_cores() // opened.number)
-        setup = Setup(
-            str(Path(root).resolve()), rows, backbone if named else loaded, settings["backbone"], cache, threads,
-            keep_hypotheses,
-        )  # fmt: skip
+        folder, sent = str(Path(root).resolve()), backbone if named else loaded
+        setup = Setup(folder, rows, sent, settings["backbone"], cache, threads, keep_hypotheses)
         known = read_records(out).rows
-        todo = {
-            category: {
-                pair: names for pair, every in found.items()
-                if (names := [name for name in every if pair.key not in known.get(name, ())])
-            }
-            for category, found in work.items()
-        }  # fmt: skip
+        todo = rows_of_pairs(
+            {name: [pair for pair in found if pair.key not in known.get(name, ())] for name, found in row_pairs.items()}
+        )
         total, left = sum(map(len, work.values())), sum(map(len, todo.values()))
         where = executor if isinstance(executor, str) else type(opened.executor).__name__ if opened.executor else None
         call = {"executor": where, "workers": opened.number, "threads": threads, "rows": list(rows)}
@@ -126,7 +119,7 @@ def evaluate(
 
         start = time.perf_counter()
         size = max(1, min(CHUNK_SIZE, left // (4 * opened.number)))
-        chunks = [chunk for found in todo.values() if found for chunk in make_chunks(found, size)]
+        chunks = [chunk for found in todo.values() for chunk in make_chunks(found, size)]
         evaluate_chunks(setup, chunks, opened, save, extractors)
         add_lines(out, [{"seconds": round(time.perf_counter() - start, 2)}])
         summary = results_of(settings, read_records(out)).summary

@@ -26,12 +26,11 @@ def object_draws(
     """Draw bootstrap weights of pairs by resampling the objects that the pairs are made of.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
-    its two objects' multiplicities: the pigeonhole bootstrap (Owen, "The pigeonhole bootstrap", 2007) with one set of
-    objects on both sides, as in the vertex bootstrap of a network (Snijders & Borgatti, 1999). It accounts for pairs
-    that share an object. If the errors depend little on the objects, the intervals are too wide: the estimated
-    variance is then up to three times the true one. Every category keeps its total weight. Pairs of a category with
-    fewer than three objects are resampled as if they were independent: the spread between objects cannot be estimated
-    from two.
+    its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one set of objects on both sides, as in
+    the vertex bootstrap of a network (Snijders & Borgatti 1999). If the errors depend little on the objects, the
+    intervals are too wide: the estimated variance is then up to three times the true one. Every category keeps its
+    total weight. Pairs of a category with fewer than three objects are resampled as if they were independent: the
+    spread between objects cannot be estimated from two.
 
     Args:
         objects: The two objects (reference, target) of each of the n pairs.
@@ -90,15 +89,9 @@ def bootstrap_ci(
 
 
 def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
-    """Compute the paper's figures of rotation errors, with 95 % bootstrap intervals.
+    """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see `bootstrap_ci`).
 
-    Args:
-        errors: (n,) in degrees.
-        weights: From `object_draws`; None treats pairs as independent.
-
-    Returns:
-        {"n", "median" (degrees), "acc30", "acc15" (percent), for each of the three NAME_ci: [low, high], and
-        "above150": the percentage of errors above 150 degrees, mostly confusions of front and back}.
+    "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back.
     """
     errors = np.asarray(errors, np.float64)
     weights = pair_draws(len(errors)) if weights is None else weights
@@ -129,18 +122,7 @@ def paired_difference(
     threshold: float = 30.0,
     weights: Float[np.ndarray, "resamples n"] | None = None,
 ) -> dict:
-    """Measure by how much the second method is better than the first on the same pairs.
-
-    Args:
-        first: (n,) errors in degrees.
-        second: (n,) errors of the same pairs in the same order.
-        threshold: A pair is solved if its error is below it, in degrees.
-        weights: From `object_draws`; None treats pairs as independent.
-
-    Returns:
-        {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, and for
-        both NAME_ci: the 95 % bootstrap interval, and NAME_p: the two-sided p value that the same bootstrap gives}.
-    """
+    """Measure by how much the second method is better than the first on the same pairs (see `paired_test`)."""
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
     weights = pair_draws(len(first)) if weights is None else weights
     differences = {
@@ -151,11 +133,8 @@ def paired_difference(
     for name, values in differences.items():
         replicates = weighted_mean(values, weights).round(9)  # rounding errors must not hide a difference of 0
         p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
-        result |= {
-            name: float(values.mean()),
-            f"{name}_ci": list(_interval(replicates)),
-            f"{name}_p": min(1.0, float(p)),
-        }
+        found = {"": float(values.mean()), "_ci": list(_interval(replicates)), "_p": min(1.0, float(p))}
+        result |= {f"{name}{suffix}": value for suffix, value in found.items()}
     return result
 
 
@@ -172,12 +151,17 @@ def paired_test(
     small; the interval and the p value of `paired_difference` with `object_draws` are the ones to report.
 
     Args:
-        first, second, threshold, weights: As in `paired_difference`.
+        first: (n,) errors in degrees.
+        second: (n,) errors of the same pairs in the same order.
+        threshold: A pair is solved if its error is below it, in degrees.
+        weights: From `object_draws`; None treats pairs as independent.
         seed: Seed of the permutation test, which is exact for up to 13 pairs.
 
     Returns:
-        The entries of `paired_difference`, and {"sign_test_p": McNemar's exact test over the pairs that only one of the
-        two solves, "permutation_test_p": of the mean difference, by 10,000 flips of the differences' signs}.
+        {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, for both
+        NAME_ci: the 95 % bootstrap interval, and NAME_p: the p value that the same bootstrap gives, "sign_test_p":
+        McNemar's exact test over the pairs that only one of the two solves, "permutation_test_p": of the mean
+        difference, by 10,000 flips of the differences' signs}.
     """
     from scipy.stats import permutation_test
 

@@ -33,23 +33,15 @@ class _Entry:
 
 @dataclass
 class FrameStore:
-    """Frames of one category and their features.
+    """Frames of one category and their features."""
 
-    Attributes:
-        dataset: The folder in CO3D's layout.
-        category: The category.
-        extractors: By name (see `extractors`).
-        cache: Feature maps on disk, or None.
-        threads: Threads of torch during feature extraction; None leaves them as they are.
-        timings: Seconds of every frame read ("reading"), every feature extraction (the extractor's name) and every
-            comparison of two frames ("similarity"), since the last `timings.clear()`.
-    """
-
-    dataset: Co3D
+    dataset: Co3D  # the folder in CO3D's layout
     category: str
-    extractors: Mapping[str, Any]
-    cache: FeatureCache | None = None
-    threads: int | None = None
+    extractors: Mapping[str, Any]  # by name
+    cache: FeatureCache | None = None  # feature maps on disk
+    threads: int | None = None  # threads of torch during feature extraction; None leaves them as they are
+    # Seconds of every frame read ("reading"), every feature extraction (the extractor's name) and every comparison of
+    # two frames ("similarity"), since the last `timings.clear()`.
     timings: dict[str, list[float]] = field(default_factory=dict)
     _entries: dict[FrameKey, _Entry] = field(default_factory=dict)
     _similarities: dict[tuple, Float[torch.Tensor, "n1 n2"]] = field(default_factory=dict)

@@ -25,18 +25,11 @@ def summarise_run(
     data: Mapping[str, Any],
     backbone: str,
 ) -> dict[str, Any]:
-    """Summarise a run.
+    """Summarise rows and evaluations (see `records.Records`): the content of summary.json.
 
-    Args:
-        rows: By row and pair key, what the row found (see `evaluate_pair`).
-        evaluations: By pair key, timings and foreground IoU of each evaluation (see `evaluate_pair`).
-        data: What was evaluated.
-        backbone: Its name.
-
-    Returns:
-        {"data", "backbone", "methods", "against_ours" and "intervals": see `summarise_rows`, "saliency_iou": mean over
-        the frames, by category and "mean", "timings": median seconds per stage of the first row, per frame and per
-        comparison of two frames}.
+    Its "methods", "against_ours" and "intervals" are those of `summarise_rows`; "saliency_iou" is the mean over the
+    frames, by category and "mean"; "timings" are median seconds per stage of the first row, per frame and per
+    comparison of two frames.
     """
     keys = dict.fromkeys(key for row in rows.values() for key in row)
     used = {key: evaluations[key] for key in keys if key in evaluations}
@@ -53,18 +46,12 @@ def summarise_run(
 
 
 def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
-    """Summarise the errors of rows.
+    """Summarise what rows found, by row and pair key.
 
-    Args:
-        rows: By row and pair key, {"error": degrees, "failed": present where the row failed, "note": not "" where the
-            method flagged its estimate, and of solvers with hypotheses "second_error" and "one_of_two"}.
-
-    Returns:
-        {"methods": by row, over all pairs and "per_category", the figures of `statistics.summarise`, and
-        "mean_category_median": the paper's way of averaging medians, and of solvers with hypotheses "best_two": see
-        `best_two_figures`; "against_ours": every other row that has the same problems in the same order against "ours",
-        see `statistics.paired_difference`; "intervals": their method}. Intervals and p values come from resampled
-        objects, except for "sign_test_p".
+    "methods" has by row, over all pairs and "per_category", the figures of `statistics.summarise`, the paper's
+    "mean_category_median", and of solvers with hypotheses "best_two" (see `best_two_figures`). "against_ours" compares
+    "ours" with every row of the same problems (see `statistics.paired_difference`). Intervals and p values come from
+    resampled objects, except for "sign_test_p".
     """
     rows = {name: _ordered(row) for name, row in rows.items()}
     draws: dict[tuple, np.ndarray] = {}  # rows with the same objects share them
@@ -101,13 +88,10 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
 
 
 def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Float[np.ndarray, "resamples n"]) -> dict[str, Any]:
-    """Compute how often one of the two best poses is right. These figures are not comparable with Acc30.
+    """Compute how often the estimate or its first alternative is right. These figures are not comparable with Acc30.
 
-    Returns:
-        {"acc30" and "acc30_ci": percentage of pairs with the estimate or its first alternative below 30 degrees,
-        "one_of_two": number of estimates between which the solver cannot decide, and of these the percentages
-        "one_of_two_acc30" with one of the two poses below 30 degrees and "one_of_two_first_acc30" with the estimate
-        itself; None without any}.
+    "one_of_two" is the number of estimates for which the solver cannot decide between the two; the figures whose names
+    begin with it are percentages of these, None without any.
     """
     first = np.array([one["error"] for one in row.values()])
     either = np.array([min(one["error"], one.get("second_error", 180.0)) for one in row.values()])
@@ -117,7 +101,7 @@ def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Float[np.ndarr
         "acc30_ci": list(bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), drawn)),
         "one_of_two": int(flagged.sum()),
         "one_of_two_acc30": float(accuracy(either[flagged], 30)) if flagged.any() else None,
-        "one_of_two_first_acc30": float(accuracy(first[flagged], 30)) if flagged.any() else None,
+        "one_of_two_first_acc30": float(accuracy(first[flagged], 30)) if flagged.any() else None,  # of the estimate
     }
 
 

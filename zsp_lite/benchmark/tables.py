@@ -10,8 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from zsp_lite.benchmark import published
-from zsp_lite.benchmark.published import PublishedTable
+from zsp_lite.benchmark.published import CATEGORIES, FIGURES, PAPER_TABLES, VERIFIED_TARGETS, PaperTable
 from zsp_lite.errors import InputError
 
 THIS_RUN = "this run"
@@ -24,8 +23,7 @@ TABLE_1_NOTE = (
     "ICP, ICP+BV, SIFT and SWaV use the true object mask, the other rows do not. SWaV and PoseContrast need their "
     "published checkpoints. The paper trained PoseContrast on ObjectNet3D, without its evaluation categories."
 )
-_FIGURES = ("med", "acc30", "acc15")
-_TITLES = dict(zip(_FIGURES, published.FIGURES))
+_NAMES = dict(zip(FIGURES, ("median", "acc30", "acc15")))  # of the figures in a summary
 
 
 @dataclass(frozen=True)
@@ -53,19 +51,12 @@ class PValue(Cell):
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table to print or write.
+    """A table to print or write."""
 
-    Attributes:
-        name: Stem of its files.
-        title: Its caption.
-        cells: A `Cell`, text or None for each row's label and each column's (group, title); group may be "".
-        note: How to read it.
-    """
-
-    name: str
+    name: str  # stem of its files
     title: str
-    cells: pd.DataFrame
-    note: str = ""
+    cells: pd.DataFrame  # a `Cell`, text or None for each row's label and each column's (group, title); group may be ""
+    note: str = ""  # how to read it
 
     @property
     def text(self) -> pd.DataFrame:
@@ -83,93 +74,49 @@ def make_table(
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return tables 1 to 3 and those of the supplement, where the run has rows for them, and what goes beyond them."""
-    methods, views = summary["methods"], summary["data"]["targets"]
-    tables: list[Table] = []
-    shown: dict[str, None] = {}
+    found = {spec: _rows_of_run(spec, summary) for spec in PAPER_TABLES}
+    shown = {row for rows in found.values() for row in rows}
+    beyond = {name: (name,) for name in summary["methods"] if name == "ours" or name not in shown}
+    for spec in (VERIFIED_TARGETS, PaperTable("beyond", "Beyond the paper", beyond, ())):
+        found[spec] = _rows_of_run(spec, summary)
+    return [_paper_table(spec, summary) for spec, rows in found.items() if rows]
 
-    def add(
-        name: str,
-        title: str,
-        blocks: Mapping[str, Mapping[str, str]],
-        figures: Sequence[str] = _FIGURES,
-        printed: PublishedTable | None = None,
-        unit: str = "",
-        note: str = NOTE,
-    ) -> None:
-        """Add a table with a group of columns for each block: by label of the table, a row of the run."""
-        used = dict.fromkeys(row for block in blocks.values() for row in block.values() if row in methods)
-        if len(used) < 2:
-            return
-        shown.update(used)
-        columns = [(group, _TITLES.get(figure, f"{figure} Acc30")) for group in blocks for figure in figures]
-        columns += [(PUBLISHED, title) for title in (printed.columns if printed else ())]
-        rows = {}
-        for label in dict.fromkeys(label for block in blocks.values() for label in block):
-            found = [methods.get(block.get(label)) for block in blocks.values()]
-            cells = [_cell(row, figure) for row in found for figure in figures]
-            if printed:
-                cells += map(Cell, printed.rows[label]) if label in printed.rows else [None] * len(printed.columns)
-            rows[f"{unit} = {label}" if unit else label] = cells
-        tables.append(make_table(name, title, columns, rows, note))
 
-    def at(row: str, n: int) -> str:
-        """Name of a row at n target views."""
-        named = f"{row}-n{n}"
-        return row if n == views and named not in methods else named
+def _row_name(name: str, summary: Mapping[str, Any]) -> str:
+    """The name in the run of "ROW-nN": ROW, if N is the run's number of target views and no row has this name."""
+    return name if name in summary["methods"] else name.removesuffix(f"-n{summary['data']['targets']}")
 
-    def by_views(row: str, numbers: Sequence[int]) -> dict[str, str]:
-        return {str(n): at(row, n) for n in numbers}
 
-    table_1 = {"ICP": "icp", "SIFT": "sift", "SWaV": "swav", "ICP+BV": "icp-bv", "PoseContrast": "posecontrast"}
-    table_1 |= {"Ours (K=30)": "ours-k30", "Ours (K=50)": "ours"}
-    featured = [name for name in published.CATEGORIES if name in summary["data"]["categories"]]
-    add("table_1", f"Table 1. Baselines and our method, N = {views}", {THIS_RUN: table_1}, (*_FIGURES, *featured),
-        published.TABLE_1, note=f"{NOTE} {TABLE_1_NOTE}")  # fmt: skip
-    table_2 = {f"{label} (N={n})": at(row, n) for label, row in (("Ours-BV", "ours-bv"), ("Ours", "ours"))
-               for n in (1, 3, 5)}  # fmt: skip
-    add("table_2", "Table 2. Number of target views", {THIS_RUN: table_2}, printed=published.TABLE_2)
-    add("table_3", "Table 3. How to choose the view",
-        {THIS_RUN: {"CyclicalDistIoU": "ours-cyclicaliou", "GlobalSim": "ours-globalsim",
-                    "SaliencyIoU": "ours-saliencyiou", "CorrespondSim": "ours"}},
-        printed=published.TABLE_3)  # fmt: skip
-    numbers, accuracies = (1, 3, 5, 10, 20), ("acc30", "acc15")
-    add("table_a_targets", "Supplement. More target views",
-        {f"{THIS_RUN}: best view only": by_views("ours-bv", numbers),
-         f"{THIS_RUN}: full method": by_views("ours", numbers)}, accuracies, published.TARGETS, "views")  # fmt: skip
-    add("table_a_matchers", "Supplement. Correspondence method",
-        {THIS_RUN: {"Optimal transport": "ours-transport", "Dual softmax": "ours-dualsoftmax",
-                    "Cyclical distances": "ours"}}, printed=published.MATCHERS)  # fmt: skip
-    add("table_a_correspondences", "Supplement. Number and diversity of correspondences",
-        {f"{THIS_RUN}: without k-means": {str(k): f"ours-k{k}-nokmeans" for k in (30, 50, 70)},
-         f"{THIS_RUN}: with k-means": {"30": "ours-k30", "50": "ours", "70": "ours-k70"}},
-        accuracies, published.CORRESPONDENCES, "K")  # fmt: skip
-    add("table_a_trials", "Supplement. RANSAC trials",
-        {THIS_RUN: {"500": "ours-trials500", "1000": "ours", "2000": "ours-trials2000"}},
-        printed=published.TRIALS, unit="trials")  # fmt: skip
-    add("table_a_depth", "Supplement. Without depth",
-        {THIS_RUN: {"No depth (essential matrix)": "ours-nodepth", "Ours-BV": "ours-bv", "Ours": "ours"}},
-        printed=published.DEPTH)  # fmt: skip
-    add("published_code", "Start and mask of the cycles",
-        {THIS_RUN: {"Cycle from the reference (paper)": "ours", "Cycle from the target (published code)":
-                    "ours-published"}})  # fmt: skip
-    beyond = {name: name for name in methods if name == "ours" or name not in shown}
-    solvers = {"the paper's": "ours", "verified": "verified", "verified, true mask": "verified-mask"}
-    if sum(at(row, n) in methods for row in ("verified", "verified-mask") for n in (1, 3, 5, 10)) > 1:
-        add("verified_targets", "Beyond the paper. All views tested: the verified solver",
-            {f"{THIS_RUN}: {label}": by_views(row, (1, 3, 5, 10)) for label, row in solvers.items()}, accuracies,
-            unit="views")  # fmt: skip
-    add("beyond", "Beyond the paper", {THIS_RUN: beyond})
-    return tables
+def _rows_of_run(spec: PaperTable, summary: Mapping[str, Any]) -> set[str]:
+    """The rows of the run in a table; none if the run has fewer than two."""
+    names = {_row_name(name, summary) for line in spec.rows.values() for name in line[: len(spec.groups)]}
+    names &= summary["methods"].keys()
+    return names if sum(name.startswith(spec.prefix) for name in names) > 1 else set()
+
+
+def _paper_table(spec: PaperTable, summary: Mapping[str, Any]) -> Table:
+    table_1, groups = spec.name == "table_1", len(spec.groups)
+    featured = [name for name in CATEGORIES if table_1 and name in summary["data"]["categories"]]
+    figures = (*spec.figures, *(f"{name} Acc30" for name in featured))
+    columns = [(f"{THIS_RUN}: {group}" if group else THIS_RUN, figure) for group in spec.groups for figure in figures]
+    columns += [(PUBLISHED, figure) for figure in spec.published]
+    rows = {}
+    for label, line in spec.rows.items():
+        methods = [summary["methods"].get(_row_name(name, summary)) for name in line[:groups]]
+        cells = [_cell(row, figure) for row in methods for figure in figures]
+        rows[f"{spec.unit} = {label}" if spec.unit else label] = [*cells, *map(Cell, line[groups:])]
+    title = f"{spec.title}, N = {summary['data']['targets']}" if table_1 else spec.title
+    return make_table(spec.name, title, columns, rows, f"{NOTE} {TABLE_1_NOTE}" if table_1 else NOTE)
 
 
 def all_rows(summary: Mapping[str, Any]) -> Table:
     """Return every row of the run: its figures, flagged and failed estimates, and its difference to "ours"."""
     columns = (
-        "pairs", *_TITLES.values(), "above 150° (%)", "flagged", "failed", "ours - row (%)", "p", "p, sign test",
+        "pairs", *FIGURES, "above 150° (%)", "flagged", "failed", "ours - row (%)", "p", "p, sign test",
     )  # fmt: skip
     rows = {}
     for name, row in summary["methods"].items():
-        cells: list[Cell | None] = [Cell(row["n"], decimals=0), *(_cell(row, figure) for figure in _FIGURES)]
+        cells: list[Cell | None] = [Cell(row["n"], decimals=0), *(_cell(row, figure) for figure in FIGURES)]
         cells += [Cell(row["above150"]), *(Cell(row[count], decimals=0) for count in ("flagged", "failed"))]
         if test := summary.get("against_ours", {}).get(name):
             cells += [Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), PValue(test["accuracy_gain_p"]),
@@ -211,10 +158,10 @@ def category_tables(summary: Mapping[str, Any]) -> list[Table]:
     categories = list(dict.fromkeys(c for row in methods.values() for c in row["per_category"]))
     columns = [("", category) for category in (*categories, "all")]
     tables = []
-    for figure, stem in (("med", "median"), ("acc30", "acc30"), ("acc15", "acc15")):
-        rows = {name: [*(_cell(row["per_category"].get(c), figure) for c in categories), _cell(row, figure)]
-                for name, row in methods.items()}  # fmt: skip
-        tables.append(make_table(f"categories_{stem}", f"By category: {_TITLES[figure]}", columns, rows, NOTE))
+    for figure, name in _NAMES.items():
+        rows = {label: [*(_cell(row["per_category"].get(c), figure) for c in categories), _cell(row, figure)]
+                for label, row in methods.items()}  # fmt: skip
+        tables.append(make_table(f"categories_{name}", f"By category: {figure}", columns, rows, NOTE))
     return tables
 
 
@@ -224,9 +171,9 @@ def by_category(summary: Mapping[str, Any], names: Sequence[str]) -> Table:
     if missing := [name for name in names if name not in methods]:
         raise InputError(f"the run has no row {', '.join(missing)}, expected some of {', '.join(methods)}")
     categories = dict.fromkeys(c for name in names for c in methods[name]["per_category"])
-    rows = {c: [_cell(methods[name]["per_category"].get(c), "acc30") for name in names] for c in categories}
+    rows = {c: [_cell(methods[name]["per_category"].get(c), "Acc30 (%)") for name in names] for c in categories}
     columns = [("", name) for name in names]
-    return make_table("by_category", f"By category: {_TITLES['acc30']}", columns, rows, NOTE)
+    return make_table("by_category", "By category: Acc30 (%)", columns, rows, NOTE)
 
 
 def every_table(summary: Mapping[str, Any]) -> list[Table]:
@@ -235,12 +182,12 @@ def every_table(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def _cell(row: Mapping[str, Any] | None, figure: str) -> Cell | None:
-    """A figure of a row or of a row's category; a category's name stands for its Acc30."""
-    if row is not None and figure not in _FIGURES:
-        row, figure = row["per_category"].get(figure), "acc30"
+    """A figure of a row or of a row's category, by its title; "CATEGORY Acc30" is a figure of a row, too."""
+    if row is not None and figure not in _NAMES:
+        row, figure = row["per_category"].get(figure.removesuffix(" Acc30")), "Acc30 (%)"
     if row is None:
         return None
-    name = figure
-    if figure == "med":
-        name = "mean_category_median" if "mean_category_median" in row else "median"
+    name = _NAMES[figure]
+    if name == "median" and "mean_category_median" in row:
+        name = "mean_category_median"
     return Cell(row[name], *row.get(f"{name}_ci", ()))
