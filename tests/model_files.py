@@ -7,7 +7,7 @@ import numpy as np
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
-from zsp_lite.synthetic.primitives import Mesh, box
+from zsp_lite.synthetic.primitives import Mesh, box, joined
 from zsp_lite.synthetic.room import CheapCamera, Room
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training.renders import framed_camera
@@ -45,9 +45,7 @@ def wedge(seat: float = 0.5) -> Mesh:
     """An object without symmetry, like a chair: a seat, a back at the rear and one arm on the left. Front +x, up +z."""
     parts = (box((1.2, 1.0, 0.2), (0, 0, seat)), box((0.2, 1.0, 1.2), (-0.5, 0, seat + 0.6)),
              box((0.8, 0.15, 0.4), (0.1, 0.45, seat + 0.25)), box((0.2, 0.2, seat), (0.3, 0, seat / 2)))  # fmt: skip
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
-    return Mesh(np.concatenate([part.vertices for part in parts]), faces)
+    return Mesh(*joined(parts))
 
 
 def write_wedge(path: Path, seat: float = 0.5) -> Path:

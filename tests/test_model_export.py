@@ -120,10 +120,8 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
     ("wrong", "message"),
     [
         (["--models", "MODELS", "--preset", "paper"], "or --models"),
-        (["--models", "MODELS", "--sequences", "2"], "--sequences does not go with --models"),
         (["--models", "MODELS", "--front", "+y"], "front is +y and up is +y, expected perpendicular axes"),
         (["--models", "nowhere"], "does not exist"),
-        (["--category", "mouse", "--image-size", "64"], "--image-size does not go with --category"),
         (["--category", "mouse", "--up", "+z"], "--up does not go with --category"),
     ],
 )

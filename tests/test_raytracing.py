@@ -10,7 +10,6 @@ from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import Material, canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo
 from zsp_lite.synthetic.raytracing import MeshScene
-from zsp_lite.synthetic.room import random_room
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training.renders import framed_camera
 
@@ -80,16 +79,6 @@ def test_a_deformed_copy_has_the_coordinates_and_the_pattern_of_the_original():
     assert (red == (original[:, 0] > 0))[clear].mean() > 0.98 and 0.2 < red.mean() < 0.8
 
 
-def test_a_surface_receives_the_light_of_the_faces_of_the_room_that_it_faces():
-    images = [np.full((8, 8, 3), value, np.float32) for value in (0.1, 0.9, 0.5, 0.5, 0.0, 0.8)]
-    room = RoomLight(replace(studio(), images=tuple(images)))
-    towards = np.float32([[-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, -1]])
-    near, far, up, down = room.irradiance(towards)[:, 0]
-    assert near < up < far and down < up
-    assert up == pytest.approx(room.on_the_floor(np.zeros(1, np.float32), np.ones(1, np.float32))[0, 0])
-    assert room.reflection(towards, np.full(4, 0.1, np.float32))[:, 0] == pytest.approx([0.1, 0.9, 0.8, 0])
-
-
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
     colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
     texture = np.repeat(np.repeat(colours, 16, 0), 16, 1)
@@ -134,14 +123,3 @@ def test_the_object_shades_the_floor_on_the_side_away_from_the_light():
     shaded, lit, under = (middle - towards)[:2], (middle + towards)[:2], middle[:2]
     key, around = scene.shadow((np.stack([shaded, lit, under]) - scene.origin[:2]).astype(np.float32))
     assert key[0] < 0.1 and key[1] > 0.9 and around[2] < 0.6 < around[1]
-
-
-def test_the_same_seed_gives_the_same_picture_and_vertices_may_have_colours():
-    mesh = painted(wedge())
-    camera = view(mesh.vertices)
-    room = RoomLight(random_room(3))
-    one, two = (MeshScene(mesh, room, 5).render(camera).rgb for _ in range(2))
-    assert (one == two).all()
-    blue = replace(mesh, colours=mesh.colours * np.float32([0.1, 0.1, 1]), materials=(Material(np.ones(4)),))
-    drawn = render(blue, camera)
-    assert (drawn.rgb[drawn.mask].argmax(-1) == 2).all()

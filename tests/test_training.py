@@ -154,7 +154,7 @@ def test_variants_keep_the_parts_and_change_the_proportions():
         first = make_shape(build_random_object, seed)
         other = make_shape(build_random_object, seed, variation=np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
-        np.testing.assert_array_equal(first.part, other.part)
+        np.testing.assert_array_equal(first.material, other.material)
         assert np.abs(first.vertices - other.vertices).max() > 0.02
 
 
