@@ -39,6 +39,15 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
 
 
+def level_camera(azimuth, height=0.0, distance=3.0):
+    """A camera that looks at (1, 2, 3) horizontally or from above; +z of the world is up."""
+    turn, tilt = np.radians([azimuth, height])
+    away = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    right = np.array([-np.sin(turn), np.cos(turn), 0])
+    R = np.stack([right, np.cross(-away, right), -away])
+    return Camera(R, np.array([0, 0, distance]) - R @ [1, 2, 3], np.full(2, 100.0), np.full(2, 50.0), (100, 100))
+
+
 # Object poses of the two sequences of a pair, and directions of cameras.
 AT_HOME = Sim3.identity()
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
@@ -107,11 +116,11 @@ def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placeme
     return Sim3(1.0, target.R, target.t) @ target_placement @ first.inverse()
 
 
-def reference_and_targets() -> list[Frame]:
-    """A frame of the object at home, and three of the object elsewhere."""
-    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:3]]
-    targets = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
-    return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *targets]
+def reference_and_targets(targets: int = 3) -> list[Frame]:
+    """A frame of the object at home, and some of the object elsewhere, by upright cameras turned with its world."""
+    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:targets]]
+    elsewhere = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
+    return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *elsewhere]
 
 
 def matched_scene(views: list[View]) -> Scene:

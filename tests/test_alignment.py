@@ -14,20 +14,9 @@ seeds = st.integers(0, 2**32 - 1)
 scales = st.floats(0.3, 4.0)
 
 
-def rotation(seed: int) -> np.ndarray:
-    """A uniformly random rotation, through a unit quaternion."""
-    w, x, y, z = (q := np.random.default_rng(seed).normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def similarity(seed: int, scale: float = 1.3) -> Sim3:
-    return Sim3(scale, rotation(seed), np.random.default_rng(seed + 1).normal(size=3) * 3)
+    rng = np.random.default_rng(seed)
+    return Sim3(scale, Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3) * 3)
 
 
 def cloud(seed: int, n: int = 20) -> np.ndarray:
@@ -136,14 +125,6 @@ def test_a_mirrored_target_gets_a_rotation_and_not_a_reflection(seed):
     assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())
 
 
-@settings(deadline=None)
-@given(seeds)
-def test_points_in_a_plane_suffice(seed):
-    flat = cloud(seed, 10) * (1, 1, 0)
-    truth = similarity(seed)
-    assert_same(umeyama(flat, truth.apply(flat)), truth, atol=1e-6)
-
-
 def test_without_scale_the_scale_is_one():
     source, truth = cloud(0), similarity(1, 1.0)
     assert_same(umeyama(source, truth.apply(source), with_scale=False), truth)
@@ -209,12 +190,6 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
     np.testing.assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
 
 
-def test_the_result_is_the_fit_on_the_inliers():
-    source, target, _, _ = contaminated(3)
-    sim3, inliers = ransac(source, target)
-    assert_same(sim3, umeyama(source[inliers], target[inliers]))
-
-
 def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     source, target, _, _ = contaminated(4, outliers=0.8)
     first, second = ransac(source, target, seed=5), ransac(source, target, seed=np.random.default_rng(5))
@@ -224,12 +199,13 @@ def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
 
 def test_ransac_agrees_with_a_loop_over_its_trials():
     source, target, _, _ = contaminated(6)
-    _, inliers = ransac(source, target, seed=11, trials=200)
+    sim3, inliers = ransac(source, target, seed=11, trials=200)
+    assert_same(sim3, umeyama(source[inliers], target[inliers]))
     best, leader = (-1, 0.0), None
     for sample in _draw_samples(len(source), 4, 200, np.random.default_rng(11)):
-        sim3 = umeyama(source[sample], target[sample])
-        if 0.2 <= sim3.scale <= 5:
-            residual = np.linalg.norm(sim3.apply(source) - target, axis=1)
+        fit = umeyama(source[sample], target[sample])
+        if 0.2 <= fit.scale <= 5:
+            residual = np.linalg.norm(fit.apply(source) - target, axis=1)
             inside = residual < 0.2
             if (inside.sum(), -residual[inside].sum()) > best:
                 best, leader = (inside.sum(), -residual[inside].sum()), inside
@@ -275,26 +251,12 @@ def test_the_final_fit_keeps_to_the_scale_range():
     np.testing.assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"trials": 0}, {"sample_size": 2}, {"scale_range": (2, 1)}],
-    ids=str,
-)
+@pytest.mark.parametrize("settings", [{"trials": 0}, {"sample_size": 2}, {"scale_range": (2, 1)}, {"threshold": 0}])
 def test_settings_of_ransac_out_of_range_are_refused(settings):
     with pytest.raises(InputError, match=next(iter(settings))):
         ransac(cloud(0), cloud(0), **settings)
-
-
-def test_the_repr_of_a_similarity_has_at_most_five_lines():
-    text = repr(similarity(0))
-    assert "scale=1.3000" in text and text.count("\n") < 5
-
-
-def test_fewer_points_than_a_sample_are_refused():
     with pytest.raises(InputError, match="at least 4"):
         ransac(cloud(0, 3), cloud(0, 3))
-    with pytest.raises(InputError, match="threshold"):
-        ransac(cloud(0), cloud(0), threshold=0)
 
 
 def test_a_hopeless_set_still_gives_a_similarity_and_few_inliers():
@@ -302,14 +264,6 @@ def test_a_hopeless_set_still_gives_a_similarity_and_few_inliers():
     sim3, inliers = ransac(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
     assert np.linalg.det(sim3.R) == pytest.approx(1)
     assert inliers.sum() < 12
-
-
-@settings(deadline=None)
-@given(seeds, st.integers(4, 30), st.integers(3, 4))
-def test_samples_hold_different_indices_below_n(seed, n, size):
-    samples = _draw_samples(n, size, 50, np.random.default_rng(seed))
-    assert samples.min() >= 0 and samples.max() < n
-    assert all(len(set(sample)) == size for sample in samples.tolist())
 
 
 def test_every_sample_is_equally_likely():

@@ -14,7 +14,6 @@ from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling, align_picks
-from zsp_lite.labelling.candidates import contact_sheet
 from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.labelling.session import MAX_RESIDUAL
 from zsp_lite.metrics import rotation_error
@@ -212,13 +211,6 @@ def test_the_reference_is_that_of_the_labels_or_the_best_of_the_given_sequences(
     assert labelling.reference == "c" and labelling.sequences == ["c", "b", "a"]
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "b"))
     assert Labelling(root, "chair").reference == "b"
-
-
-def test_the_contact_sheet_has_a_row_for_every_candidate(root):
-    dataset = Co3D(root)
-    figure = contact_sheet(dataset, "chair", dataset.select("chair"), views=3)
-    assert len(figure.axes) == 9
-    assert figure.axes[0].get_ylabel() == "best\ncloud 3.00\nviews 2.00"
 
 
 @pytest.mark.slow

@@ -4,34 +4,21 @@ The values are those of the one-page version (`zsp_lite.minimal`), the truth, or
 that is ignored fails: each case changes one, and names the first result that must differ.
 """
 
-import base64
-import re
 from dataclasses import astuple, replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic_views import (
-    AT_HOME,
-    DIRECTIONS,
-    ELSEWHERE,
-    CoordinateBackbone,
-    look_at,
-    matched_scene,
-    render,
-    true_pose,
-    turned,
-)
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, reference_and_targets, true_pose, turned
 
 from zsp_lite import minimal, pipeline
-from zsp_lite.alignment import ransac, umeyama
+from zsp_lite.alignment import ransac
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
-from zsp_lite.verified import VerifiedSolver, proposals, refinement, soft_icp, solver
+from zsp_lite.verified import VerifiedSolver, solver
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.views import extract_views, object_crop, patch_mask
 
@@ -42,15 +29,18 @@ def method():
 
 
 @pytest.fixture(scope="module")
-def reference():
-    return render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
+def frames():
+    return reference_and_targets(5)
 
 
 @pytest.fixture(scope="module")
-def targets():
-    # Upright cameras around the object; it and they are turned with its world.
-    views = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS]
-    return [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(views)]
+def reference(frames):
+    return frames[0]
+
+
+@pytest.fixture(scope="module")
+def targets(frames):
+    return frames[1:]
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +56,8 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
     centre = reference.camera.to_camera(np.zeros(3))
     np.testing.assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
     assert estimate.reliable and estimate.note == ""
+    assert list(estimate.timings) == ["features", "matching", "view", "alignment"]
+    assert estimate.hypotheses == estimate.alternatives == () and estimate.confidence is None
 
 
 def test_the_best_view_looks_from_nearly_the_same_side(estimate, reference, targets):
@@ -75,31 +67,6 @@ def test_the_best_view_looks_from_nearly_the_same_side(estimate, reference, targ
     ]
     assert estimate.view == np.argmax(estimate.view_scores)
     assert estimate.view in np.argsort(errors)[:2]
-
-
-def test_the_pose_is_the_fit_on_the_inlying_matches(estimate):
-    source, target = (points[estimate.inliers] for points in estimate.points)
-    assert estimate.inliers.sum() > 20
-    np.testing.assert_allclose(umeyama(source, target).matrix, estimate.sim3.matrix, atol=1e-9)
-    assert len(estimate.points[0]) == len(estimate.inliers) == len(estimate.matches.reference) <= 50
-
-
-def test_matched_points_are_the_same_point_of_the_object(estimate, reference, targets):
-    camera = targets[estimate.view].camera
-    first = reference.camera.to_world(estimate.points[0])
-    second = ELSEWHERE.inverse().apply(camera.to_world(estimate.points[1]))
-    assert np.median(np.linalg.norm(first - second, axis=1)) < 0.1
-
-
-def test_every_stage_is_timed(estimate):
-    assert list(estimate.timings) == ["features", "matching", "view", "alignment"]
-    assert all(seconds >= 0 for seconds in estimate.timings.values())
-
-
-def test_a_second_run_gives_the_same_numbers(method, estimate, reference, targets):
-    again = method.estimate(reference, targets)
-    assert (again.sim3.matrix == estimate.sim3.matrix).all()
-    assert (again.view_scores == estimate.view_scores).all()
 
 
 def test_turning_the_target_world_leaves_the_pose_between_cameras(method, estimate, reference, targets):
@@ -122,27 +89,6 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
         fitted = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
         expected = rotation_error(estimate.sim3.R, fitted.R)
         assert rotation_error(pose.R, truth.R) == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"kmeans": False},
-        {"k": 20},
-        {"foreground": "mask"},
-        {"cycle_from": "target"},
-        {"view_selector": "global"},
-        {"view_selector": "saliency"},
-        {"view_selector": "cyclical"},
-    ],
-    ids=str,
-)
-def test_with_perfect_features_no_setting_breaks_the_method(method, reference, targets, settings):
-    # The two nearest views only: what a selector picks of them can be aligned.
-    pair = [targets[0], targets[4]]
-    estimate = replace(method, **settings).estimate(reference, pair)
-    truth = true_pose(reference.camera, AT_HOME, pair[estimate.view].camera, ELSEWHERE)
-    assert rotation_error(estimate.sim3.R, truth.R) < 8
 
 
 def test_depth_with_holes_still_gives_the_pose(method, reference, targets):
@@ -247,13 +193,6 @@ def test_a_setting_reaches_its_stage_and_no_earlier_one(reference, targets, sett
     assert changed[0] == first_changed
 
 
-def test_the_seed_reaches_ransac(views):
-    # Without k-means, matches do not depend on the seed.
-    first, second = (estimate_noisy(views, kmeans=False, seed=seed) for seed in (0, 1))
-    assert (first.matches.reference == second.matches.reference).all()
-    assert not np.array_equal(first.sim3.matrix, second.sim3.matrix)
-
-
 def test_the_range_of_scales_reaches_ransac(views, monkeypatch):
     free = estimate_noisy(views, trials=1000)
     monkeypatch.setattr(pipeline, "SCALE_RANGE", (1.2, 1.25))
@@ -333,19 +272,6 @@ def test_the_threshold_reaches_the_verified_solver(views, verified):
     assert wide.inliers.sum() > verified.inliers.sum() and (wide.sim3.matrix == verified.sim3.matrix).all()
 
 
-@pytest.mark.parametrize("module", [soft_icp, refinement])
-def test_the_range_of_scales_reaches_the_verified_search(views, verified, monkeypatch, module):
-    monkeypatch.setattr(module, "SCALE_RANGE", (0.6, 0.61))
-    assert estimate_noisy(views, VERIFIED).sim3.scale != verified.sim3.scale
-
-
-def test_the_range_of_scales_reaches_the_proposals(views, monkeypatch):
-    scene = matched_scene(views)
-    free = proposals.propose_poses(scene).scale
-    monkeypatch.setattr(proposals, "SCALE_RANGE", (0.6, 0.61))
-    assert not torch.equal(proposals.propose_poses(scene).scale, free)
-
-
 def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
     mask = np.zeros(reference.mask.shape, np.float32)
     mask[:71, :90] = 1  # just over a quarter of 140 x 180 pixels
@@ -399,17 +325,17 @@ def test_a_target_with_an_empty_mask_is_left_out_with_a_flag(method, reference, 
     assert [one.view for one in estimate.hypotheses] == [one.view + 1 for one in without.hypotheses]
 
 
-def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(method, reference, targets):
+@pytest.mark.parametrize("solver", ["paper", "verified"])
+def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(method, reference, targets, solver):
+    method = replace(method, solver=solver)
     reference, *views = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
     no_depth = replace(views[0], frame=replace(views[0].frame, depth=None))
     unknown = replace(views[1], frame=replace(views[1].frame, depth=np.zeros_like(views[1].frame.depth)))
     blank = replace(views[2], foreground=torch.zeros_like(views[2].foreground))
     estimate = method.estimate_from_views(reference, [no_depth, unknown, blank, views[4]])
-    assert estimate.view == 3 and estimate.flags == (
-        "target 0 left out: no depth map",
-        "target 1 left out: no known depth",
-        "target 2 left out: no foreground",
-    )
+    defects = ("no depth map", "no known depth", "no foreground")
+    assert estimate.view == 3 and len(estimate.view_scores) == 4
+    assert estimate.flags[:3] == tuple(f"target {view} left out: {defect}" for view, defect in enumerate(defects))
     with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no depth map; target 1"):
         method.estimate_from_views(reference, [no_depth, unknown])
 
@@ -428,24 +354,15 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
         replace(method, foreground="mask").estimate(replace(reference, mask=None), targets)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"view_selector": "best"}, {"foreground": "all"}, {"cycle_from": "both"}, {"solver": "best"}, {"threshold": -1},
-        {"k": 0}, {"k": 2.5}, {"k": True}, {"trials": 10.5}, {"trials": 0}, {"sample_size": 2}, {"sample_size": 4.0},
-        {"seed": -1}, {"seed": 0.5}, {"threshold": 0}, {"threshold": np.inf}, {"threshold": np.nan}, {"threshold": "0.2"}, {"threshold": True},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(settings):
-    with pytest.raises(InputError, match=f"^{next(iter(settings))} is "):
-        ZeroShotPose(CoordinateBackbone(), **settings)
+OUT_OF_RANGE = {
+    "view_selector": ["best"], "foreground": ["all"], "cycle_from": ["both"], "solver": ["best"], "seed": [-1, 0.5],
+    "k": [0, 2.5, True], "trials": [0, 10.5], "sample_size": [2, 4.0],
+    "threshold": [-1, 0, np.inf, np.nan, "0.2", True],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name, value", [(name, value) for name, values in OUT_OF_RANGE.items() for value in values])
+def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(name, value):
+    with pytest.raises(InputError, match=f"^{name} is "):
+        ZeroShotPose(CoordinateBackbone(), **{name: value})
     assert ZeroShotPose(CoordinateBackbone(), k=30).k == 30
-
-
-def test_a_notebook_shows_small_pictures_above_the_text(estimate):
-    for part, pictures in ((estimate, 2), (estimate.reference_view.features, 1), (estimate.reference_view.frame, 1)):
-        shown = part._repr_html_()
-        assert repr(part).replace("'", "&#x27;").replace(">", "&gt;") in shown
-        found = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", shown)]
-        assert [cv2.imdecode(np.frombuffer(one, np.uint8), 1).shape for one in found] == [(128, 128, 3)] * pictures

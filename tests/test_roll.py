@@ -6,22 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, reference_and_targets, true_pose
 
-from zsp_lite.backbones.load import load_backbone
 from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.cli import main as cli
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import turn_frame
-from zsp_lite.data.labels import read_labels
-from zsp_lite.demo import demo_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.estimates import label_error
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
-from zsp_lite.samples import sample_data
 
 TURNS = (1, 2, 3)
 
@@ -45,9 +39,7 @@ class UprightBackbone(CoordinateBackbone):
 
 @pytest.fixture(scope="module")
 def frames():
-    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:3]]
-    reference = render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
-    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+    return reference_and_targets()
 
 
 @pytest.mark.parametrize("quarters", range(-1, 5))
@@ -116,19 +108,6 @@ def test_without_a_usable_target_the_error_is_that_of_the_upright_method(frames)
     blind = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames[1:]]
     with pytest.raises(InputError, match="all 3 target views were left out"):
         ZeroShotPose(CoordinateBackbone(), upright=False).estimate(frames[0], blind)
-
-
-@pytest.mark.slow
-def test_the_turn_of_a_sample_object_is_found():
-    dataset = Co3D(sample_data())
-    (pair,) = [one for one in demo_pairs(dataset) if one.category == "car"]
-    reference, targets = dataset.load_pair(pair)
-    labels = read_labels(dataset.root, pair.category)
-    rolled = turn_frame(reference, 1)
-    found = ZeroShotPose(load_backbone("zsp-tiny"), solver="verified", upright=False).estimate(rolled, targets[:3])
-    assert found.reference_turn == 270
-    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
-    assert label_error(found, first, rolled, second, targets) < 30
 
 
 @pytest.mark.slow

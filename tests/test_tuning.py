@@ -21,7 +21,6 @@ from tools.tuning import (
 )
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.metrics import reliability
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 
@@ -105,16 +104,6 @@ def test_every_category_counts_the_same_in_the_calibration():
     more = outcomes + 3 * [one for one in outcomes if one.category == "category 0"]
     once, again = (fit_calibration(some, FIRST_TERMS, ridge=0) for some in (outcomes, more))
     assert [*again.scale, *again.none] == pytest.approx([*once.scale, *once.none], rel=0.05, abs=0.05)
-
-
-def test_calibrated_probabilities_are_frequencies_on_new_pairs():
-    fitted = fit_calibration(sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(2)), FIRST_TERMS)
-    new = sample_ranked(1500, TRUE_CALIBRATION, np.random.default_rng(3))
-    ranked = [one.ranked(FIRST_TERMS) for one in new]
-    found = [fitted.probabilities(deficit, one.evidence(FIRST_TERMS)) for one, (deficit, _) in zip(new, ranked)]
-    for k in range(3):
-        confidence, right = np.array([p[k] for p in found]), np.array([error[k] < 30 for _, error in ranked])
-        assert reliability(confidence, right, 5).calibration_error < 0.05
 
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():

@@ -5,11 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic_views import AT_HOME, DIRECTIONS, ELSEWHERE, CoordinateBackbone, look_at, render, true_pose, turned
+from scipy.spatial.transform import Rotation
+from synthetic_views import (
+    AT_HOME,
+    ELSEWHERE,
+    CoordinateBackbone,
+    look_at,
+    reference_and_targets,
+    render,
+    true_pose,
+    turned,
+)
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
@@ -26,9 +35,7 @@ def method():
 
 @pytest.fixture(scope="module")
 def frames():
-    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS]
-    reference = render(look_at((1, 0.6, 0.4)), AT_HOME, "reference")
-    return [reference, *(render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras))]
+    return reference_and_targets(5)
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +67,8 @@ def test_perfect_features_give_the_true_pose(estimate, frames):
     centre = frames[0].camera.to_camera(np.zeros(3))
     np.testing.assert_allclose(estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12)
     assert estimate.confidence > 0.5 and estimate.reliable
+    stages = ["matching", "scene", "proposals", "alignment", "verification", "refinement", "ranking"]
+    assert list(estimate.timings) == stages
 
 
 def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
@@ -105,17 +114,6 @@ def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estim
     np.testing.assert_array_equal(estimate.inliers[sure], (residual < 0.2 * spread)[sure])
 
 
-def test_every_stage_is_timed(estimate):
-    stages = ["matching", "scene", "proposals", "alignment", "verification", "refinement", "ranking"]
-    assert list(estimate.timings) == stages
-
-
-def test_a_second_run_gives_the_same_numbers(method, estimate, views):
-    again = method.estimate_from_views(views[0], views[1:])
-    assert (again.sim3.matrix == estimate.sim3.matrix).all()
-    assert [one.score for one in again.hypotheses] == [one.score for one in estimate.hypotheses]
-
-
 def test_the_order_of_the_views_does_not_matter(method, estimate, views):
     order = [3, 0, 4, 2, 1]
     other = method.estimate_from_views(views[0], [views[1 + index] for index in order])
@@ -150,14 +148,6 @@ def test_one_target_view_is_enough(method, views, frames):
     assert alone.view == 0 and error(alone, frames) < 10
 
 
-def test_the_papers_solver_is_the_default_and_has_no_hypotheses(method, views):
-    paper = replace(method, solver="paper").estimate_from_views(views[0], views[1:])
-    default = ZeroShotPose(method.backbone).estimate_from_views(views[0], views[1:])
-    assert (paper.sim3.matrix == default.sim3.matrix).all()
-    assert default.hypotheses == () and default.confidence is None
-    assert default.alternatives == () and not default.one_of_two
-
-
 def test_a_given_mask_replaces_the_saliency(method, frames):
     masked = replace(method, foreground="mask").estimate(frames[0], frames[1:4])
     assert error(masked, frames) < 8
@@ -179,29 +169,13 @@ def test_noise_of_cameras_and_depth_changes_the_estimate_little(method, views, f
 
     def noisy(view):
         axis = rng.normal(size=3)
-        x, y, z = np.radians(1) * axis / np.linalg.norm(axis)
-        tilt, _, other = np.linalg.svd(np.array([[1, -z, y], [z, 1, -x], [-y, x, 1]]))
-        camera = replace(view.frame.camera, R=tilt @ other @ view.frame.camera.R, t=view.frame.camera.t * 1.01)
+        tilt = Rotation.from_rotvec(np.radians(1) * axis / np.linalg.norm(axis)).as_matrix()
+        camera = replace(view.frame.camera, R=tilt @ view.frame.camera.R, t=view.frame.camera.t * 1.01)
         depth = view.frame.depth * rng.normal(1, 0.02, view.frame.depth.shape)
         return changed(view, camera=camera, depth=depth.astype(np.float32))
 
     shaken = method.estimate_from_views(noisy(views[0]), [noisy(view) for view in views[1:]])
     assert error(shaken, frames) < 10
-
-
-def test_a_view_without_depth_is_left_out_with_a_flag(method, views, frames):
-    blind = changed(views[2], depth=np.zeros_like(views[2].frame.depth))
-    found = method.estimate_from_views(views[0], [views[1], blind, views[3]])
-    assert found.flags == ("target 1 left out: no known depth",)
-    assert np.isneginf(found.view_scores[1]) and found.view != 1
-    assert error(found, frames) < 10
-
-
-def test_a_view_without_foreground_is_left_out_with_a_flag(method, views, frames):
-    empty = replace(views[1], foreground=torch.zeros_like(views[1].foreground))
-    found = method.estimate_from_views(views[0], [empty, *views[2:]])
-    assert "target 0 left out: no foreground" in found.flags and not found.reliable
-    assert error(found, frames) < 8
 
 
 @pytest.mark.parametrize("sides", [[(-1, -0.2, -0.1)], [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]])
@@ -212,22 +186,6 @@ def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
     reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])
     found = method.estimate_from_views(reference, targets)
     assert "are not similar" in found.note and not found.reliable
-
-
-def test_unusable_views_are_refused_in_one_line(method, views, frames):
-    blind = [changed(view, depth=np.zeros_like(view.frame.depth)) for view in views]
-    with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no known depth"):
-        method.estimate_from_views(views[0], blind[1:3])
-    with pytest.raises(InputError, match="reference"):
-        method.estimate_from_views(blind[0], views[1:])
-    without = replace(views[0], frame=replace(views[0].frame, depth=None))
-    with pytest.raises(InputError, match="reference.*: no depth map"):
-        method.estimate_from_views(without, views[1:])
-    empty = replace(frames[0], mask=np.zeros_like(frames[0].mask))
-    with pytest.raises(InputError, match="mask"):
-        method.estimate(empty, frames[1:])
-    with pytest.raises(InputError, match="solver is 'best'"):
-        replace(method, solver="best")
 
 
 def test_uninformative_features_give_a_low_confidence(method, views):

@@ -7,15 +7,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic_views import (
-    ELSEWHERE,
-    CoordinateBackbone,
-    look_at,
-    matched_scene,
-    reference_and_targets,
-    true_pose,
-    working_pose,
-)
+from scipy.spatial.transform import Rotation
+from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, reference_and_targets, true_pose, working_pose
 
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.cameras import Camera
@@ -45,23 +38,14 @@ from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, pr
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import (
-    TERM_NAMES,
-    ScoreCoefficients,
-    ScoreTerms,
-    forward_terms,
-    reverse_terms,
-    score_terms,
-    viewpoint_term,
-)
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms, viewpoint_term
 from zsp_lite.views import View, extract_views, object_crop
 
 seeds = st.integers(0, 2**31)
 
 
 def some_rotation(rng: np.random.Generator) -> np.ndarray:
-    matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    return matrix * np.sign(np.linalg.det(matrix))
+    return Rotation.random(random_state=rng).as_matrix()
 
 
 def as_poses(*sim3s: Sim3) -> Poses:
@@ -100,17 +84,6 @@ def truth(frames, scene):
 
 
 @given(seeds)
-def test_a_known_similarity_is_fitted(seed):
-    rng = np.random.default_rng(seed)
-    pose = Sim3(rng.uniform(0.5, 2), some_rotation(rng), rng.normal(size=3))
-    source = rng.normal(size=(6, 3))
-    fitted = fit_poses(*(torch.tensor(part, dtype=torch.float32)[None] for part in (source, pose.apply(source))))
-    assert rotation_error(fitted.rotation[0].double().numpy(), pose.R) < 0.1
-    assert float(fitted.scale) == pytest.approx(pose.scale, rel=1e-3)
-    np.testing.assert_allclose(fitted.translation[0], pose.t, atol=1e-3)
-
-
-@given(seeds)
 def test_batched_fits_equal_umeyama(seed):
     rng = np.random.default_rng(seed)
     source, target = rng.normal(size=(2, 4, 7, 3))
@@ -121,19 +94,11 @@ def test_batched_fits_equal_umeyama(seed):
         np.testing.assert_allclose(fitted.translation[i], alone.t, atol=1e-5)
 
 
-@given(seeds)
-def test_an_inverse_undoes_its_pose(seed):
-    rng = np.random.default_rng(seed)
-    poses = as_poses(*(Sim3(rng.uniform(0.5, 2), some_rotation(rng), rng.normal(size=3)) for _ in range(3)))
-    points = torch.tensor(rng.normal(size=(5, 3)), dtype=torch.float32)
-    there = poses.apply(points)
-    back = poses.inverse()
-    for i in range(3):
-        np.testing.assert_allclose(back[[i]].apply(there[i])[0], points, atol=1e-4)
-
-
-def test_angles_are_the_rotation_errors():
+def test_rotation_vectors_and_angles_are_those_of_scipy_and_of_the_metrics():
     rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(9, 3))
+    expected = Rotation.from_rotvec(vectors).as_matrix()
+    np.testing.assert_allclose(rotation_matrices(torch.tensor(vectors)), expected, atol=1e-6)
     one, two = (np.stack([some_rotation(rng) for _ in range(n)]) for n in (3, 4))
     np.testing.assert_allclose(
         rotation_angles(torch.tensor(one), torch.tensor(two)), rotation_error(one[:, None], two[None]), atol=1e-6
@@ -406,27 +371,13 @@ def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
 
 
 def test_the_truth_scores_above_other_poses(scene, truth):
-    turns = rotation_matrices(
-        torch.deg2rad(torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]]))
-    )
+    degrees = torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]])
+    turns = rotation_matrices(torch.deg2rad(degrees))
     others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
     score = ScoreCoefficients().score(score_terms(scene, concatenate([truth, others])))
     assert int(score.argmax()) == 0
     terms = first_terms(scene, truth)
-    assert (
-        terms["forward_silhouette"] < 0.02
-        and terms["forward_free_space"] < 0.02
-        and terms["reverse_silhouette"] < 0.02
-        and terms["reverse_free_space"] < 0.02
-    )
-
-
-def test_points_in_front_of_a_surface_violate_free_space_and_occluded_ones_do_not(scene, truth):
-    from_camera = scene.target_maps.rotation[0].T @ scene.target_maps.translation[0]  # to the origin
-    toward = from_camera / from_camera.norm()
-    near, far = (Poses(truth.scale, truth.rotation, truth.translation + move * toward) for move in (-1.0, 1.0))
-    fronts = [float(forward_terms(scene, pose).free_space[0, 0].mean()) for pose in (near, truth, far)]
-    assert fronts[0] > 0.3 and fronts[1] < 0.02 and fronts[2] < 0.02
+    assert all(terms[name] < 0.02 for name in TERM_NAMES if name.endswith(("silhouette", "free_space")))
 
 
 def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
@@ -451,14 +402,6 @@ def test_terms_do_not_depend_on_how_many_poses_are_tested_at_once(scene, truth):
         np.testing.assert_allclose(getattr(together, name)[::60], getattr(alone, name), atol=1e-5)
 
 
-def test_the_score_is_the_weighted_sum_of_the_terms():
-    rng = np.random.default_rng(4)
-    terms = ScoreTerms(*(torch.tensor(rng.random(3), dtype=torch.float32) for _ in TERM_NAMES))
-    weights = ScoreCoefficients(1.0, 2.0, -3.0, 4.0, 0.5, -0.5, 0.25, 7.0, -2.0)
-    by_hand = sum(getattr(weights, name) * getattr(terms, name) for name in TERM_NAMES)
-    np.testing.assert_allclose(weights.score(terms), by_hand, rtol=1e-5)
-
-
 def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_view(views):
     """Of two target views far apart, one is similar: the term is its similarity weighted by the angle."""
     alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
@@ -474,16 +417,6 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
 def test_with_one_view_the_viewpoint_term_is_zero(views):
     scene = build_scene(views[0], views[1:2], [torch.rand(784, 784)])
     np.testing.assert_array_equal(viewpoint_term(scene, poses_from_views(scene)), np.zeros(12))
-
-
-def test_reverse_terms_equal_forward_terms_with_exchanged_views(views, truth):
-    """With one target view, the reverse terms are the forward terms of the inverse pose with exchanged views."""
-    zeros = [torch.zeros(784, 784)]
-    one, other = build_scene(views[0], [views[1]], zeros), build_scene(views[1], [views[0]], zeros)
-    pose = working_pose(one, Sim3(1.0, look_at((0, 1, 0.2)).R, np.array([0.1, 0, 0.3])), 0)
-    there, back = reverse_terms(one, pose), forward_terms(other, pose.inverse())
-    np.testing.assert_allclose(there.silhouette, back.silhouette, atol=1e-4)
-    np.testing.assert_allclose(there.free_space, back.free_space, atol=1e-4)
 
 
 # Refinement
@@ -510,30 +443,11 @@ def test_refinement_never_lowers_the_score():
     assert float(same) == pytest.approx(float(score(goal)), abs=1e-4) and len(still) == 1
 
 
-@pytest.mark.parametrize("scale", [0.51, 1.95])
-def test_refinement_reaches_the_ends_of_the_scale_range(scale):
-    """Proposals, soft ICP and refinement share the scale range of 0.5 to 2."""
-    start = as_poses(Sim3(0.9 * scale if scale > 1 else 1.1 * scale, np.eye(3), np.zeros(3)))
-    search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8)
-    found, _ = refine(start, lambda poses: -(poses.scale / scale).log().square(), search)
-    assert float(found.scale) == pytest.approx(scale, rel=0.005)
-
-
 def test_refinement_stays_within_the_scale_range():
     search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.2, decay=0.9)
     for sign, end in zip((-1, 1), SCALE_RANGE):
         found, _ = refine(as_poses(Sim3.identity()), lambda poses: sign * poses.scale, search)
         assert float(found.scale) == pytest.approx(end)
-
-
-@given(seeds)
-def test_rotation_vectors_rotate_by_their_length_about_their_direction(seed):
-    vector = torch.tensor(np.random.default_rng(seed).normal(size=(1, 3)), dtype=torch.float64)
-    matrix = rotation_matrices(vector)
-    np.testing.assert_allclose(matrix[0] @ matrix[0].T, np.eye(3), atol=1e-6)
-    np.testing.assert_allclose(matrix[0] @ vector[0], vector[0], atol=1e-6)
-    expected = np.degrees(float(vector.norm())) % 360
-    assert rotation_error(matrix[0].numpy(), np.eye(3)) == pytest.approx(min(expected, 360 - expected), abs=1e-3)
 
 
 def test_bad_scenes_are_refused_in_one_line(views):
@@ -589,10 +503,10 @@ MODE = np.array([0, 0, 2, 2, 4])
 
 
 def test_probabilities_of_hypotheses_by_hand():
-    # Of four views that span 3/4 of the circle, the nearest with exp(-(angle / 45)^2) = 1/2.
-    evidence = Evidence(0.75, np.log(4), 0.5, 0.03, 2.0)
+    # Of four views that span half the circle, the nearest with exp(-(angle / 45)^2) = 1/2.
+    evidence = Evidence(0.5, np.log(4), 0.5, 0.03, 2.0)
     calibration = Calibration((0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4)
-    a, none = np.exp(0.2 + 0.3 + 0.3 + 0.03 + 0.2) / 2, np.exp(0.3 + 0.6 + 0.1 - 0.06 - 0.5) * 4**-0.1
+    a, none = np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2, np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0]))
     first, second, third = (1 - 0.4 / 4) * odds / (none + odds.sum())
     score = np.array([5.0, 4.9, 4.5, 4.4, 3.0])

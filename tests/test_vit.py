@@ -7,7 +7,6 @@ from torch import nn
 
 from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.errors import InputError
 
 DEPTH, DIM, HEADS, PATCH = 3, 48, 6, 8
 
@@ -118,9 +117,3 @@ def test_position_embedding_is_itself_on_its_own_grid_and_interpolated_on_others
     torch.testing.assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, -1, DIM))
     with torch.no_grad():
         assert model.extract(torch.zeros(1, 3, 24, 48), 0).grid == (3, 6)
-
-
-@pytest.mark.parametrize("arguments", [(33, 8, 48, 1, 6), (32, 8, 50, 1, 6), (32, 8, 48, 0, 6)])
-def test_sizes_that_do_not_fit_are_refused(arguments):
-    with pytest.raises(InputError, match="VisionTransformer"):
-        VisionTransformer(*arguments)
