@@ -11,8 +11,8 @@ from zsp_lite.metrics import reliability
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_cloud
 from zsp_lite.verified.maps import Projection, ViewMaps
-from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, TERM_NAMES, PointTerms, ScoreCoefficients
-from zsp_lite.viz import alignment_plots, feature_plots, plots, result_plots, scene3d, verified
+from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
+from zsp_lite.viz import alignment_plots, feature_plots, plots, result_plots, scene3d, training_plots, verified
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
@@ -42,12 +42,21 @@ def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]  # the patch, the most similar one, the true one
 
 
-def test_outliers_are_dashed_and_inliers_solid():
-    pixels = np.array([[10.0, 10], [20, 20], [30, 30]])
-    figure = plots.draw_matches(IMAGE, IMAGE, pixels, pixels + 5, np.array([True, False, True]))
-    ends = {tuple(artist.xy1): artist for artist in figure.artists}
-    assert [ends[tuple(pixel)].get_linestyle() in ("-", "solid") for pixel in pixels] == [True, False, True]
-    assert all(tuple(artist.xy2) == (first[0] + 5, first[1] + 5) for first, artist in ends.items())
+def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():
+    cells = np.array([[0, 0], [1, 1], [2, 3]])
+    figure = plots.show_matches([IMAGE, IMAGE], [cells, cells[::-1]], (3, 4), np.array([True, False, True]))
+    lines = {(tuple(line.xy1), tuple(line.xy2)): line.get_linestyle() for line in figure.artists}
+    assert set(lines) == {((10, 10), (70, 50)), ((30, 30), (30, 30)), ((70, 50), (10, 10))}
+    assert [line in ("-", "solid") for line in lines.values()] == [False, True, True]  # outliers first, below
+
+
+def test_intervals_stand_at_their_values_and_the_axis_holds_them_all():
+    figure = plots.show_intervals([1, 9], {"a": ([2, 3], [1, 2], [4, 7]), "b": ([2, 3], [0, 2], [4, 5])})
+    (axis,) = figure.axes
+    ends = [bars.get_segments()[1][:, 1].tolist() for bars in axis.collections]
+    assert ends == [[2, 7], [2, 5]] and axis.lines[0].get_xydata().tolist() == [[1, 2], [9, 3]]
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    assert left < 1 < 9 < right and low < 0 < 7 < high
 
 
 def test_equal_features_have_equal_colours_across_maps_and_the_background_is_white():
@@ -145,18 +154,6 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
 
 
-def test_bars_of_the_score_add_up_to_it():
-    rng = np.random.default_rng(0)
-    terms, weights = (
-        dict(zip(TERM_NAMES, rng.random(len(TERM_NAMES)))),
-        ScoreCoefficients(*rng.normal(size=len(TERM_NAMES))),
-    )
-    _, axis = plt.subplots()
-    verified.draw_score_contributions(axis, {"first": terms}, weights)
-    widths = [bar.get_width() for bar in axis.containers[0]]
-    np.testing.assert_allclose(widths, [getattr(weights, name) * terms[name] for name in TERM_NAMES])
-
-
 def test_reliability_points_lie_at_confidence_and_frequency_with_wilsons_interval():
     _, axis = plt.subplots()
     measured = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
@@ -165,3 +162,25 @@ def test_reliability_points_lie_at_confidence_and_frequency_with_wilsons_interva
     # For 3 of 10, from a table: 10.8 % to 60.3 %.
     low, high = axis.containers[0][2][0].get_segments()[0][:, 1]
     assert (low, high) == pytest.approx((0.108, 0.603), abs=1e-3)
+
+
+def test_the_same_place_has_the_same_colour_and_the_background_is_white():
+    surface = np.full((1, 3, 3), np.nan, np.float32)
+    surface[0, :2] = 0.5
+    first, second, background = training_plots.coordinate_picture(surface)[0]
+    assert (first == second).all() and (background == 1).all() and not (first == 1).any()
+
+
+def test_a_running_mean_stands_at_the_middle_of_its_window():
+    steps, means = training_plots.smoothed([3.0, 0.0, 3.0, 6.0], 3)
+    assert steps.tolist() == [2, 3] and means.tolist() == [2, 3]
+
+
+def test_a_query_is_framed_and_small_weights_are_left_out():
+    target = np.zeros((2, 4, 4))
+    target[1, 2, 3] = 1
+    figure = training_plots.show_query(np.zeros((2, 32, 32, 3), np.float32), (1, 2), target, target * 0)
+    query, drawn, _, answer = figure.axes
+    assert query.patches[0].get_xy() == (16, 8) and query.patches[0].get_width() == 8
+    assert drawn.images[1].get_array().compressed().tolist() == [1]
+    assert answer.images[1].get_array().compressed().size == 0

@@ -9,11 +9,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from synthetic_views import level_camera
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.best_view import VIEW_SELECTORS
-from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import cyclical_distances, match, similarity
@@ -80,20 +80,6 @@ def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypat
         common.slider("x", 0, 1, 0)
 
 
-def test_update_gets_the_values_of_all_controls():
-    calls = []
-
-    def update(x, name):
-        calls.append((x, name))
-        return f"x is {x}, {name}"
-
-    controls = {"x": common.slider("x", 0.0, 1.0, 0.0, 0.25), "name": common.choice("name", ["a", "b"])}
-    widget = common.interactive_figure(plt.figure(figsize=(1, 1)), controls, update, "nothing")
-    widget.controls["x"].value = 0.5
-    widget.controls["name"].value = "b"
-    assert calls[-2:] == [(0.5, "a"), (0.5, "b")] and widget.caption.value == "x is 0.5, b"
-
-
 # features and matches
 
 
@@ -129,10 +115,14 @@ def test_facets_report_the_fraction_of_correct_nearest_neighbours():
     assert f"{correct_matches(cells, truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
 
 
-def test_saliency_counts_the_patches_above_the_threshold():
+def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_is_reported():
     view, widget = examples.sample_views()[0], examples.saliency()
     widget.controls["threshold"].value = 0.5
     assert f"{int((view.features.saliency > 0.5).sum())} of 784 patches" in widget.caption.value
+    widget = examples.box_to_mask()
+    assert "IoU" in widget.caption.value
+    widget.controls["bottom"].value = 4
+    assert "the box is empty" in widget.caption.value
 
 
 def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
@@ -159,13 +149,6 @@ def test_matches_are_compared_with_the_ground_truth(sim, matcher):
     assert f"{(~truth.valid[at]).sum()} without ground truth" in widget.caption.value
 
 
-def test_an_empty_box_is_reported_in_the_caption():
-    widget = examples.box_to_mask()
-    assert "IoU" in widget.caption.value
-    widget.controls["bottom"].value = 4
-    assert "the box is empty" in widget.caption.value
-
-
 # best view
 
 
@@ -182,20 +165,9 @@ def test_the_caption_names_the_view_with_the_best_score_of_those_offered(score, 
         assert f"selects view {best + 1}, {angles[best]:.0f}°" in widget.caption.value
 
 
-def camera_at(degrees, tilt=0.3):
-    """A camera on a circle around the origin, looking at it; +z of the world is up."""
-    turn = np.radians(degrees)
-    centre = 5 * np.array([np.cos(turn), np.sin(turn), tilt])
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    return Camera(R, -R @ centre, np.full(2, 100.0), np.full(2, 50.0), (100, 100))
-
-
 def test_cameras_on_a_circle_are_on_a_circle_from_above():
-    cameras = [camera_at(degrees) for degrees in np.arange(0, 360, 45)]
-    ring, other = views.viewpoints_from_above(cameras, camera_at(20, tilt=0.8).centre[None])
+    cameras = [level_camera(degrees) for degrees in np.arange(0, 360, 45)]
+    ring, other = views.viewpoints_from_above(cameras, level_camera(20, 40).centre[None])
     turns = np.degrees(np.unwrap(np.arctan2(*ring.T[::-1])))
     # Counter-clockwise in the world is counter-clockwise in the plot, for any axes of the plane.
     assert np.allclose(np.diff(turns), 45) and np.allclose(np.linalg.norm(ring, axis=1), 1)

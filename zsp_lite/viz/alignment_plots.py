@@ -25,7 +25,6 @@ from zsp_lite.viz.plots import (
     ORANGE,
     VERMILLION,
     coordinate_colours,
-    draw_curves,
     draw_points,
     overlay_map,
     show_images,
@@ -80,24 +79,6 @@ def scores_over_angle(angles: Real[np.ndarray, " n"], scores: Mapping[str, Real[
         axis.set(title=name, xlabel="angle to the reference (degrees)", ylabel="score")
         axis.set(xlim=(-10, 190), xticks=range(0, 181, 45))
         axis.margins(y=0.15)
-    return figure
-
-
-def accuracy_over_views(counts: Sequence[int], curves: Mapping[str, Sequence[Real[np.ndarray, " starts"]]]) -> Figure:
-    """Show the accuracy over the number of target views; bars span the choices of the first view.
-
-    `curves` maps a method to its accuracies: for each number of views, one for each first view.
-    """
-    figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
-    shifts = np.geomspace(0.97, 1.03, len(curves))
-    for (name, values), colour, line, marker, shift in zip(curves.items(), COLOURS, LINES, MARKERS, shifts):
-        at = shift * np.asarray(counts)
-        axis.plot(at, [np.mean(v) for v in values], line, marker=marker, color=colour, label=name, markersize=8)
-        axis.vlines(at, [np.min(v) for v in values], [np.max(v) for v in values], color=colour, alpha=0.5, linewidth=3)
-    axis.set(xscale="log", xlabel="number of target views N", ylabel="Acc30 (%)", ylim=(0, 100))
-    axis.set_xticks(counts, counts)
-    axis.minorticks_off()
-    figure.legend(fontsize=9, ncols=len(curves), loc="outside upper center")
     return figure
 
 
@@ -294,20 +275,6 @@ def ransac_sweeps(
     return figure
 
 
-def rotation_error_over_width(
-    widths: Real[np.ndarray, " n"], quartiles: Real[np.ndarray, "n 3"], noise: float
-) -> Figure:
-    """Show quartiles of the rotation error of thin sets of length 1 over their width; a line marks the noise."""
-    figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
-    low, middle, high = np.transpose(quartiles)
-    axis.fill_between(widths, low, high, color=BLUE, alpha=0.2, linewidth=0)
-    axis.plot(widths, middle, "o-", color=BLUE)
-    axis.axvline(noise, color="0.5", linestyle=":")
-    axis.text(1.05 * noise, 0.92 * np.max(high), "width = noise")
-    axis.set(xscale="log", xlabel="width of a set of length 1 (scene units)", ylabel="rotation error (degrees)")
-    return figure
-
-
 def angle_errors_of_formulas(
     offsets: Real[np.ndarray, " n"], errors: Mapping[str, tuple[Sequence[float], Sequence[float]]]
 ) -> Figure:
@@ -355,54 +322,6 @@ def pose_chain(
         panel.invert_yaxis()
         panel.set_aspect("equal", adjustable="datalim")
     panels[5].legend(*panels[1].get_legend_handles_labels(), loc="center", markerscale=4)
-    return figure
-
-
-def share_of_benchmarks(gains: Real[np.ndarray, " n"], curves: Mapping[str, Real[np.ndarray, "2 n"]]) -> Figure:
-    """Show the share of benchmarks that show a true gain at all (first row), and significantly, over the gain."""
-    figure, panels = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained", sharey=True)
-    titles = "the better method comes out ahead", "... and significantly so"
-    for row, (panel, title) in enumerate(zip(panels, titles)):
-        draw_curves(panel, gains, {name: shares[row] for name, shares in curves.items()})
-        panel.set(title=title, xlabel="true gain (points of Acc30)", xticks=gains[::2])
-    panels[0].set_ylabel("share of benchmarks (%)")
-    panels[1].legend(fontsize=9, loc="lower right")
-    return figure
-
-
-def measured_accuracies(
-    distributions: Mapping[str, Sequence[tuple[Real[np.ndarray, " n"], Real[np.ndarray, " n"]]]], labels: Sequence[str]
-) -> Figure:
-    """Show the probability densities of the accuracies that benchmarks would measure.
-
-    `distributions` maps the title of a panel to the accuracies and densities of each method.
-    """
-    figure, axes = plt.subplots(1, len(distributions), figsize=(10.2, 4), layout="constrained", sharex=True)
-    likely = [values[density > 0.01 * density.max()] for one in distributions.values() for values, density in one]
-    for axis, (title, methods) in zip(np.atleast_1d(axes), distributions.items()):
-        for (values, density), label, colour, line in zip(methods, labels, COLOURS, LINES):
-            axis.plot(values, density, line, color=colour, label=label)
-        axis.set(xlim=(np.concatenate(likely).min(), np.concatenate(likely).max()), title=title)
-        axis.set_xlabel("measured Acc30 (%)")
-    np.atleast_1d(axes)[0].set_ylabel("probability density (1/%)")
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=len(labels), fontsize=9)
-    return figure
-
-
-def accuracies_with_intervals(
-    accuracies: Mapping[str, float], intervals: Mapping[str, Mapping[str, tuple[float, float]]]
-) -> Figure:
-    """Show accuracies of methods, each with several kinds of intervals (by method) beside each other."""
-    figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
-    shifts = np.linspace(-0.12, 0.12, len(intervals))
-    for (kind, found), colour, marker, shift in zip(intervals.items(), COLOURS, MARKERS, shifts):
-        at = np.arange(len(accuracies)) + shift
-        low, high = np.transpose([found[name] for name in accuracies])
-        axis.vlines(at, low, high, color=colour, linewidth=3)
-        axis.plot(at, [*accuracies.values()], marker, color=colour, markersize=8, label=kind)
-    axis.set_xticks(range(len(accuracies)), accuracies)
-    axis.set(ylabel="Acc30 (%)", ylim=(-2, 102))
-    figure.legend(fontsize=9, ncols=len(intervals), loc="outside upper center")
     return figure
 
 

@@ -10,32 +10,20 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Int, Real, UInt8
-from matplotlib.axes import Axes
+from jaxtyping import Float, Int, Real, UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from zsp_lite.data.frames import Frame
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
 from zsp_lite.points import object_cloud
-from zsp_lite.synthetic.ground_truth import GroundTruthPair
 from zsp_lite.viz import plots
 
 Image = UInt8[np.ndarray, "height width 3"]
 
 _POINTS = 1500  # drawn of a cloud
 _WRONG = "#D40000"  # with black borders or beside orange, also distinguishable with colour-vision deficiencies
-_MAP = {"limits": (-8, 0), "cmap": "cividis", "alpha": 0.85}  # of a cyclical distance map
-
-
-def views_with_choice(reference: Frame, targets: Sequence[Frame], chosen: int, size: float = 3.0) -> Figure:
-    """Show the reference and the target views, three in a row, with a frame around the chosen target view."""
-    titles = ["reference", *(f"target {number}" for number in range(1, len(targets) + 1))]
-    figure, axes = plots.show_images([frame.rgb for frame in (reference, *targets)], titles, columns=3, size=size)
-    plots.mark(axes[1 + chosen], "chosen")
-    return figure
 
 
 def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Figure:
@@ -56,14 +44,11 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Fi
 
 
 def matches_of_estimate(estimate: PoseEstimate, size: float = 3.6) -> Figure:
-    """Show the matches between the reference and the chosen target view; see `plots.draw_matches` for the lines."""
+    """Show the matches between the reference and the chosen target view; see `plots.show_matches` for the lines."""
     views = estimate.reference_view, estimate.target_views[estimate.view]
-    ends = [
-        plots.patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
-        for cells, view in zip((estimate.matches.reference, estimate.matches.target), views)
-    ]
-    pictures = [view.frame.rgb for view in views]
-    return plots.draw_matches(*pictures, *ends, estimate.inliers, ("reference", "chosen target"), size=size)
+    pictures, cells = [view.frame.rgb for view in views], (estimate.matches.reference, estimate.matches.target)
+    grid, titles = views[0].features.grid, ("reference", "chosen target")
+    return plots.show_matches(pictures, cells, grid, estimate.inliers, titles, size)
 
 
 def image_in_patches(image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"], corner: tuple[int, int]) -> Figure:
@@ -82,29 +67,6 @@ def image_in_patches(image: Image, patches: UInt8[np.ndarray, "rows cols p p 3"]
     return figure
 
 
-def maps_of_positions(maps: Mapping[tuple[int, int], Real[np.ndarray, "rows cols"]], label: str) -> Figure:
-    """Show maps over the patch grid, from 0 to 1, without an image; a circle marks the patch of each."""
-    shape = next(iter(maps.values())).shape
-    titles = [f"position ({row}, {col})" for row, col in maps]
-    figure, axes = plots.show_images([np.ones((*shape, 3))] * len(maps), titles, size=3.2)
-    for axis, (cell, values) in zip(axes, maps.items()):
-        plots.overlay_map(axis, values, alpha=1, limits=(0, 1), label=label)
-        _circle(axis, cell, shape, shape)
-    return figure
-
-
-def attention_of_patch(
-    image: Image, cell: tuple[int, int], weights: Mapping[str, Float[np.ndarray, "rows cols"]], columns: int
-) -> Figure:
-    """Show the attention weights of one patch, each panel relative to its largest weight; a circle marks the patch."""
-    titles = [f"{title}\nat most {values.max():.0%}" for title, values in weights.items()]
-    figure, axes = plots.show_images([image] * len(weights), titles, columns=columns, size=2.6)
-    for axis, values in zip(axes, weights.values()):
-        plots.overlay_map(axis, values / values.max(), alpha=0.75)
-        _circle(axis, cell, values.shape, image.shape[:2], size=5)
-    return figure
-
-
 def similarities_of_patch(
     image: Image,
     cell: tuple[int, int],
@@ -120,48 +82,15 @@ def similarities_of_patch(
     """
     columns = 2 if len(maps) == 3 else min(1 + len(maps), 3)
     figure, axes = plots.show_images([image, *pictures], ["this patch", *maps], columns=columns, size=size)
-    _circle(axes[0], cell, next(iter(maps.values())).shape, image.shape[:2])
+    plots.circle_patch(axes[0], cell, next(iter(maps.values())).shape, image)
     for axis, picture, values in zip(axes[1:], pictures, maps.values()):
         values = np.asarray(values)
         plots.overlay_map(axis, values, limits=limits, label="cosine")
-        _circle(axis, divmod(int(values.argmax()), values.shape[1]), values.shape, picture.shape[:2])
+        plots.circle_patch(axis, np.unravel_index(values.argmax(), values.shape), values.shape, picture)
         if true_cell is not None:
             centre = plots.patch_centres(true_cell[None], values.shape, picture.shape[:2])[0]
             axis.plot(*centre, "*", color=plots.ORANGE, markersize=18, markeredgecolor="black")
     return figure
-
-
-def true_partners(pair: GroundTruthPair, seed: int = 0) -> Figure:
-    """Show 14 patches of the reference, drawn at random, with those of the target that show the same place."""
-    known = np.argwhere(pair.valid)
-    some = known[np.random.default_rng(seed).choice(len(known), min(14, len(known)), replace=False)]
-    grid = pair.valid.shape
-    ends = [
-        plots.patch_centres(cells, grid, frame.rgb.shape[:2])
-        for cells, frame in ((some, pair.reference), (pair.cells[tuple(some.T)], pair.target))
-    ]
-    return plots.draw_matches(
-        pair.reference.rgb, pair.target.rgb, *ends, titles=("reference", "target: the same places"), size=3.6
-    )
-
-
-def scores_by_layer(scores: pd.DataFrame, used: int, guessing: float) -> Figure:
-    """Draw a score (share of 1) against the layer, a line per facet; lines mark the layer in use and guessing."""
-    figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
-    plots.draw_curves(axis, scores.index, (100 * scores).to_dict("list"))
-    axis.axhline(100 * guessing, color="0.4", linestyle=":", label="guessing")
-    axis.axvline(used, color="0.6", linestyle="--", linewidth=1)
-    axis.set(xlabel="layer", ylabel="nearest neighbour within one patch (%)", xticks=scores.index, ylim=(0, None))
-    figure.legend(ncols=5, loc="outside upper center", fontsize=9)
-    return figure
-
-
-def rows_of_pictures(rows: Mapping[str, Sequence[np.ndarray]], size: float = 2.0) -> Figure:
-    """Show rows of pictures, each under the title of its row."""
-    columns = len(next(iter(rows.values())))
-    pictures = [picture for row in rows.values() for picture in row]
-    titles = [title for title in rows for _ in range(columns)]
-    return plots.show_images(pictures, titles, columns=columns, size=size)[0]
 
 
 def overlap_by_threshold(thresholds: Float[np.ndarray, " t"], overlap: Float[np.ndarray, "n t"], used: float) -> Figure:
@@ -224,14 +153,6 @@ def toy_cycles(
     return figure
 
 
-def cyclical_map(reference: Image, distances: Real[np.ndarray, "rows cols"], target: Image) -> Figure:
-    """Show a reference, its cyclical distance map, and the target."""
-    titles = ["reference", "map C over the reference", "target"]
-    figure, axes = plots.show_images([reference, reference, target], titles, size=3.2)
-    plots.overlay_map(axes[1], distances, label="− d(u, u') in patches", **_MAP)
-    return figure
-
-
 def cycles_between(
     reference: Image,
     target: Image,
@@ -276,18 +197,6 @@ def counts_of_matches(counts: Mapping[str, pd.DataFrame], wanted: int) -> Figure
     return figure
 
 
-def correct_by_length(table: pd.DataFrame) -> Figure:
-    """Draw the columns "correct" (share of 1) and "matches" (number) against the length of the cycle, the index."""
-    figure, axis = plt.subplots(figsize=(6.8, 3.6), layout="constrained")
-    shares = 100 * table["correct"]
-    bars = axis.bar(table.index, shares, color=plots.BLUE)
-    labels = [f"{share:.0f} % of {count:.0f}" for share, count in zip(shares, table["matches"])]
-    axis.bar_label(bars, labels, fontsize=9)
-    axis.set(xlabel="d(u, u') in patches", ylabel="right within one patch (%)")
-    axis.margins(y=0.15)
-    return figure
-
-
 def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[int, int]) -> Figure:
     """Show where the matches of several rules start, coloured by their cyclical distance."""
     figure, axes = plots.show_images([image] * len(matches), list(matches), size=4.0)
@@ -297,21 +206,3 @@ def spread_of_matches(image: Image, matches: Mapping[str, Matches], grid: tuple[
         dots = axis.scatter(*centres, c=some.distance, **style)
     figure.colorbar(dots, ax=axes, label="d(u, u') in patches", shrink=0.8)
     return figure
-
-
-def judged_matches(
-    images: tuple[Image, Image],
-    cells: tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]],
-    good: Bool[np.ndarray, " n"],
-    grid: tuple[int, int],
-    titles: tuple[str, str],
-) -> Figure:
-    """Show matches between two images; the good ones are solid, the others dashed."""
-    ends = [plots.patch_centres(some, grid, image.shape[:2]) for some, image in zip(cells, images)]
-    return plots.draw_matches(*images, *ends, good, titles, size=3.8)
-
-
-def _circle(axis: Axes, cell: tuple[int, int], grid: tuple[int, int], image: tuple[int, int], size: float = 8) -> None:
-    """Mark a patch (row, col) of an image by a white circle."""
-    centre = plots.patch_centres(np.array([cell]), grid, image)[0]
-    axis.plot(*centre, "o", color="white", markersize=size, markeredgecolor="black")

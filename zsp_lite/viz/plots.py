@@ -1,8 +1,8 @@
 """Plots of every stage of the method, as primitives to combine.
 
-`show_images` shows images side by side; `overlay_map`, `mark`, `draw_points` and `draw_axes` add to its axes.
-`draw_matches` shows two images and lines between them; `draw_curves` adds curves to any axis. Colours are
-distinguishable with colour-vision deficiencies.
+`show_images` shows images side by side; `overlay_map`, `mark`, `circle_patch`, `draw_points` and `draw_axes` add to its
+axes. `show_maps` shows maps over images, `show_matches` lines between two images, `show_curves`, `show_panels` and
+`show_intervals` values over x. Colours are distinguishable with colour-vision deficiencies.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
@@ -31,6 +32,7 @@ LINES = "-", "--", "-.", ":"
 MARKERS = "o", "s", "^", "D"
 _AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
+_MARKED = 20  # points of a curve; more have no markers
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
@@ -42,16 +44,9 @@ def plain_text(text: str) -> str:
 def show_images(
     images: Sequence[np.ndarray], titles: Sequence[str] | None = None, columns: int | None = None, size: float = 2.4
 ) -> tuple[Figure, list[Axes]]:
-    """Show images in a grid, without ticks. Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
+    """Show images (H, W, 3) or (H, W) in a grid, each `size` inches wide; returns the figure and one axis per image.
 
-    Args:
-        images: Images (H, W, 3) or (H, W).
-        titles: One title per image.
-        columns: Images per row; default all in one row.
-        size: Width of an image in inches.
-
-    Returns:
-        The figure, and one axis per image.
+    Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
     """
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
@@ -77,15 +72,9 @@ def overlay_map(
     limits: tuple[float, float] | None = None,
     label: str | None = None,
 ) -> AxesImage:
-    """Draw a map on the patch grid (saliency, cyclical distances) over the image of an axis; fill it with `set_data`.
+    """Draw a map on the patch grid over the image of an axis, transparent where it is not finite.
 
-    Args:
-        axis: Axis of an image from `show_images`.
-        values: One value per patch; patches whose value is not finite (background) are transparent.
-        alpha: Opacity of the map.
-        cmap: Name of the colour map.
-        limits: Values at the ends of the colour map; default the smallest and the largest finite value.
-        label: Label of a colour bar; None for no colour bar.
+    `limits` are the values at the ends of the colour map, `label` is that of a colour bar. `set_data` fills it anew.
     """
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
@@ -117,35 +106,30 @@ def patch_centres(
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
 
-def draw_matches(
-    reference: np.ndarray,
-    target: np.ndarray,
-    reference_pixels: Real[np.ndarray, "n 2"],
-    target_pixels: Real[np.ndarray, "n 2"],
+def circle_patch(axis: Axes, cell: tuple[int, int], grid: tuple[int, int], image: np.ndarray, size: float = 7) -> None:
+    """Mark a patch (row, col) of the image of an axis by a white circle."""
+    (centre,) = patch_centres(np.array([cell]), grid, image.shape[:2])
+    axis.plot(*centre, "o", color="white", markersize=size, markeredgecolor="black")
+
+
+def show_matches(
+    images: Sequence[np.ndarray],
+    cells: Sequence[Integer[np.ndarray, "n 2"]],
+    grid: tuple[int, int],
     inliers: Bool[np.ndarray, " n"] | None = None,
-    titles: tuple[str, str] = ("reference", "target"),
+    titles: Sequence[str] = ("reference", "target"),
     size: float = 3.4,
 ) -> Figure:
-    """Show two images with a line for each match. Outliers are thin, dashed and grey.
+    """Show two images with a line for each match of patches (row, col); outliers are thin, dashed and grey.
 
-    The colour of an inlier depends on its row in the reference, so that lines can be told apart.
-
-    Args:
-        reference: Image (H, W, 3).
-        target: Image (H, W, 3).
-        reference_pixels: Pixels (x, y) of the matches in the reference.
-        target_pixels: Pixels (x, y) of the matches in the target.
-        inliers: Which matches are inliers; None for all.
-        titles: Titles of the images.
-        size: Width of an image in inches.
+    The colour of an inlier depends on its row in the first image, so that lines can be told apart.
     """
-    inliers = np.ones(len(reference_pixels), bool) if inliers is None else inliers
-    figure, (left, right) = show_images([reference, target], list(titles), size=size)
+    first, second = (patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images))
+    inliers = np.ones(len(first), bool) if inliers is None else inliers
+    figure, (left, right) = show_images(images, titles, size=size)
     # plasma without its brightest end, which is not visible on light images.
-    colours = plt.get_cmap("plasma")(0.85 * reference_pixels[:, 1] / np.shape(reference)[0])
-    for a, b, good, colour in sorted(
-        zip(reference_pixels, target_pixels, inliers, colours, strict=True), key=lambda match: match[2]
-    ):
+    colours = plt.get_cmap("plasma")(0.85 * first[:, 1] / len(images[0]))
+    for a, b, good, colour in sorted(zip(first, second, inliers, colours, strict=True), key=lambda match: match[2]):
         style = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
         if good:  # with a white outline, to be visible on dark images
             style = {
@@ -166,18 +150,56 @@ def draw_matches(
     return figure
 
 
-def draw_curves(axis: Axes, x: ArrayLike, curves: Mapping[str, ArrayLike]) -> None:
-    """Draw up to four curves over x that differ in colour, line and marker, each with its name for the legend."""
-    for (name, values), colour, line, marker in zip(curves.items(), COLOURS, LINES, MARKERS):
-        axis.plot(x, values, line, marker=marker, color=colour, label=name, markersize=5)
+def draw_curves(axis: Axes, curves: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> None:
+    """Draw up to four curves (x, y) that differ in colour, line and marker, each with its name for the legend."""
+    for (name, (x, y)), colour, line, marker in zip(curves.items(), COLOURS, LINES, MARKERS):
+        marker = marker if len(x) <= _MARKED else None
+        axis.plot(x, y, line, marker=marker, color=colour, label=name, markersize=5)
 
 
 def show_curves(x: ArrayLike, curves: Mapping[str, ArrayLike], **labels: Any) -> Figure:
     """Show up to four curves over x; `labels` is what `Axes.set` takes, such as xlabel, ylabel and ylim."""
     figure, axis = plt.subplots(figsize=(7, 3.5), layout="constrained")
-    draw_curves(axis, x, curves)
+    draw_curves(axis, {name: (x, y) for name, y in curves.items()})
     axis.set(**labels)
     figure.legend(ncols=len(curves), fontsize=9, loc="outside upper center")
+    return figure
+
+
+def show_panels(
+    panels: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike]]], columns: int | None = None, **labels: Any
+) -> Figure:
+    """Show up to four curves (x, y) in each panel, by its title, with one legend; `labels` is what `Axes.set` takes."""
+    columns = min(columns or len(panels), len(panels))
+    rows = -(-len(panels) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(10, 3.4 * rows), layout="constrained", squeeze=False)
+    for axis, (title, curves) in zip(axes.flat, panels.items()):
+        draw_curves(axis, curves)
+        axis.set(title=title, **labels)
+    names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*names, ncols=len(names[0]), fontsize=9, loc="outside upper center")
+    return figure
+
+
+def show_intervals(
+    x: ArrayLike, intervals: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]], joined: bool = True, **labels: Any
+) -> Figure:
+    """Show up to four rows of values over x, each value with a bar from its lower to its upper end.
+
+    A row is (values, lower ends, upper ends) by its name; bars at one x stand beside each other. A line joins the
+    values of a row if they are `joined`; `labels` is what `Axes.set` takes.
+    """
+    figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
+    styles = zip(intervals.items(), COLOURS, LINES, MARKERS)
+    for place, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
+        beside = offset_copy(axis.transData, figure, x=5 * (place - (len(intervals) - 1) / 2), units="points")
+        line = line if joined else "none"
+        (row,) = axis.plot(x, values, linestyle=line, marker=marker, color=colour, label=name)
+        for artist in (row, axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)):
+            artist.set_transform(beside)  # after the limits of the axis are known
+    axis.set(**labels)
+    axis.minorticks_off()
+    figure.legend(ncols=len(intervals), fontsize=9, loc="outside upper center")
     return figure
 
 
@@ -186,12 +208,18 @@ def show_maps(
     maps: Mapping[str, Real[np.ndarray, "rows cols"]],
     columns: int | None = None,
     size: float = 3.0,
+    circles: Sequence[tuple[int, int]] = (),
     **style: Any,
 ) -> Figure:
-    """Show each map, by its title, over its image; `style` is what `overlay_map` takes."""
+    """Show each map, by its title, over its image, with a circle around one of its patches (row, col) where given.
+
+    `style` is what `overlay_map` takes.
+    """
     figure, axes = show_images(images, list(maps), columns, size)
     for axis, values in zip(axes, maps.values()):
         overlay_map(axis, values, **style)
+    for axis, cell, values, image in zip(axes, circles, maps.values(), images):
+        circle_patch(axis, cell, values.shape, image)
     return figure
 
 

@@ -24,29 +24,17 @@ _OBJECT = 0.45  # reach of the object in the drawing from above; the cameras are
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Directions from the target object to the cameras, seen from above with the reference camera below.
+    """Directions from the target object to the cameras, seen from above with the reference camera below."""
 
-    Attributes:
-        targets: (n, 2) unit vectors towards the target cameras, without their vertical part.
-        numbers: Number of each of these target views, counted from 1.
-        reference: (2,) the same of the reference camera under the estimated pose.
-        span: Angle that the target views span around the object in degrees (see `view_span`).
-        gap: Angles in degrees between which, counter-clockwise from the right, there is no target camera.
-        nearest: Number of the target view closest to the reference viewpoint.
-        angle: Angle in degrees between the directions of that view and of the reference.
-        centre: (3,) middle of the target object in the world.
-        axes: (2, 3) the drawing's axes to the right and up in the world.
-    """
-
-    targets: Float[np.ndarray, "n 2"]
-    numbers: tuple[int, ...]
-    reference: Float[np.ndarray, "2"]
-    span: float
-    gap: tuple[float, float]
-    nearest: int
-    angle: float
-    centre: Float[np.ndarray, "3"]
-    axes: Float[np.ndarray, "2 3"]
+    targets: Float[np.ndarray, "n 2"]  # unit vectors towards the target cameras, without their vertical part
+    numbers: tuple[int, ...]  # number of each of these target views, counted from 1
+    reference: Float[np.ndarray, "2"]  # the same of the reference camera under the estimated pose
+    span: float  # angle that the target views span around the object in degrees (see `view_span`)
+    gap: tuple[float, float]  # no target camera is between these angles (degrees, counter-clockwise from the right)
+    nearest: int  # number of the target view closest to the reference viewpoint
+    angle: float  # angle in degrees between the directions of that view and of the reference
+    centre: Float[np.ndarray, "3"]  # middle of the target object in the world
+    axes: Float[np.ndarray, "2 3"]  # the drawing's axes to the right and up in the world
 
 
 def coverage(

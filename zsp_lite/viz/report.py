@@ -91,7 +91,7 @@ def write_report(
 def write_pair_report(path: str | Path, result: PairResult) -> Path:
     """Write the page of one pair of the user's own."""
     path = Path(path)
-    names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found from the depth"}
+    names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found by depth and colours"}
     note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
     page = render_page([result], result.backbone, path.parent, data_note=note, own=True)
     write_atomic(path, page.encode(errors="replace"))

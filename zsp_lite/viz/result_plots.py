@@ -20,23 +20,6 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
 
 
-def pose_overview(estimate: PoseEstimate, title: str = "", size: float = 2.6, points: int = 1500) -> Figure:
-    """Draw the reference with its points, the chosen view, and the points in it after the estimated pose.
-
-    The colour of a point is its position along the reference object.
-    """
-    reference, chosen = estimate.reference_view, estimate.target_views[estimate.view].frame
-    cloud = object_cloud(reference, most=points)
-    colours = plots.coordinate_colours(cloud)
-    titles = ["reference", f"chosen view (target {estimate.view + 1})", "reference, moved"]
-    figure, axes = plots.show_images([reference.frame.rgb, chosen.rgb, chosen.rgb], titles, size=size)
-    plots.draw_points(axes[0], reference.frame.camera, cloud, colours, size=4)
-    plots.draw_points(axes[2], chosen.camera, estimate.sim3.apply(cloud), colours, size=4)
-    if title:
-        figure.suptitle(plots.plain_text(title), fontsize=10, weight="bold")
-    return figure
-
-
 def crop_steps(frame: Frame, crop: Frame, size: float = 3.0) -> Figure:
     """Draw a frame with the box around its object, the object mask, and the crop."""
     top, left, height, width = mask_to_bbox(frame.mask)
@@ -198,21 +181,6 @@ def errors_against_viewpoint(angles: Sequence[float], errors: Sequence[float], g
     return figure
 
 
-def label_error_curves(noises: Sequence[float], errors: Mapping[int, Real[np.ndarray, "noises draws"]]) -> Figure:
-    """Draw the error of pose labels over the error of single clicks: medians, and 95th percentiles dotted."""
-    figure, axis = plt.subplots(figsize=(6.5, 3.2), layout="constrained")
-    for (n, draws), marker, colour in zip(errors.items(), cycle(plots.MARKERS), cycle(plots.COLOURS)):
-        middle, high = np.percentile(draws, [50, 95], axis=1)
-        axis.plot(noises, middle, marker=marker, color=colour, label=f"{n} keypoints")
-        axis.plot(noises, high, marker=marker, color=colour, linestyle=":", markerfacecolor="white")
-    axis.plot([], [], color="0.3", linestyle=":", label="95 of 100 are below")
-    axis.xaxis.set_major_formatter("{x:.0%}")
-    axis.set(xlabel="error of a click (share of the object's length)", ylabel="error of the label (degrees)")
-    axis.set(xticks=noises, ylim=(0, None))
-    axis.legend(fontsize=8)
-    return figure
-
-
 def cloud_overlays(
     overlays: Sequence[tuple[Real[np.ndarray, "n 3"], Real[np.ndarray, "m 3"]]],
     titles: Sequence[str],
@@ -291,18 +259,4 @@ def category_heatmap(
     axis.set_xticks(range(len(categories)), categories, rotation=55, ha="right", fontsize=9)
     axis.set_yticks(range(len(rows)), rows, fontsize=9)
     figure.colorbar(image, label=label)
-    return figure
-
-
-def interval_against_pairs(numbers: Sequence[int], values: Sequence[float], bounds: Real[np.ndarray, "n 2"]) -> Figure:
-    """Draw Acc30 with its interval over the number of pairs, and the rule of thumb for independent pairs dotted."""
-    figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-    axis.fill_between(numbers, *bounds.T, color=BLUE, alpha=0.25, label="95 % interval, objects resampled")
-    axis.plot(numbers, values, "o-", color=BLUE, label="Acc30 of the first n pairs")
-    for sign, label in ((-1, None), (1, "all pairs ± 100 / √n")):
-        axis.plot(numbers, values[-1] + sign * 100 / np.sqrt(numbers), ":", color="0.3", label=label)
-    axis.set(xscale="log", xlabel="pairs n", ylabel="Acc30 (%)")
-    axis.set_xticks(numbers, numbers)
-    axis.minorticks_off()
-    axis.legend(fontsize=8)
     return figure

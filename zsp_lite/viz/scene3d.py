@@ -20,20 +20,9 @@ def aligned_clouds(
     seed: int = 0,
     colours: tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]] | None = None,
 ) -> go.Figure:
-    """Draw two point clouds in one frame. They differ in colour and in the shape of their markers.
+    """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
 
-    The scene is seen from near the target camera: +x right, +y down, +z forward.
-
-    Args:
-        reference: (N, 3) the reference's points, transformed by the estimated pose, in the target camera's frame.
-        target: (M, 3) the target's points in the target camera's frame.
-        names: legend entries.
-        title: title above the scene.
-        seed: seed of the random subset of at most 2,000 points that is drawn of each cloud.
-        colours: RGB colours of the points; by default one colour per cloud.
-
-    Raises:
-        InputError: If a cloud is empty or has values that are not finite.
+    A random subset is drawn of each; the clouds differ in colour, if no `colours` are given, and in their markers.
     """
     rng = np.random.default_rng(seed)
     traces, drawn = [], []

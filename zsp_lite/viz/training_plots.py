@@ -133,21 +133,6 @@ def show_losses(rows: Sequence[Mapping[str, float]], losses: Mapping[str, str], 
     return figure
 
 
-def show_measurements(
-    shares: Mapping[str, Sequence[float]], values: Mapping[str, Sequence[tuple[float, ...]]], labels: Sequence[str]
-) -> Figure:
-    """Show several measurements over the course of several runs, one panel per measurement."""
-    figure, axes = plt.subplots(1, len(labels), figsize=(4.4 * len(labels), 3.3), layout="constrained", squeeze=False)
-    for index, (axis, label) in enumerate(zip(axes[0], labels)):
-        for run, (colour, line, marker) in zip(values, _STYLES):
-            curve = [one[index] for one in values[run]]
-            axis.plot(shares[run], curve, color=colour, linestyle=line, marker=marker, label=run)
-        highest = max(one[index] for curve in values.values() for one in curve)
-        axis.set(xlabel="share of the run", ylabel=label, ylim=(0, 1.2 * highest))
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(values))
-    return figure
-
-
 def show_keys_and_attention(
     pictures: Sequence[np.ndarray], rows: Sequence[tuple[str, Sequence[np.ndarray], Sequence[np.ndarray]]],
     size: float = 1.15,

@@ -204,23 +204,6 @@ def show_proposal_errors(errors: Float[np.ndarray, " m"], sources: Sequence[str]
     return figure
 
 
-def show_term_curves(
-    degrees: Float[np.ndarray, " m"], forward: Mapping[str, Float[np.ndarray, " m"]],
-    reverse: Mapping[str, Float[np.ndarray, " m"]],
-) -> Figure:  # fmt: skip
-    """Show how terms change as an object is turned: forward and reverse terms of the same name in one panel."""
-    columns = min(len(forward), 2)
-    rows = -(-len(forward) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4.4 * columns, 2.9 * rows), squeeze=False, layout="constrained")
-    for axis, name in zip(axes.flat, forward):
-        axis.plot(degrees, forward[name], color=BLUE, label="forward")
-        axis.plot(degrees, reverse[name], color=VERMILLION, linestyle="--", label="reverse")
-        axis.set(title=name.replace("_", " "), xlabel="turn (degrees)", xlim=(degrees[0], degrees[-1]))
-        axis.set_xticks(range(0, 361, 90))
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return figure
-
-
 def show_from_above(
     reference_points: Float[Tensor, "n 3"], target_points: Float[Tensor, "m 3"], poses: Poses, titles: Sequence[str]
 ) -> Figure:
