@@ -41,7 +41,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import reliability, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import Calibration, Evidence, different_poses, modes
+from zsp_lite.verified.confidence import Calibration, Evidence, different_poses, hidden_share, modes
 from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 
@@ -277,7 +277,7 @@ def fit_calibration(
     evidence = np.array([astuple(one.evidence(weights)) for one in outcomes])
     mean, std = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
     x = torch.from_numpy(np.column_stack([np.ones(len(evidence)), (evidence - mean) / std]))
-    unspanned = torch.from_numpy(1 - evidence[:, 0])
+    hidden = torch.from_numpy(hidden_share(evidence[:, 0]))
     theta = torch.zeros(2, x.shape[1], dtype=torch.float64, requires_grad=True)  # alpha and beta
     unseen = torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)  # logit of lambda
     optimiser = torch.optim.LBFGS([theta, unseen], max_iter=300, line_search_fn="strong_wolfe")
@@ -286,7 +286,7 @@ def fit_calibration(
         optimiser.zero_grad()
         log_scale, none = theta @ x.T
         logits = torch.cat([-log_scale.exp()[:, None] * deficits, none[:, None]], dim=1)
-        look_alike = (unseen.sigmoid() * unspanned)[:, None]
+        look_alike = (unseen.sigmoid() * hidden)[:, None]
         probability = (1 - look_alike) * logits.softmax(dim=1)
         probability = torch.cat([probability[:, :-1], probability[:, -1:] + look_alike], dim=1)
         likelihood = probability.gather(1, target[:, None])[:, 0].clamp_min(1e-12)

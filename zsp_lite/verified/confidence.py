@@ -3,13 +3,14 @@ r"""Calibrated probabilities: how likely is the rotation of each hypothesis with
 The score S is a conditional logit (McFadden 1974), with one more alternative: that none of the poses is right. Of the
 different poses (see `modes`) of an estimate, pose k has the probability
 
-    p_k = (1 - \lambda (1 - span)) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
+    p_k = (1 - \lambda h) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
     \log a = \alpha . x,   b = \beta . x.
 
 x is what is known about the estimate beside the scores (see `Evidence`), above all the span: how far around the target
 its views go. Where they show one side only, the best pose turns that side to the reference, and whether the reference
-shows another side that looks alike cannot be known: \lambda is the chance of such a side. What the p_k leave of 1 is
-the probability of none of these. The confidence of an estimate is p_1. `metrics.reliability` measures how well such
+shows a hidden side that looks alike cannot be known. h is the share of the circle around the target from where no view
+is within 60 degrees, relative to that of a single view, and \lambda the chance of such a side. What the p_k leave of 1
+is the probability of none of these. The confidence of an estimate is p_1. `metrics.reliability` measures how well such
 probabilities are calibrated.
 """
 
@@ -18,6 +19,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from zsp_lite.estimates import Hypothesis
 
@@ -56,15 +58,20 @@ class Calibration:
     of 30 to 120 degrees (`tools/tuning.py`).
     """
 
-    scale: tuple[float, ...] = (-0.31, 1.41, 0.03, -0.91, 0.65, -0.077)  # \alpha
-    none: tuple[float, ...] = (0.21, -3.86, 0.72, 1.62, -39.9, -0.334)  # \beta
-    unseen: float = 0.126  # \lambda
+    scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
+    none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
+    unseen: float = 0.313  # \lambda
 
     def probabilities(self, deficit: Float[np.ndarray, " m"], evidence: Evidence) -> Float[np.ndarray, " m"]:
         """Return the probabilities of different poses; the `deficit` S_1 - S_k is infinite for no pose."""
         x = np.array([1.0, *astuple(evidence)])
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
-        return (1 - self.unseen * (1 - evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
+        return (1 - self.unseen * hidden_share(evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
+
+
+def hidden_share(span: ArrayLike) -> np.ndarray:
+    """Return h of the probabilities (see the module's docstring) for a share of the circle that the views span."""
+    return np.maximum(0.0, 1 - 1.5 * np.asarray(span))
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
