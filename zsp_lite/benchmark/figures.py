@@ -49,28 +49,28 @@ def accuracy_against_views(results: Results) -> Figure:
     The results that the paper published for CO3D are dotted grey; those of the verified solver are dashed.
     """
     methods, views = results.summary["methods"], results.summary["data"]["targets"]
-    lines = {}
-    shown = {"full method": ("ours", "full"), "best view only": ("ours-bv", "best view")}
-    for label, (row, printed) in (shown | {"verified solver": ("verified", None)}).items():
+    lines = []
+    for label, row, published, style, colour in (
+        ("full method", "ours", "full", "o-", BLUE),
+        ("best view only", "ours-bv", "best view", "s-", GREEN),
+        ("verified solver", "verified", "", "D--", VERMILLION),
+    ):
         found = {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in _VIEWS}
-        lines[label] = {n: one for n, one in found.items() if one is not None}, printed
-    if max(len(found) for found, printed in lines.values() if printed) < 2:
+        found = {n: one for n, one in found.items() if one is not None}
+        if published or len(found) > 1:
+            lines.append((found, published, style, {"color": colour, "label": label}))
+    if max(len(found) for found, published, *_ in lines if published) < 2:
         raise InputError("accuracy against views: the run has fewer than two numbers of target views")
-    if len(lines["verified solver"][0]) < 2:
-        del lines["verified solver"]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
     for axis, name, title in zip(axes, ("acc30", "acc15"), ACCURACIES, strict=True):
-        for (label, (found, printed)), colour in zip(lines.items(), (BLUE, GREEN, VERMILLION)):
-            numbers = list(found)
-            low, high = zip(*(found[n][f"{name}_ci"] for n in numbers), strict=True) if numbers else ((), ())
-            axis.fill_between(numbers, low, high, color=colour, alpha=0.18, lw=0)
-            style = {"full": "o-", "best view": "s-", None: "D--"}[printed]
-            axis.plot(numbers, [found[n][name] for n in numbers], style, color=colour, label=label)
-            if printed is None:
-                continue
-            column = 2 + VIEWS_FIGURES.index(f"{printed}: {title}")  # after the names of the rows
-            values = [TARGETS[str(n)][column] for n in _VIEWS]
-            axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=f"{label}, published on CO3D")
+        for found, published, style, look in lines:
+            ends = np.array([one[f"{name}_ci"] for one in found.values()]).reshape(-1, 2)
+            axis.fill_between(list(found), *ends.T, color=look["color"], alpha=0.18, lw=0)
+            axis.plot(list(found), [one[name] for one in found.values()], style, **look)
+            if published:
+                column = 2 + VIEWS_FIGURES.index(f"{published}: {title}")  # after the names of the rows
+                values, label = [TARGETS[str(n)][column] for n in _VIEWS], f"{look['label']}, published on CO3D"
+                axis.plot(_VIEWS, values, ":", marker="s", ms=3, color="0.55", label=label)
         axis.set(xlabel="target views N", ylabel=title, xticks=_VIEWS, ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
@@ -109,7 +109,7 @@ def reliability_diagram(results: Results) -> Figure:
     right = np.array([errors[key] < RIGHT for key in stated])
     found = reliability(confidence, right, min(10, len(right) // 5))
     figure, (above, below) = plt.subplots(
-        2, 1, figsize=(5, 5.6), layout="constrained", sharex=True, gridspec_kw={"height_ratios": [3, 1]}
+        2, 1, figsize=(5, 5.6), layout="constrained", sharex=True, height_ratios=[3, 1]
     )
     spread = np.sqrt(found.accuracy * (1 - found.accuracy) / found.count)
     above.plot([0, 1], [0, 1], ":", color="0.5", label="calibrated")
@@ -121,8 +121,8 @@ def reliability_diagram(results: Results) -> Figure:
         fontsize=10,
     )
     above.legend(fontsize=8, loc="upper left")
-    below.hist([confidence[right], confidence[~right]], bins=np.linspace(0, 1, 21), stacked=True,
-               color=[BLUE, ORANGE], label=["correct", "wrong"])  # fmt: skip
+    look = {"color": [BLUE, ORANGE], "label": ["correct", "wrong"]}
+    below.hist([confidence[right], confidence[~right]], bins=np.linspace(0, 1, 21), stacked=True, **look)
     for patch in below.containers[1].patches:
         patch.set_hatch("///")
     below.set(xlim=(-0.02, 1.02), xlabel="confidence", ylabel="pairs")

@@ -90,9 +90,8 @@ def environment() -> dict[str, Any]:
 def _git_commit() -> str | None:
     """The commit of the library's checkout; None for an installed copy."""
     git = ["git", "-C", str(_PACKAGE)]
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         # An installed copy may lie inside the repository of another project, whose commit says nothing.
         subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], check=True, capture_output=True)
         return subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
+    return None

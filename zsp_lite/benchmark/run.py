@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.execution import (
-    CHUNK_SIZE,
-    MOST_WORKERS,
-    Setup,
-    available_cores,
-    evaluate_chunks,
-    make_chunks,
-    open_workers,
-)
+from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
@@ -93,13 +85,13 @@ def evaluate(
     settings |= {"methods": {name: _identity(row, extractors) for name, row in rows.items()}}
     settings |= {"labels": _labels(root, work)}
     if threads is not None:
-        check_integer("threads", threads, 1, MOST_WORKERS)
+        check_integer("threads", threads, 1, execution.MOST_WORKERS)
     if cache is not None:
         cache = make_folder(cache, "cache folder").resolve()  # before anything is written
-    with open_run(out, settings, allow_other_version), open_workers(executor, workers) as opened:
-        threads = threads or max(1, available_cores() // opened.number)
+    with open_run(out, settings, allow_other_version), execution.open_workers(executor, workers) as opened:
+        threads = threads or max(1, execution.available_cores() // opened.number)
         folder, sent = str(Path(root).resolve()), backbone if named else loaded
-        setup = Setup(folder, rows, sent, settings["backbone"], cache, threads, keep_hypotheses)
+        setup = execution.Setup(folder, rows, sent, settings["backbone"], cache, threads, keep_hypotheses)
         known = read_records(out).rows
         todo = rows_of_pairs(
             {name: [pair for pair in found if pair.key not in known.get(name, ())] for name, found in row_pairs.items()}
@@ -118,9 +110,9 @@ def evaluate(
                 progress(done, total)
 
         start = time.perf_counter()
-        size = max(1, min(CHUNK_SIZE, left // (4 * opened.number)))
-        chunks = [chunk for found in todo.values() for chunk in make_chunks(found, size)]
-        evaluate_chunks(setup, chunks, opened, save, extractors)
+        size = max(1, min(execution.CHUNK_SIZE, left // (4 * opened.number)))
+        chunks = [chunk for found in todo.values() for chunk in execution.make_chunks(found, size)]
+        execution.evaluate_chunks(setup, chunks, opened, save, extractors)
         add_lines(out, [{"seconds": round(time.perf_counter() - start, 2)}])
         summary = results_of(settings, read_records(out)).summary
         write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())

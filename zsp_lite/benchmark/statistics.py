@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import accuracy, median, weighted_mean
 
+Draws = Float[np.ndarray, "resamples n"]
 RESAMPLES = 2000
 _FEWEST_OBJECTS = 3
 
@@ -22,7 +23,7 @@ def object_draws(
     categories: Sequence[str] | np.ndarray | None = None,
     resamples: int = RESAMPLES,
     seed: int = 0,
-) -> Float[np.ndarray, "resamples n"]:
+) -> Draws:
     """Draw bootstrap weights of pairs by resampling the objects that the pairs are made of.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
@@ -61,16 +62,13 @@ def object_draws(
     return weights
 
 
-def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Float[np.ndarray, "resamples n"]:
+def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Draws:
     """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
     return _multiplicities(n, resamples, np.random.default_rng(seed)).astype(np.float64)
 
 
 def bootstrap_ci(
-    errors: ArrayLike,
-    statistic: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    weights: Float[np.ndarray, "resamples n"] | None = None,
-    level: float = 0.95,
+    errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None, level: float = 0.95
 ) -> tuple[float, float]:
     """Compute the percentile bootstrap interval of a statistic.
 
@@ -88,7 +86,7 @@ def bootstrap_ci(
     return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights), level)
 
 
-def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | None = None) -> dict:
+def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see `bootstrap_ci`).
 
     "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back.
@@ -107,7 +105,7 @@ def summarise(errors: ArrayLike, weights: Float[np.ndarray, "resamples n"] | Non
 
 
 def mean_category_median(
-    errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Float[np.ndarray, "resamples n"]
+    errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Draws
 ) -> tuple[float, tuple[float, float]]:
     """Compute the mean of the categories' medians, the paper's average of medians, with its 95 % interval."""
     errors, categories = np.asarray(errors, np.float64), np.asarray(categories, dtype=str)
@@ -117,10 +115,7 @@ def mean_category_median(
 
 
 def paired_difference(
-    first: ArrayLike,
-    second: ArrayLike,
-    threshold: float = 30.0,
-    weights: Float[np.ndarray, "resamples n"] | None = None,
+    first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None
 ) -> dict:
     """Measure by how much the second method is better than the first on the same pairs (see `paired_test`)."""
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
@@ -139,11 +134,7 @@ def paired_difference(
 
 
 def paired_test(
-    first: ArrayLike,
-    second: ArrayLike,
-    threshold: float = 30.0,
-    weights: Float[np.ndarray, "resamples n"] | None = None,
-    seed: int = 0,
+    first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None, seed: int = 0
 ) -> dict:
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
@@ -169,14 +160,9 @@ def paired_test(
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
     p = 1.0  # of one pair: both signs give the same absolute difference, and scipy refuses one pair
     if len(first) > 1:
-        p = permutation_test(
-            (first - second,), np.mean, permutation_type="samples", n_resamples=10_000, batch=500, vectorized=True,
-            rng=seed,
-        ).pvalue  # fmt: skip
-    return result | {
-        "sign_test_p": sign_test(first < threshold, second < threshold),
-        "permutation_test_p": float(p),
-    }
+        how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
+        p = permutation_test((first - second,), np.mean, rng=seed, **how).pvalue
+    return result | {"sign_test_p": sign_test(first < threshold, second < threshold), "permutation_test_p": float(p)}
 
 
 def sign_test(first: ArrayLike, second: ArrayLike) -> float:

@@ -4,26 +4,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from zsp_lite.benchmark.statistics import (
-    bootstrap_ci,
-    mean_category_median,
-    object_draws,
-    paired_difference,
-    sign_test,
-    summarise,
-)
+from zsp_lite.benchmark import statistics
+from zsp_lite.benchmark.statistics import Draws, object_draws
 from zsp_lite.metrics import accuracy
 
+Rows = Mapping[str, Mapping[str, Mapping[str, Any]]]  # by row and pair key, what the row found
 _TIMED = {"backbone": "features_per_frame", "reading": "reading_each", "similarity": "similarity_each"}
 
 
 def summarise_run(
-    rows: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    evaluations: Mapping[str, Sequence[Mapping[str, Any]]],
-    data: Mapping[str, Any],
-    backbone: str,
+    rows: Rows, evaluations: Mapping[str, Sequence[Mapping[str, Any]]], data: Mapping[str, Any], backbone: str
 ) -> dict[str, Any]:
     """Summarise rows and evaluations (see `records.Records`): the content of summary.json.
 
@@ -39,13 +30,11 @@ def summarise_run(
         seconds = [one for found in used.values() for once in found for one in once["timings"].get(stage, ())]
         if seconds:
             timings[name] = float(np.median(seconds))
-    return {
-        "data": dict(data), "backbone": backbone, **summarise_rows(rows), "saliency_iou": _saliency_iou(used),
-        "timings": timings,
-    }  # fmt: skip
+    summary = {"data": dict(data), "backbone": backbone, **summarise_rows(rows)}
+    return summary | {"saliency_iou": _saliency_iou(used), "timings": timings}
 
 
-def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def summarise_rows(rows: Rows) -> dict[str, Any]:
     """Summarise what rows found, by row and pair key.
 
     "methods" has by row, over all pairs and "per_category", the figures of `statistics.summarise`, the paper's
@@ -61,14 +50,14 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
         objects = tuple(map(objects_of, row))
         drawn = draws[objects] = draws[objects] if objects in draws else draws_of_pairs(row)
         categories = np.array([category_of(key) for key in row])
-        average, interval = mean_category_median(errors[name], categories, drawn)
-        methods[name] = summarise(errors[name], drawn) | {
+        average, interval = statistics.mean_category_median(errors[name], categories, drawn)
+        methods[name] = statistics.summarise(errors[name], drawn) | {
             "mean_category_median": average,
             "mean_category_median_ci": list(interval),
             "failed": sum("failed" in one for one in row.values()),
             "flagged": sum(one.get("note", "") != "" for one in row.values()),
             "per_category": {
-                category: summarise(errors[name][members], drawn[:, members])
+                category: statistics.summarise(errors[name][members], drawn[:, members])
                 for category in dict.fromkeys(categories.tolist())
                 for members in [categories == category]
             },
@@ -79,15 +68,15 @@ def summarise_rows(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
     if "ours" in rows:
         problems, drawn = list(map(_problem, rows["ours"])), draws[tuple(map(objects_of, rows["ours"]))]
         summary["against_ours"] = {
-            name: paired_difference(found, errors["ours"], weights=drawn)
-            | {"sign_test_p": sign_test(found < 30, errors["ours"] < 30)}
+            name: statistics.paired_difference(found, errors["ours"], weights=drawn)
+            | {"sign_test_p": statistics.sign_test(found < 30, errors["ours"] < 30)}
             for name, found in errors.items()
             if name != "ours" and list(map(_problem, rows[name])) == problems
         }
     return summary
 
 
-def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Float[np.ndarray, "resamples n"]) -> dict[str, Any]:
+def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Draws) -> dict[str, Any]:
     """Compute how often the estimate or its first alternative is right. These figures are not comparable with Acc30.
 
     "one_of_two" is the number of estimates for which the solver cannot decide between the two; the figures whose names
@@ -98,7 +87,7 @@ def best_two_figures(row: Mapping[str, Mapping[str, Any]], drawn: Float[np.ndarr
     flagged = np.array([one.get("one_of_two", False) for one in row.values()], dtype=bool)
     return {
         "acc30": float(accuracy(either, 30)),
-        "acc30_ci": list(bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), drawn)),
+        "acc30_ci": list(statistics.bootstrap_ci(either, lambda errors, weights: accuracy(errors, 30, weights), drawn)),
         "one_of_two": int(flagged.sum()),
         "one_of_two_acc30": float(accuracy(either[flagged], 30)) if flagged.any() else None,
         "one_of_two_first_acc30": float(accuracy(first[flagged], 30)) if flagged.any() else None,  # of the estimate
@@ -116,7 +105,7 @@ def objects_of(key: str) -> tuple[str, str]:
     return f"{category}/{reference.rpartition(':')[0]}", f"{category}/{target.rpartition(':')[0]}"
 
 
-def draws_of_pairs(keys: Iterable[str]) -> Float[np.ndarray, "resamples n"]:
+def draws_of_pairs(keys: Iterable[str]) -> Draws:
     """Draw bootstrap weights of the pairs with these keys, from resampled objects."""
     keys = list(keys)
     return object_draws([objects_of(key) for key in keys], [category_of(key) for key in keys])

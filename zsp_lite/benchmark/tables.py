@@ -111,16 +111,14 @@ def _paper_table(spec: PaperTable, summary: Mapping[str, Any]) -> Table:
 
 def all_rows(summary: Mapping[str, Any]) -> Table:
     """Return every row of the run: its figures, flagged and failed estimates, and its difference to "ours"."""
-    columns = (
-        "pairs", *FIGURES, "above 150° (%)", "flagged", "failed", "ours - row (%)", "p", "p, sign test",
-    )  # fmt: skip
+    columns = ["pairs", *FIGURES, "above 150° (%)", "flagged", "failed", "ours - row (%)", "p", "p, sign test"]
     rows = {}
     for name, row in summary["methods"].items():
         cells: list[Cell | None] = [Cell(row["n"], decimals=0), *(_cell(row, figure) for figure in FIGURES)]
         cells += [Cell(row["above150"]), *(Cell(row[count], decimals=0) for count in ("flagged", "failed"))]
         if test := summary.get("against_ours", {}).get(name):
-            cells += [Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), PValue(test["accuracy_gain_p"]),
-                      PValue(test["sign_test_p"])]  # fmt: skip
+            cells += [Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])]
+            cells += [PValue(test["accuracy_gain_p"]), PValue(test["sign_test_p"])]
         rows[name] = cells + [None] * (len(columns) - len(cells))
     note = (
         "Med. err.: mean of the categories' medians. flagged: estimates with a warning of the method, included "
@@ -132,18 +130,15 @@ def all_rows(summary: Mapping[str, Any]) -> Table:
 
 def best_two_tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return the table "one of two", of the rows whose estimates have alternatives; none without such rows."""
-    columns = (
-        "pairs", "one of the two best right (%)", 'flagged "one of two"', "of these, one right (%)",
-        "of these, the first right (%)",
-    )  # fmt: skip
+    columns = ["pairs", "one of the two best right (%)", 'flagged "one of two"']
+    columns += ["of these, one right (%)", "of these, the first right (%)"]
     rows = {}
     for name, row in summary["methods"].items():
         if (found := row.get("best_two")) is not None:
             shares = [found["one_of_two_acc30"], found["one_of_two_first_acc30"]]
-            rows[name] = [
-                Cell(row["n"], decimals=0), Cell(found["acc30"], *found["acc30_ci"]),
-                Cell(found["one_of_two"], decimals=0), *(None if share is None else Cell(share) for share in shares),
-            ]  # fmt: skip
+            rows[name] = [Cell(row["n"], decimals=0), Cell(found["acc30"], *found["acc30_ci"])]
+            rows[name] += [Cell(found["one_of_two"], decimals=0)]
+            rows[name] += [None if share is None else Cell(share) for share in shares]
     note = (
         "Right: a rotation error below 30°. The two best: the estimate and its first alternative, of every pair. Two "
         "answers are right more often than one: these values are not comparable with Acc30."
@@ -159,8 +154,10 @@ def category_tables(summary: Mapping[str, Any]) -> list[Table]:
     columns = [("", category) for category in (*categories, "all")]
     tables = []
     for figure, name in _NAMES.items():
-        rows = {label: [*(_cell(row["per_category"].get(c), figure) for c in categories), _cell(row, figure)]
-                for label, row in methods.items()}  # fmt: skip
+        rows = {
+            label: [*(_cell(row["per_category"].get(c), figure) for c in categories), _cell(row, figure)]
+            for label, row in methods.items()
+        }
         tables.append(make_table(f"categories_{name}", f"By category: {figure}", columns, rows, NOTE))
     return tables
 
