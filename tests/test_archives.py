@@ -96,7 +96,6 @@ def write_catalogue(server) -> None:
         "co3d-v1": {"url": "http://nowhere.invalid", "full": {"toaster": [digest["/toaster.zip"]]}},
     }
     server.catalogue.write_text(json.dumps(lists))
-    archives._catalogue.cache_clear()
 
 
 def download(root, *options, dataset="co3d", yes=True) -> int:

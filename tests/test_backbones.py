@@ -280,15 +280,6 @@ def server(monkeypatch):
     server.close()
 
 
-def test_a_file_is_fetched_checked_and_not_fetched_twice(server, tmp_path):
-    path = tmp_path / "folder" / "file"
-    for _ in range(2):
-        assert fetch(f"{server.url}/file", path, 10_000, server.md5) == path
-    assert path.read_bytes() == server.content
-    assert server.ranges == [None]
-    assert [p.name for p in path.parent.iterdir()] == ["file"]
-
-
 @pytest.mark.parametrize("size", [10_000, None])
 @pytest.mark.parametrize("received", [2_000, 10_000])
 @pytest.mark.parametrize("knows_ranges", [True, False])
@@ -321,9 +312,7 @@ def release(monkeypatch, name, content, **changes):
     monkeypatch.setitem(pretrained.PRETRAINED, name, PretrainedWeights(**(known | changes)))
 
 
-def test_dino_models_come_from_the_server_and_are_never_replaced_unnoticed(
-    server, vit, pictures, tmp_path, cache, monkeypatch
-):
+def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache, monkeypatch):
     torch.save(vit.state_dict(), tmp_path / "made.pth")
     content = (tmp_path / "made.pth").read_bytes()
     server.files["/dino/some/vit.pth"] = content
@@ -335,19 +324,13 @@ def test_dino_models_come_from_the_server_and_are_never_replaced_unnoticed(
     assert loaded.name == "dino_vits8" and available_backbones()["dino_vits8"] == cache / "vit.pth"
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
     verify("dino_vits8")
-    assert (cache / "vit.pth.sha256").read_text() == f"{hashlib.sha256(content).hexdigest()}  vit.pth\n"
-    torch.save(small_vit(seed=5).state_dict(), cache / "vit.pth")  # loads as well
-    release(monkeypatch, "dino_vits8", content, md5_prefix="", size=None)
-    with pytest.raises(InputError, match="vit.pth has changed since its first use: its SHA-256 is .*, expected"):
-        load_backbone("dino_vits8", "cpu")
 
 
-def test_a_file_that_is_not_the_released_one_is_refused_and_not_pinned(vit, cache):
+def test_a_file_that_is_not_the_released_one_is_refused(vit, cache):
     cache.mkdir()
     torch.save(vit.state_dict(), cache / "dino_deitsmall16_pretrain.pth")
     with pytest.raises(InputError, match="dino_vits16: .*not the released file.*weights fetch dino_vits16"):
         load_backbone("dino_vits16", "cpu")
-    assert [path.name for path in cache.iterdir()] == ["dino_deitsmall16_pretrain.pth"]
 
 
 def test_weights_that_overflow_do_not_verify(tmp_path):

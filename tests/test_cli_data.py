@@ -117,7 +117,7 @@ def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
     [
         (["data"], "Missing command"),
         (["data", "check", "/nowhere"], "does not exist"),
-        (["data", "labels", "/nowhere", "--root", "."], "cannot be read"),
+        (["data", "labels", "/nowhere", "--root", "."], "holds no class_labels"),
         (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
         (["data", "import", "lists", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
         (["data", "import", "nerfstudio", "x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit=2"],

@@ -16,12 +16,9 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, relative_pose
-from zsp_lite.io.html import picture_html
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import View, turn_view
-
-SEQUENCE_FRAMES = 6  # frames of the target sequence that the pose of a pair is shown in
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +128,6 @@ class PoseEstimate:
         ]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return picture_html(repr(self), self.reference_view.frame.rgb, self.target_views[self.view].frame.rgb)
-
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6)."""
         best = self.target_camera
@@ -154,7 +148,6 @@ class PairResult:
     targets: tuple[Frame, ...]  # target frames, whole
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
     errors: dict[str, float]  # rotation error of each estimate in degrees; empty without pose labels
-    sequence: tuple[Frame, ...]  # some whole frames of the target sequence, for displaying the propagated pose
     pair: Pair | None = None  # the evaluation pair, or None
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")

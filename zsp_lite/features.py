@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.errors import FatalError, InputError, check_integer
-from zsp_lite.io.html import picture_html
 
 Grid = tuple[int, int]  # (rows, columns) of patches
 # A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
@@ -57,9 +56,6 @@ class FeatureMap:
             f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, keys of {channels} "
             f"channels, global feature of {len(self.global_feature)}, {self.keys.device})"
         )
-
-    def _repr_html_(self) -> str:
-        return picture_html(repr(self), self.saliency.float().cpu().numpy())
 
     @property
     def grid(self) -> Grid:

@@ -1,7 +1,6 @@
 """Loading of backbones: by name, from a checkpoint file, or from a model in Hugging Face's format."""
 
 import os
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone
 from zsp_lite.backbones.checkpoints import build_vit, metadata_integers, read_checkpoint
 from zsp_lite.backbones.facets import Facet
 from zsp_lite.backbones.huggingface import IMAGE_SIZE, PREFIX, load_huggingface
-from zsp_lite.backbones.pretrained import DEFAULT, authentic, available_backbones, download, obtained_by
+from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, check_authentic, download, obtained_by
 from zsp_lite.errors import InputError
 
 
@@ -109,17 +108,17 @@ def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) 
     name, path = config.name, Path(config.name).expanduser()
     if name in available_backbones():
         path, label = download(name), name
+        check_authentic(name, path)
     elif os.path.isfile(path):  # False for a name that is too long, where Path.is_file raises
         label = path.stem
     else:
         raise InputError(
             f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}, nor {PREFIX}NAME"
         )
-    with authentic(name, path) if name in available_backbones() else nullcontext():
-        weights, metadata = read_checkpoint(path)
-        num_heads, key_block, saliency_heads = (
-            metadata_integers(metadata, key, path) for key in ("num_heads", "key_block", "saliency_heads")
-        )
-        model = build_vit(weights, num_heads[0] if num_heads else None, path)
+    weights, metadata = read_checkpoint(path)
+    num_heads, key_block, saliency_heads = (
+        metadata_integers(metadata, key, path) for key in ("num_heads", "key_block", "saliency_heads")
+    )
+    model = build_vit(weights, num_heads[0] if num_heads else None, path)
     layer = key_block[0] if config.layer is None and key_block else config.layer
     return Backbone(model, label, layer, saliency_heads, device, facet=config.facet, image_size=config.image_size)

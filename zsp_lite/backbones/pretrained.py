@@ -1,18 +1,16 @@
 """Backbones that have a name: the embedded one, and the DINO models released by Caron et al. (2021).
 
 The SHA-256 of the embedded weights is in weights/SHA256SUMS. Of the released models only the first digits of an MD5
-digest were published, which can be forged: their SHA-256 is also compared with that of the first use (see
-`download.pinned`).
+digest were published.
 """
 
 import os
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from zsp_lite.backbones.huggingface import PREFIX, model_folder
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash, pinned
+from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.io.files import read_bytes, sha256
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
@@ -78,21 +76,16 @@ def download(name: str) -> Path:
         ) from error
 
 
-def authentic(name: str, path: Path) -> AbstractContextManager:
-    """Check the file of a backbone of this name; InputError if it is not the embedded or released one.
-
-    The context that is returned loads the file: a released file that loads is known from then on by its SHA-256.
-    """
+def check_authentic(name: str, path: Path) -> None:
+    """Raise InputError if the file of a backbone of this name is not the embedded or released one."""
     if name == DEFAULT:
-        check_shipped(path)
-        return nullcontext()
+        return check_shipped(path)
     weights = PRETRAINED[name]
     if not has_size_and_hash(path, weights.size, weights.md5_prefix):
         raise InputError(
             f"{name}: {path} is not the released file, expected {weights.size or 'any number of'} bytes with MD5 "
             f"{weights.md5_prefix}...; remove it, then run zsp-lite weights fetch {name}"
         )
-    return pinned(path)
 
 
 def check_shipped(path: Path) -> None:

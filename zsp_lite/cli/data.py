@@ -34,12 +34,9 @@ def check(root, deep, partial) -> int:
 
     The exit code is 1 if there is any problem.
     """
-    from tqdm import tqdm
-
     from zsp_lite.data.check import check_folder
 
-    checks = check_folder(root, deep, lambda names: tqdm(names, "checking", disable=None), partial=partial)
-    return print_checks(root, checks, deep)
+    return print_checks(root, check_folder(root, deep, partial=partial), deep)
 
 
 def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> int:
@@ -81,7 +78,7 @@ def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> i
 def labels(source, root, replace) -> None:
     """Import the published pose labels and evaluation pairs into a data folder.
 
-    SOURCE is a local clone of the published repository, or an archive of it.
+    SOURCE is a local clone of the published repository.
     """
     from zsp_lite.data.published import import_labels
     from zsp_lite.data.transfer import labelled_v2_categories

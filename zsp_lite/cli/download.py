@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import click
@@ -37,8 +36,6 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     command. With --labelled-only, sequences are read out of the archive on the server. The environment variables
     ZSP_LITE_CO3D_URL and ZSP_LITE_CO3D_V1_URL give the address of a mirror.
     """
-    from tqdm import tqdm
-
     from zsp_lite.data import archives as co3d
     from zsp_lite.data.check import check_folder
     from zsp_lite.data.published import import_labels, published_sequences
@@ -49,7 +46,6 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     if labelled_only and not labels:
         raise InputError("--labelled-only goes with --labels")
 
-    unpacking, checking = (partial(tqdm, desc=text, disable=None) for text in ("unpacking", "checking"))
     root = root or Path(dataset)
     categories = tuple(dict.fromkeys(categories))
     archives = [one for name in categories for one in co3d.list_archives(dataset, name, single_sequence, chunks)]
@@ -72,14 +68,14 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
         return 1
     elif labelled_only:
         for archive in missing:
-            co3d.download_sequences(root, archive, wanted[archive], unpacking)
+            co3d.download_sequences(root, archive, wanted[archive])
     else:
-        co3d.download_archives(root, archives, unpacking)
+        co3d.download_archives(root, archives)
     if labels:
         counts = import_labels(labels, root, categories=categories)
         print(f"Imported: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
     some = chunks is not None or labelled_only
-    return print_checks(root, check_folder(root, False, checking, categories, partial=some), deep=False)
+    return print_checks(root, check_folder(root, categories=categories, partial=some), deep=False)
 
 
 def _confirmed(names: Sequence[str], sizes: Sequence[int | None], needed: int, root: Path, yes: bool) -> bool:

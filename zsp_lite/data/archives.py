@@ -5,18 +5,18 @@ is one archive. The names and SHA-256 digests stand in `co3d_archives.json`. Sin
 archive without downloading the rest of it.
 """
 
-import functools
 import io
 import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from tqdm import tqdm
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import RemoteFile, fetch, remote_size
@@ -27,7 +27,8 @@ CATALOGUE = Path(__file__).with_name("co3d_archives.json")
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
 _PART = 1 << 22  # bytes of a request for a part of an archive
-_WORK = ".download"  # in the data folder: archives in progress, and the list of what is unpacked
+_WORK = ".download"  # in the data folder: archives in progress
+_RECORD = f"{_WORK}/unpacked.json"  # what is unpacked, by category
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,6 @@ class Archive:
     name: str
     url: str
     sha256: str
-    has_annotations: bool
 
 
 class _Unpacked(msgspec.Struct):
@@ -55,7 +55,7 @@ def list_archives(
 ) -> list[Archive]:
     """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the annotations."""
     subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
-    catalogue, origin = _catalogue(CATALOGUE)[dataset], f"{dataset} ({subset})"
+    catalogue, origin = msgspec.json.decode(CATALOGUE.read_bytes())[dataset], f"{dataset} ({subset})"
     digests = catalogue.get(subset, {})
     if category not in digests:
         raise InputError(
@@ -65,7 +65,7 @@ def list_archives(
     archives = []
     for number, sha256 in enumerate(digests[category][:chunks]):
         name = f"{category}_{number:03d}{suffix}.zip" if dataset == "co3d" else f"{category}.zip"
-        archives.append(Archive(category, origin, name, f"{base}/{name}", sha256, number == 0))
+        archives.append(Archive(category, origin, name, f"{base}/{name}", sha256))
     return archives
 
 
@@ -84,10 +84,8 @@ def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
 
 def missing_sequences(root: Path, archive: Archive, sequences: Iterable[str]) -> list[str]:
     """Return the sequences of an archive that are not unpacked in a data folder yet."""
-    if not missing_archives(root, [archive]):
-        return []
-    found = _read_record(root).get(archive.category)
-    return sorted(set(sequences) - set(found.sequences if found else ()))
+    found = _read_record(root).get(archive.category, _Unpacked(archive.origin))
+    return sorted(set(sequences) - set(found.sequences)) if missing_archives(root, [archive]) else []
 
 
 def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
@@ -97,10 +95,9 @@ def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
 
 
 def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
-    """Return the number of bytes that missing archives need on the disk; InputError if it has less.
+    """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less.
 
-    These are the unpacked archives, which are about as large as the archives, and, if `whole` archives are downloaded,
-    one archive, as each is removed once it is unpacked. Unknown sizes are None.
+    Unpacked archives are about as large as the archives. If `whole` archives are downloaded, one of them is there, too.
     """
     known = [size for size in sizes if size is not None]
     needed = sum(known) + (max(known, default=0) if whole else 0)
@@ -116,28 +113,24 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
     return max(0, needed)
 
 
-def download_archives(root: Path, archives: Sequence[Archive], progress: Callable[..., Iterable] | None = None) -> None:
+def download_archives(root: Path, archives: Sequence[Archive]) -> None:
     """Download archives, verify their SHA-256 and unpack them into a data folder.
 
     An interrupted download is continued by the next call. The annotations of a category are unpacked last, so that the
-    category is read only if it is complete. `progress` wraps the list of an archive's files, such as `tqdm`.
+    category is read only if it is complete.
     """
     with writing(root / _WORK):
-        missing = missing_archives(root, archives)
-        # The archive with the annotations comes last.
-        for archive in sorted(missing, key=lambda one: (one.category, one.has_annotations, one.name)):
+        for archive in reversed(missing_archives(root, archives)):  # the first, with the annotations, comes last
             path = root / _WORK / archive.name
             if not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
             with _recorded(root, archive) as category, _zip(io.FileIO(path), str(path)) as zipped:
-                unpack(zipped, root, _members(zipped, archive.category), progress)
+                _unpack(zipped, root, _members(zipped, archive.category))
                 category.archives.append(archive.name)
             path.unlink()
 
 
-def download_sequences(
-    root: Path, archive: Archive, sequences: Collection[str], progress: Callable[..., Iterable] | None = None
-) -> None:
+def download_sequences(root: Path, archive: Archive, sequences: Collection[str]) -> None:
     """Read sequences and the annotations out of an archive on the server, without downloading the rest of it.
 
     Each file is verified by the CRC-32 in the archive. The SHA-256 is that of the whole archive and cannot be verified.
@@ -145,37 +138,33 @@ def download_sequences(
     with writing(root / _WORK):
         if missing := missing_sequences(root, archive, sequences):
             with _recorded(root, archive) as category, _zip(RemoteFile(archive.url), archive.url) as zipped:
-                unpack(zipped, root, _members(zipped, archive.category, missing), progress)
+                _unpack(zipped, root, _members(zipped, archive.category, missing))
                 category.sequences += missing
 
 
-def unpack(
-    zipped: zipfile.ZipFile,
-    root: Path,
-    members: Sequence[zipfile.ZipInfo],
-    progress: Callable[..., Iterable] | None = None,
-) -> None:
+def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     """Unpack members of a zip archive, annotations last; no path leads out of the folder, and no link is made.
 
     All paths are checked before the first file is written. A file that exists with the same size is not written again,
     except the annotations.
     """
     targets = {member: path_inside(root, member.filename) for member in members}
-    wanted = [one for one in members if _is_annotation(one) or not _is_there(one, targets[one])]
+    sizes = {member: path.stat().st_size for member, path in targets.items() if path.is_file()}
+    wanted = [one for one in members if _is_annotation(one) or sizes.get(one) != one.file_size]
     wanted.sort(key=lambda one: (_is_annotation(one), one.header_offset))
-    for member in progress(wanted) if progress else wanted:
+    for member in tqdm(wanted, "unpacking", disable=None):
         _write_member(zipped, member, targets[member])
 
 
 def _members(zipped: zipfile.ZipFile, category: str, sequences: Collection[str] | None = None) -> list[zipfile.ZipInfo]:
     """List the files of a category, or its annotations and the files of some sequences."""
     members = [one for one in zipped.infolist() if one.filename.startswith(f"{category}/") and not one.is_dir()]
-    if sequences is None:
-        return members
-    sequence_of = {one: one.filename.split("/")[1] for one in members if not _is_annotation(one)}
-    if absent := sorted(set(sequences) - set(sequence_of.values())):
-        raise InputError(f"archive of {category} has no sequence {absent[0]!r}, expected all that are labelled")
-    return [one for one in members if _is_annotation(one) or sequence_of[one] in sequences]
+    if sequences is not None:
+        folder_of = {one: one.filename.split("/")[1] for one in members}
+        if absent := sorted(set(sequences) - set(folder_of.values())):
+            raise InputError(f"archive of {category} has no sequence {absent[0]!r}, expected all that are labelled")
+        members = [one for one in members if _is_annotation(one) or folder_of[one] in sequences]
+    return members
 
 
 @contextmanager
@@ -183,9 +172,9 @@ def _recorded(root: Path, archive: Archive) -> Iterator[_Unpacked]:
     """Record that the category is from this archive, and at the end what was unpacked of it."""
     record = _read_record(root)
     category = record.setdefault(archive.category, _Unpacked(archive.origin))
-    _write_record(root, record)
+    write_atomic(root / _RECORD, msgspec.json.encode(record))
     yield category
-    _write_record(root, record)
+    write_atomic(root / _RECORD, msgspec.json.encode(record))
 
 
 @contextmanager
@@ -202,10 +191,6 @@ def _is_annotation(member: zipfile.ZipInfo) -> bool:
     return member.filename.count("/") == 1
 
 
-def _is_there(member: zipfile.ZipInfo, target: Path) -> bool:
-    return target.is_file() and target.stat().st_size == member.file_size
-
-
 def _write_member(zipped: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(target.name + ".part")  # renamed when complete, so that sizes tell what is there
@@ -218,14 +203,5 @@ def _write_member(zipped: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path
 
 
 def _read_record(root: Path) -> dict[str, _Unpacked]:
-    path = root / _WORK / "unpacked.json"
+    path = root / _RECORD
     return read_json(path, dict[str, _Unpacked], "list") if path.is_file() else {}
-
-
-def _write_record(root: Path, record: dict[str, _Unpacked]) -> None:
-    write_atomic(root / _WORK / "unpacked.json", msgspec.json.encode(record))
-
-
-@functools.cache
-def _catalogue(path: Path) -> dict:
-    return msgspec.json.decode(path.read_bytes())

@@ -28,32 +28,18 @@ _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
 _MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
-
-_STEEP = 0.4  # sine of the angle to the vertical of a camera that is above or below the object
-_NEAR = 45.0  # degrees: within it, two views show about the same side
+_STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera without distortion.
+    """Pinhole camera without distortion; InputError for a value out of range, or an `R` that is no rotation."""
 
-    Attributes:
-        R: (3, 3) rotation, world to camera. A matrix within 1e-3 of a rotation is replaced by the nearest rotation.
-        t: (3,) translation, world to camera, in units of the world.
-        focal_length: (2,) focal lengths along x and y, pixels.
-        principal_point: (2,) principal point (x, y), pixels.
-        size: Image (height, width), pixels.
-
-    Raises:
-        InputError: A value is not finite, above 1e9 or of another shape, `R` is not a rotation, a focal length is
-            below 1e-3, or the size is not positive.
-    """
-
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, "3"]
-    focal_length: Float[np.ndarray, "2"]
-    principal_point: Float[np.ndarray, "2"]
-    size: tuple[int, int]
+    R: Float[np.ndarray, "3 3"]  # (3, 3) rotation, world to camera; the nearest rotation of what is given
+    t: Float[np.ndarray, "3"]  # (3,) translation, world to camera, in units of the world
+    focal_length: Float[np.ndarray, "2"]  # (2,) along x and y, pixels
+    principal_point: Float[np.ndarray, "2"]  # (2,) as (x, y), pixels
+    size: tuple[int, int]  # image (height, width), pixels
 
     def __post_init__(self):
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal_length", (2,)), ("principal_point", (2,))):
@@ -75,34 +61,24 @@ class Camera:
         object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
 
     def __repr__(self) -> str:
-        rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
-        first, second, third, translation = rows
-        return (
-            f"Camera(size={self.size}, focal_length={self.focal_length.round(2)}, "
-            f"principal_point={self.principal_point.round(2)},\n       t={translation},\n"
-            f"       R=[{first},\n          {second},\n          {third}])"
-        )
+        names = ("focal_length", "principal_point", "t", "R")
+        values = (f"{name}={getattr(self, name).round(4).tolist()}" for name in names)
+        return f"Camera(size={self.size}, {', '.join(values)})"
 
     @classmethod
     def from_pytorch3d(
         cls,
-        R: Real[np.ndarray, "3 3"] | Sequence,
+        R: Real[np.ndarray, "3 3"] | Sequence,  # for row vectors: `X_cam = X_world @ R + T`, +x left, +y up
         T: Real[np.ndarray, "3"] | Sequence,
-        focal_length: Real[np.ndarray, "2"] | Sequence,
-        principal_point: Real[np.ndarray, "2"] | Sequence,
-        size: Sequence[int],
+        focal_length: Real[np.ndarray, "2"] | Sequence,  # along x and y, in units of the format
+        principal_point: Real[np.ndarray, "2"] | Sequence,  # in units of the format
+        size: Sequence[int],  # image (height, width), pixels
         intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
     ) -> "Camera":
         """Convert a PyTorch3D camera, such as a CO3D viewpoint.
 
-        Args:
-            R: (3, 3) rotation for row vectors, `X_cam = X_world @ R + T`, with +x left and +y up.
-            T: (3,) translation.
-            focal_length: (2,) focal lengths in the units of `intrinsics_format`.
-            principal_point: (2,) principal point in the units of `intrinsics_format`.
-            size: Image (height, width), pixels.
-            intrinsics_format: "ndc_norm_image_bounds" (each image side covers [-1, 1]) or "ndc_isotropic" (the
-                shorter side does).
+        In the format "ndc_norm_image_bounds", each side of the image covers [-1, 1]; in "ndc_isotropic", the shorter
+        side does.
         """
         R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)
@@ -194,10 +170,9 @@ class Camera:
         camera = self
         for _ in range(quarters % 4):
             x, y = camera.principal_point
-            camera = Camera(
-                _QUARTER_TURN @ camera.R, _QUARTER_TURN @ camera.t, camera.focal_length[::-1].copy(),
-                np.array([y, camera.size[1] - x]), camera.size[::-1],
-            )  # fmt: skip
+            centre = np.array([y, camera.size[1] - x])
+            R, t = _QUARTER_TURN @ camera.R, _QUARTER_TURN @ camera.t
+            camera = Camera(R, t, camera.focal_length[::-1], centre, camera.size[::-1])
         return camera
 
 
@@ -232,27 +207,19 @@ def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float
     return np.where(steep, np.nan, np.degrees(np.arctan2(y, x)))
 
 
-def view_gaps(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the angles between neighbouring cameras around a point in degrees; their sum is 360.
+def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
+    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0 for one camera.
 
     Cameras that look along the vertical do not count (see `azimuths`), unless fewer than two others are left: then the
-    cameras span the largest angle between any two of them.
+    span is the largest angle between any two cameras.
     """
     angles = azimuths(cameras, centre)
     angles = np.sort(angles[~np.isnan(angles)])
     if len(angles) > 1:
-        return np.diff(angles, append=angles[0] + 360)
-    directions = np.stack([camera.centre for camera in cameras]) - centre
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))
-    return np.array([span, 360 - span])
-
-
-def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the angle that cameras span around a point: 360 degrees minus the largest gap; 0 for one camera."""
-    return float(360 - view_gaps(cameras, centre).max())
-
-
-def view_coverage(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the share of all directions around a point that are within 45 degrees of a camera's, in [0.25, 1]."""
-    return float(np.minimum(view_gaps(cameras, centre), 2 * _NEAR).sum() / 360)
+        gaps = np.diff(angles, append=angles[0] + 360)
+    else:
+        directions = np.stack([camera.centre for camera in cameras]) - centre
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))
+        gaps = np.array([span, 360 - span])
+    return float(360 - gaps.max())

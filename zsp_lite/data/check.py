@@ -1,17 +1,19 @@
 """Check of a data folder: missing and broken files, sequences that can be evaluated, size on disk."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
 from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import frame_defect
 from zsp_lite.data.labels import check_one_reference, label_folder, read_label_files
-from zsp_lite.data.pairs import read_published_pairs
+from zsp_lite.data.pairs import pair_files, read_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 
@@ -47,30 +49,22 @@ class CategoryCheck:
 
 
 def check_folder(
-    root: str | Path,
-    deep: bool = False,
-    progress: Callable[[Iterable], Iterable] | None = None,
-    categories: Sequence[str] | None = None,
-    partial: bool = False,
+    root: str | Path, deep: bool = False, categories: Sequence[str] | None = None, partial: bool = False
 ) -> list[CategoryCheck]:
-    """Check the categories of a data folder.
+    """Check the categories of a data folder, sorted by name.
 
     Args:
         root: The data folder.
         deep: Also decode every image, mask, depth map and point cloud, which is slow on large folders. Otherwise only
             check that the files exist and are not empty.
-        progress: Wraps the list of categories to show a progress bar, such as `tqdm`.
         categories: Names of the categories to check; all by default.
         partial: An annotated sequence without any file is counted, and is not a problem.
-
-    Returns:
-        One result per category, sorted by name.
     """
     dataset = Co3D(root)
     chosen = sorted(set(dataset.categories() if categories is None else categories))
     if not chosen:
         raise InputError(f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz")
-    return [_check_category(dataset, category, deep, partial) for category in (progress or iter)(chosen)]
+    return [_check_category(dataset, name, deep, partial) for name in tqdm(chosen, "checking", disable=None)]
 
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
@@ -82,9 +76,8 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
     sequences = {one.sequence_name: one for one in annotations}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
     check.sequences, check.frames = len(names), len(keys)
-    check.problems += [
-        f"sequence {name} has no frames in the annotations" for name in sorted(set(sequences) - set(names))
-    ]
+    frameless = sorted(set(sequences) - set(names))
+    check.problems += [f"sequence {name} has no frames in the annotations" for name in frameless]
     layouts, usable = set(), set()
     for name in names:
         if partial and not (dataset.root / category / name).exists():
@@ -97,28 +90,21 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
                 layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
         if name not in sequences:
             check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
-        elif (cloud := sequences[name].point_cloud) is not None:
-            if _check_file(dataset, cloud.path, check) and deep:
-                check.attempt(dataset.point_cloud, category, name)
+        elif (cloud := sequences[name].point_cloud) and _check_file(dataset, cloud.path, check) and deep:
+            check.attempt(dataset.point_cloud, category, name)
         check.complete += len(check.problems) == before
         if complete_frames >= _MIN_FRAMES:
             usable.add(name)
     check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
-    _check_labels(dataset, check, set(names), usable)
-    return check
-
-
-def _check_labels(dataset: Co3D, check: CategoryCheck, annotated: set[str], usable: set[str]) -> None:
-    labels = check.attempt(read_label_files, dataset.root, check.category) or {}
+    labels = check.attempt(read_label_files, dataset.root, category) or {}
     check.labelled, check.usable = len(labels), len(set(labels) & usable)
-    folder = label_folder(dataset.root, check.category)
-    for name in sorted(set(labels) - annotated):
+    folder = label_folder(dataset.root, category)
+    for name in sorted(set(labels) - set(names)):
         check.problems.append(f"label {folder / name}.json is of a sequence that is not in the annotations")
     check.attempt(check_one_reference, labels, folder)
-    # No recursive pattern: the folder may hold millions of files.
-    for part in ("", "data/"):
-        for path in sorted(dataset.root.glob(f"{part}determ_eval/*/{check.category}.pt")):
-            check.pairs += check.attempt(read_published_pairs, path, dataset) is not None
+    for path in pair_files(dataset, category):
+        check.pairs += check.attempt(read_published_pairs, path, dataset) is not None
+    return check
 
 
 def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> bool:
@@ -128,13 +114,10 @@ def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: 
     are_there = [_check_file(dataset, path, check) for path in paths if path]
     if annotation.viewpoint is None or not all(are_there):
         return False
-    defect = ""
-    if not deep:
-        works = check.attempt(dataset.camera, annotation) is not None
-    elif works := (frame := check.attempt(dataset.load, annotation)) is not None:
-        defect = frame_defect(frame)
-        check.defects.update([defect] if defect else [])
-    return works and not defect and depth is not None and mask is not None
+    opened = check.attempt(dataset.load if deep else dataset.camera, annotation)
+    if defect := frame_defect(opened) if deep and opened is not None else "":
+        check.defects[defect] += 1
+    return opened is not None and not defect and depth is not None and mask is not None
 
 
 def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> bool:

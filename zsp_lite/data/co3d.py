@@ -135,8 +135,7 @@ class Co3D:
     def camera(self, annotation: FrameAnnotation) -> Camera:
         """Convert the viewpoint of a frame to a camera."""
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
-        view = annotation.viewpoint
-        if view is None:
+        if (view := annotation.viewpoint) is None:
             raise InputError(f"frame {name} has no viewpoint, expected a camera")
         try:
             return Camera.from_pytorch3d(
@@ -224,14 +223,8 @@ def write_co3d(
 
     Other sequences in the folder are kept; those of the same names are replaced. The annotations are updated
     atomically after each sequence, so the folder stays readable if the run is interrupted. Only one process can write
-    to a category at a time.
-
-    Args:
-        root: The data folder.
-        category: Name of the category.
-        sequences: The sequences.
-        quality: JPEG quality, 0 to 100.
-        intrinsics_format: "ndc_norm_image_bounds" (v1) or "ndc_isotropic" (v2).
+    to a category at a time. `quality` is that of JPEG, 0 to 100; the formats are "ndc_norm_image_bounds" (v1) and
+    "ndc_isotropic" (v2).
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
@@ -252,7 +245,7 @@ def write_co3d(
             keys = [keys[position] for position in kept]
             keys += [FrameKey(frame.sequence_name, frame.frame_number) for frame in annotations]
             listed = [item for item in listed if item[0] != sequence.name] + [(sequence.name, annotation)]
-            write_atomic(frames_path, compress(msgspec.json.encode(entries)))
+            write_atomic(frames_path, compress(msgspec.json.encode(entries, enc_hook=np.ndarray.tolist)))
             write_atomic(sequences_path, compress(msgspec.json.encode([entry for _, entry in listed])))
 
 
@@ -276,9 +269,7 @@ def _write_sequence(
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)
-        view = frame.camera.to_pytorch3d(intrinsics_format)
-        arrays = {name: value.tolist() for name, value in view.items() if isinstance(value, np.ndarray)}
-        view = Viewpoint(**view | arrays)
+        view = Viewpoint(**frame.camera.to_pytorch3d(intrinsics_format))  # its arrays are written as lists
         is_v2 = intrinsics_format == NDC_ISOTROPIC
         meta = {"frame_splits": [], "eval_batch_maps": []} if is_v2 else msgspec.UNSET
         annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta))

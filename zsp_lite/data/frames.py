@@ -3,6 +3,7 @@
 All image files are opened here.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
-from zsp_lite.io.html import picture_html
 from zsp_lite.io.images import decode_image
 
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
@@ -25,21 +25,14 @@ _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidde
 class Frame:
     """Image with its camera and, if known, its depth map and object mask.
 
-    Attributes:
-        rgb: (H, W, 3) colours, uint8.
-        depth: (H, W) depth along +z in units of the camera's world, 0 where unknown; or None.
-        mask: (H, W) probability that a pixel is on the object, in [0, 1]; or None.
-        camera: Camera of the image.
-        name: Name for error messages.
-
     InputError if shapes do not fit together, or values are out of range.
     """
 
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"] | None
-    mask: Float32[np.ndarray, "h w"] | None
+    rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
+    depth: Float32[np.ndarray, "h w"] | None  # (H, W) along +z in units of the camera's world, 0 where unknown
+    mask: Float32[np.ndarray, "h w"] | None  # (H, W) probability that a pixel is on the object, in [0, 1]
     camera: Camera
-    name: str = ""
+    name: str = ""  # for error messages
 
     def __post_init__(self):
         label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.asarray(self.rgb)
@@ -63,9 +56,6 @@ class Frame:
         depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
         mask = "no mask" if self.mask is None else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
-
-    def _repr_html_(self) -> str:
-        return picture_html(repr(self), self.rgb)
 
 
 def frame_defect(frame: Frame) -> str:
@@ -98,24 +88,15 @@ def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
     box = top, left, height, width = mask_to_bbox(frame.mask, threshold, padding)
     inside = np.s_[top : top + height, left : left + width]
-    return replace(
-        frame,
-        rgb=frame.rgb[inside],
-        depth=None if frame.depth is None else frame.depth[inside],
-        mask=None if frame.mask is None else frame.mask[inside],
-        camera=frame.camera.crop(box),
-    )
+    return _changed(frame, frame.camera.crop(box), lambda image: image[inside])
 
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
     """Turn a frame and its camera by quarter turns as in `numpy.rot90`; depths and world points stay the same."""
     if quarters % 4 == 0:
         return frame
-    rgb, depth, mask = (
-        None if image is None else np.ascontiguousarray(np.rot90(image, quarters))
-        for image in (frame.rgb, frame.depth, frame.mask)
-    )
-    return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=frame.camera.turn(quarters))
+    turned = frame.camera.turn(quarters)
+    return _changed(frame, turned, lambda image: np.ascontiguousarray(np.rot90(image, quarters)))
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
@@ -186,6 +167,12 @@ def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustme
 def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
     """Write a boolean mask (H, W) as a 1-bit PNG, which reads as 255 and 0."""
     _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
+
+
+def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
+    """Return a frame with another camera and `change` applied to its colours, depth and mask."""
+    images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
+    return replace(frame, camera=camera, **{name: one if one is None else change(one) for name, one in images.items()})
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:

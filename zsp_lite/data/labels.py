@@ -41,24 +41,13 @@ class PoseLabel:
 
 
 def label_folder(root: str | Path, category: str) -> Path:
-    """Return the folder of a category's labels.
-
-    This is ROOT/class_labels/CATEGORY, or ROOT/data/class_labels/CATEGORY (the layout of the published code) if only
-    the latter exists.
-    """
+    """Return ROOT/class_labels/CATEGORY, or ROOT/data/class_labels/CATEGORY (published code) if only that exists."""
     folders = [Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
-    """Read the labels of a category.
-
-    Returns:
-        Labels by sequence, sorted by name; {} if the category has none.
-
-    Raises:
-        InputError: A file is invalid (see `parse_label`), or the labels have several reference sequences.
-    """
+    """Read the labels of a category by sequence, sorted by name; InputError if they have several references."""
     labels = read_label_files(root, category)
     check_one_reference(labels, label_folder(root, category))
     return labels
@@ -131,9 +120,6 @@ def relative_pose(
 
     Returns:
         (4, 4) transform from the coordinates of camera a to those of camera b, for column vectors.
-
-    Raises:
-        InputError: The labels have different reference sequences.
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(

@@ -8,7 +8,7 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -50,11 +50,9 @@ def sample_pairs(
     sequences = sorted(read_labels(dataset.root, category))
     if len(sequences) < 2:
         raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
-    numbers: dict[str, list[int]] = {name: [] for name in sequences}
-    for key in dataset.frame_list(category):
-        numbers.setdefault(key.sequence_name, []).append(key.frame_number)
+    frames = dataset.frame_list(category)
+    numbers = {name: sorted(key.frame_number for key in frames if key.sequence_name == name) for name in sequences}
     for name in sequences:
-        numbers[name].sort()
         if len(numbers[name]) < n_targets:
             raise InputError(
                 f"labelled sequence {category}/{name} has {len(numbers[name])} frames, expected at least {n_targets}"
@@ -89,23 +87,24 @@ def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read the first evaluation set of the data folder with at least so many pairs; [] if there is none.
-
-    Sets are in ROOT/determ_eval or, as in the published code, ROOT/data/determ_eval.
-    """
-    name = f"determ_eval/*samples_{n_targets}tgt/{plain_name(category, 'category')}.pt"
-    for path in [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]:
+    """Read the first evaluation set of the data folder with at least so many pairs; [] if there is none."""
+    for path in pair_files(dataset, category, f"*samples_{n_targets}tgt"):
         pairs = read_published_pairs(path, dataset)
         if len(pairs) >= at_least:
             return pairs
     return []
 
 
+def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
+    """List a category's evaluation sets in ROOT/determ_eval and, as in the published code, ROOT/data/determ_eval."""
+    name = f"determ_eval/{folders}/{plain_name(category, 'category')}.pt"
+    return [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]
+
+
 def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     """Read an evaluation set of the published code, whose ids are positions in `dataset.frame_list(category)`.
 
-    Code in the file is not executed. InputError if its structure is another one, a sequence is compared with itself,
-    there is another number of targets than the name of the folder says, or the set does not fit the data set.
+    Code in the file is not executed. InputError if the set is damaged or does not fit the data set.
     """
     path, pairs = Path(path), []
     named = re.fullmatch(r".*_(\d{1,6})tgt", path.absolute().parent.name)
@@ -133,7 +132,8 @@ def parse_published_pairs(data: bytes, path: PurePath) -> list[_PublishedPair]:
     """Parse the content of an evaluation set of the published code; InputError if its structure is another one."""
     content = load_torch(data, f"evaluation pairs {path}")
     try:
-        return msgspec.convert(_without_tensors(content), list[_PublishedPair])
+        plain = msgspec.to_builtins(content, enc_hook=lambda one: one.tolist() if torch.is_tensor(one) else str(one))
+        return msgspec.convert(plain, list[_PublishedPair])
     except (msgspec.ValidationError, RecursionError) as error:
         raise InputError(f"evaluation pairs {path}: {error}") from error
 
@@ -147,23 +147,10 @@ def write_published_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D
     items = []
     for pair in pairs:
         position = positions[pair.category]
-        item = _PublishedPair(
-            pair.category,
-            pair.reference_sequence,
-            position[pair.reference_sequence, pair.reference_frame],
-            pair.target_sequence,
-            [position[pair.target_sequence, number] for number in pair.target_frames],
-        )
+        reference = position[pair.reference_sequence, pair.reference_frame]
+        targets = [position[pair.target_sequence, number] for number in pair.target_frames]
+        item = _PublishedPair(pair.category, pair.reference_sequence, reference, pair.target_sequence, targets)
         items.append(msgspec.to_builtins(item))
     buffer = io.BytesIO()  # torch.save to a file would store the file's name
     torch.save(items, buffer)
     write_atomic(path, buffer.getvalue())
-
-
-def _without_tensors(value: Any) -> Any:
-    """Replace tensors, also in lists and dicts, by numbers and lists of numbers."""
-    if isinstance(value, torch.Tensor):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {key: _without_tensors(item) for key, item in value.items()}
-    return [_without_tensors(item) for item in value] if isinstance(value, list | tuple) else value

@@ -17,22 +17,10 @@ _MIN_CAMERAS = 4
 
 
 def transfer_labels(source: str | Path, target: str | Path, category: str, replace: bool = False) -> dict[str, float]:
-    """Transfer the labels of a category from CO3D v1 to v2.
+    """Transfer the labels of a category from a folder of CO3D v1 to one of v2, and return each sequence's residual.
 
-    For each sequence, the camera centres of the frames in both data sets are aligned by Umeyama's method with scale.
-
-    Args:
-        source: Data folder with labels (v1).
-        target: Data folder without (v2).
-        category: Name of the category.
-        replace: Overwrite existing labels of other content.
-
-    Returns:
-        Residual of each sequence: RMS distance of the aligned camera centres over their RMS distance from their mean.
-
-    Raises:
-        InputError: A residual is above 0.05, fewer than four cameras are in both data sets, or labels in `target` would
-            be overwritten or have another reference sequence. Nothing is written then.
+    For each sequence, the camera centres of the frames in both data sets are aligned by Umeyama's method with scale;
+    the residual is their RMS distance over their RMS distance from their mean. Nothing is written if one is above 0.05.
     """
     labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
     if not labels:

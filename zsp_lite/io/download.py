@@ -7,14 +7,12 @@ import math
 import os
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tqdm import tqdm
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_bytes, sha256, write_atomic
+from zsp_lite.io.files import sha256
 
 CHUNK = 1 << 18  # bytes
 TIMEOUT = 30  # of a connection, s
@@ -65,23 +63,6 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
     return size in (None, path.stat().st_size) and digest.startswith(md5_prefix)
 
 
-@contextmanager
-def pinned(path: Path) -> Iterator[None]:
-    """Use a file without a published digest; InputError if it differs from the first use, whose SHA-256 is stored."""
-    pin, found = path.with_name(path.name + ".sha256"), sha256(path, "weights")
-    if known := pin.is_file():
-        expected = read_bytes(pin, "digest")[:64].decode("ascii", "replace")
-        if found != expected:
-            raise InputError(
-                f"{path} has changed since its first use: its SHA-256 is {found}, expected {expected} as in "
-                f"{pin.name}; remove both files to download it again"
-            )
-    yield
-    if not known:
-        with suppress(OSError):  # a folder that cannot be written
-            write_atomic(pin, f"{found}  {path.name}\n".encode())
-
-
 def remote_size(url: str) -> int | None:
     """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
     try:
@@ -116,21 +97,19 @@ class RemoteFile(io.RawIOBase):
 
     def readinto(self, buffer: bytearray | memoryview) -> int:
         """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not send parts."""
-        end = min(self._position + len(buffer), self.size)
-        if end <= self._position:
+        count, problem = min(len(buffer), self.size - self._position), "the connection was closed"
+        if count <= 0:
             return 0
-        problem: object = "the connection was closed"
         for _ in range(ATTEMPTS):
             try:
-                with _request(self.url, self._position, end) as response:
+                with _request(self.url, self._position, self._position + count) as response:
                     if not _is_part(response, self._position):
                         problem = "the server does not send parts of files, expected range requests"
-                    elif data := _read(response, end - self._position):
-                        buffer[: len(data)] = data
-                        self._position += len(data)
-                        return len(data)
+                    elif received := response.readinto(memoryview(buffer)[:count]):
+                        self._position += received
+                        return received
             except NETWORK_ERRORS as error:
-                problem = error
+                problem = str(error)
         raise InputError(f"{self.url} cannot be read: {problem}")
 
 
@@ -143,14 +122,6 @@ def _request(url: str, start: int, end: int | None = None) -> http.client.HTTPRe
 def _is_part(response: http.client.HTTPResponse, start: int) -> bool:
     """Tell whether a server sends a file from `start`, rather than all of it."""
     return response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
-
-
-def _read(response: http.client.HTTPResponse, count: int) -> bytes:
-    """Read `count` bytes, or those that came before the connection was closed."""
-    try:
-        return response.read(count)
-    except http.client.IncompleteRead as error:
-        return error.partial
 
 
 def _fetch_rest(url: str, part: Path, most: float) -> bool:

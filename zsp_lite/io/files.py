@@ -17,7 +17,7 @@ from zsp_lite.errors import InputError
 
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
-_GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
+GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME = 255  # bytes, on most file systems
 
 
@@ -93,14 +93,9 @@ def stable_hash(text: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big")
 
 
-def growth_limit(size: int) -> int:
-    """Return the number of bytes to which `size` compressed bytes may grow."""
-    return min(MAX_FILE, max(_GROWTH_ALLOWED, _GROWTH_FACTOR * size))
-
-
 def decompress(data: bytes, what: str) -> bytes:
-    """Decompress the gzip data `what`; InputError if they are incomplete or grow beyond `growth_limit`."""
-    limit = growth_limit(len(data))
+    """Decompress the gzip data `what`; InputError if they are incomplete or grow too much."""
+    limit = min(MAX_FILE, max(GROWTH_ALLOWED, _GROWTH_FACTOR * len(data)))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(limit + 1)
