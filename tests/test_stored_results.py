@@ -1,7 +1,7 @@
 """The figures of the pages are those of the stored runs, the code and the fitted constants."""
 
 import re
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -88,5 +88,7 @@ def test_the_page_on_solvers_has_the_weights_and_the_calibration_of_the_code():
         term, forward, reverse = re.match(r"\| `(\w+)` \|[^|]*\| (\S+) \| (\S*) ?\|", line).groups()
         stated |= {term: forward} if not reverse else {f"forward_{term}": forward, f"reverse_{term}": reverse}
     assert {name: float(value) for name, value in stated.items()} == weights
-    (line,) = rows(text, "| α₀")
-    assert numbers(line) == list(astuple(Calibration()))
+    stated = [numbers(line)[-2:] for line in rows(text, "| evidence |")]
+    calibration = Calibration()
+    assert [tuple(column) for column in zip(*stated)] == [calibration.scale, calibration.none]
+    assert f"λ = {calibration.unseen} is its chance" in text
