@@ -116,13 +116,6 @@ def test_what_lies_outside_a_picture_is_counted_and_not_drawn():
     assert [len(axis.collections[0].get_offsets()) for axis in figure.axes[:4]] == [2, 2, 1, 0]
 
 
-def test_mean_scores_are_relative_to_the_pair_and_by_angle():
-    angles, scores = np.array([[10.0, 100.0], [20.0, 110.0]]), np.array([[4.0, 2.0], [10.0, 6.0]])
-    figure = alignment_plots.choices_and_scores_over_angle(["car", "car"], angles[:, 0], angles, scores)
-    values = figure.axes[1].lines[0].get_ydata()
-    assert values[[0, 3]].tolist() == [1.5, -1.5] and np.isnan(values[[1, 2, 4, 5]]).all()
-
-
 def test_a_scene_has_equal_axes_robust_to_outliers_and_y_down():
     cloud = np.random.default_rng(0).uniform(-1, 1, (30_000, 3)) * [1, 2, 3]
     figure = scene3d.aligned_clouds(cloud, cloud[:100])

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from unittest.mock import Mock
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -47,14 +48,19 @@ def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
     assert results[0].estimate.inliers.sum() > 20
 
 
-def test_a_notebook_on_another_drive_is_named_without_a_link(monkeypatch):
-    def fail(*arguments):
-        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+def test_notebooks_are_linked_on_the_site_in_the_clone_or_in_the_repository_or_only_named(monkeypatch, tmp_path):
+    def link(addresses, clone):
+        monkeypatch.setattr("zsp_lite.viz.report._project_url", addresses.get)
+        monkeypatch.setattr("zsp_lite.viz.report.REPOSITORY", clone)
+        return re.sub('.*href="([^"]*)".*', r"\1", _notebook_link("01_features", REPOSITORY))
 
-    monkeypatch.setattr("zsp_lite.viz.report._project_url", lambda label: None)
-    assert 'href="notebooks/01_features.ipynb"' in _notebook_link("01_features", REPOSITORY)
-    monkeypatch.setattr("zsp_lite.viz.report.os.path.relpath", fail)
-    assert _notebook_link("01_features", REPOSITORY) == "notebook 01"
+    site, code = {"Documentation": "https://host/course/"}, {"Repository": "https://host/code"}
+    assert link(site | code, REPOSITORY) == "https://host/course/notebooks/01_features.html"
+    assert link(code, REPOSITORY) == "notebooks/01_features.ipynb"
+    assert link(code, tmp_path) == "https://host/code/blob/main/notebooks/01_features.ipynb"
+    assert link({}, tmp_path) == "notebook 01"
+    monkeypatch.setattr("zsp_lite.viz.report.os.path.relpath", Mock(side_effect=ValueError))  # another drive
+    assert link({}, REPOSITORY) == "notebook 01"
 
 
 def test_shipped_evaluation_pairs_are_preferred(ellipsoids):
@@ -129,20 +135,6 @@ def test_two_poses_are_shown_side_by_side_where_the_answer_is_one_of_two(results
     plt.close(figure)
 
 
-def test_links_lead_to_the_projects_site_where_its_address_is_known(results, monkeypatch):
-    monkeypatch.setattr("zsp_lite.viz.report._project_url", {"Documentation": "https://host/course/"}.get)
-    assert 'href="https://host/course/notebooks/01_features.html"' in render_page(results, "b")
-
-
-def test_outside_the_clone_notebooks_are_linked_in_the_repository_or_named_only(results, monkeypatch, tmp_path):
-    monkeypatch.setattr("zsp_lite.viz.report.REPOSITORY", tmp_path)
-    monkeypatch.setattr("zsp_lite.viz.report._project_url", {"Repository": "https://host/code"}.get)
-    assert 'href="https://host/code/blob/main/notebooks/01_features.ipynb"' in render_page(results, "b")
-    monkeypatch.setattr("zsp_lite.viz.report._project_url", lambda label: None)
-    page = render_page(results, "b")
-    assert "More: notebook 01." in page and ".ipynb" not in page
-
-
 def test_the_scene_has_every_pose_in_one_frame_the_pictures_colours_and_leaves_the_wheel_to_the_page(results, text):
     (result,) = results
     (content,) = re.findall(r'<script type="application/json">(.*?)</script>', text)
@@ -162,13 +154,8 @@ def test_all_text_is_escaped(results, text):
     assert "synthetic ellipsoids &lt;script&gt;" in text and "a &amp; b" in text
     hostile = "<img src=x onerror=alert(1)>"
     estimate = replace(results[0].estimates["verified"], flags=(hostile,), timings={hostile: 1.0})
-    result = replace(
-        results[0],
-        title=hostile,
-        sources=(hostile, hostile),
-        estimates={hostile: estimate},
-        errors={hostile: 1.0},
-    )
+    own = {"title": hostile, "sources": (hostile, hostile), "estimates": {hostile: estimate}, "errors": {hostile: 1.0}}
+    result = replace(results[0], **own)
     page = render_page([result], hostile, data=hostile, data_note=hostile)
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15

@@ -98,31 +98,26 @@ def test_attention_names_the_patch_with_the_largest_weight():
     assert f"patch ({top[0]}, {top[1]})" in widget.caption.value
 
 
-def test_all_facets_equal_the_features_of_the_backbone_for_each_layer():
-    image = examples.sample_pair().reference.rgb
-    facets = features.all_facets(load_backbone("zsp-tiny", "cpu"), [image])
-    for layer, facet in ((9, "key"), (3, "value"), (11, "token")):
-        keys = load_backbone("zsp-tiny", "cpu", layer=layer, facet=facet)([image])[0].keys
-        assert torch.allclose(facets[layer, facet][0, 1:], keys.flatten(0, 1), atol=1e-3)
-
-
-def test_facets_report_the_fraction_of_correct_nearest_neighbours():
+def test_facets_are_those_of_the_backbone_and_the_caption_has_the_share_of_correct_neighbours():
     truth, widget = examples.sample_pair(), examples.facets()
-    widget.controls["layer"].value, widget.controls["facet"].value = 9, "token"
-    keys = load_backbone("zsp-tiny", "cpu", facet="token")([truth.reference.rgb, truth.target.rgb])
-    nearest = similarity(*(one.keys for one in keys)).argmax(1).numpy()
-    cells = np.stack(np.divmod(nearest, 28), -1).reshape(28, 28, 2)
-    assert f"{correct_matches(cells, truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
+    images = [truth.reference.rgb, truth.target.rgb]
+    facets = features.all_facets(load_backbone("zsp-tiny", "cpu"), images)
+    for layer, facet in ((9, "token"), (3, "value"), (11, "key")):
+        first, second = (one.keys for one in load_backbone("zsp-tiny", "cpu", layer=layer, facet=facet)(images))
+        assert torch.allclose(facets[layer, facet][0, 1:], first.flatten(0, 1), atol=1e-3)
+        cells = np.stack(np.divmod(similarity(first, second).argmax(1).numpy(), 28), -1).reshape(28, 28, 2)
+        widget.controls["layer"].value, widget.controls["facet"].value = layer, facet
+        assert f"{correct_matches(cells, truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
 
 
-def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_is_reported():
+def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
     view, widget = examples.sample_views()[0], examples.saliency()
     widget.controls["threshold"].value = 0.5
     assert f"{int((view.features.saliency > 0.5).sum())} of 784 patches" in widget.caption.value
     widget = examples.box_to_mask()
     assert "IoU" in widget.caption.value
     widget.controls["bottom"].value = 4
-    assert "the box is empty" in widget.caption.value
+    assert widget.caption.value == "mask of 0 pixels, IoU with the true mask 0.00"
 
 
 def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
@@ -181,7 +176,7 @@ def test_views_are_evenly_spaced_on_a_ring():
 
 
 def test_lines_end_in_the_second_image_and_outliers_have_their_own_lines():
-    canvas = views.match_canvas(plt.figure().add_subplot(), *np.zeros((2, 10, 20, 3)), ("a", "b"))
+    canvas = views.MatchCanvas(plt.figure().add_subplot(), *np.zeros((2, 10, 20, 3)), ("a", "b"))
     canvas.draw(np.array([[1, 2], [3, 4]]), np.array([[5, 6], [7, 8]]), np.array([True, False]))
     (inlier,), (outlier,) = canvas.inliers.get_segments(), canvas.outliers.get_segments()
     assert inlier.tolist() == [[1, 2], [5 + canvas.offset, 6]] and canvas.offset > 20
@@ -191,27 +186,22 @@ def test_lines_end_in_the_second_image_and_outliers_have_their_own_lines():
 # alignment, hypotheses and metrics
 
 
-def ransac_widget(source, target):
-    pixels = np.random.default_rng(1).uniform(0, 60, (2, len(source), 2))
-    return alignment.ransac_settings(
-        (np.zeros((60, 60, 3)), np.ones((60, 60, 3))), tuple(pixels), (source, target), TURN
-    )
-
-
 def test_the_caption_agrees_with_ransac():
     rng = np.random.default_rng(0)
     source = rng.normal(size=(40, 3))
     target = Sim3(1.3, TURN, np.ones(3)).apply(source) + 0.03 * rng.normal(size=(40, 3))
     target[:10] = 2 * rng.normal(size=(10, 3))
-    widget = ransac_widget(source, target)
+    images, pixels = np.zeros((2, 60, 60, 3)), rng.uniform(0, 60, (2, 40, 2))
+    widget = alignment.ransac_settings(tuple(images), tuple(pixels), (source, target), TURN)
     for trials, threshold, seed in ((1000, 0.2, 0), (5, 0.1, 3), (100, 0.9, 7)):
         for name, value in (("trials", trials), ("threshold", threshold), ("seed", seed)):
             widget.controls[name].value = value
         sim3, inliers = ransac(source, target, threshold, trials, seed=seed, scale_range=(0.2, 5))
         assert f"{inliers.sum()} of 40 matches are inliers; scale {sim3.scale:.2f}" in widget.caption.value
         assert f"rotation error {rotation_error(sim3.R, TURN):.0f}°" in widget.caption.value
-    line = np.outer(np.arange(8.0), [1, 2, 3])
-    assert ransac_widget(line, line).caption.value.startswith("No fit: ")
+    line = np.outer(np.arange(40.0), [1, 2, 3])
+    widget = alignment.ransac_settings(tuple(images), tuple(pixels), (line, line))
+    assert widget.caption.value.startswith("No fit: ")
 
 
 def test_the_caption_agrees_with_least_squares():

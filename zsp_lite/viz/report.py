@@ -315,20 +315,19 @@ def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
 
 def _saliency_figure(result: PairResult) -> Figure:
     views = _chosen_views(result)
-    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
-    for axis, view in zip(axes, views):
-        plots.overlay_map(axis, view.features.saliency.cpu().numpy(), limits=(0, 1), label="saliency")
-    return figure
+    reference, target = (view.features.saliency.cpu().numpy() for view in views)
+    maps = {"reference": reference, "chosen target": target}
+    return plots.show_maps([view.frame.rgb for view in views], maps, size=2.7, limits=(0, 1), label="saliency")
 
 
 def _cycles_figure(result: PairResult) -> Figure:
-    views = _chosen_views(result)
-    figure, axes = plots.show_images([view.frame.rgb for view in views], ["reference", "chosen target"], size=2.7)
+    views, maps = _chosen_views(result), {}
     sim = similarity(views[0].features, views[1].features)
-    for axis, start, end, table in ((axes[0], *views, sim), (axes[1], *views[::-1], sim.T)):
+    for title, start, end, table in (("reference", *views, sim), ("chosen target", *views[::-1], sim.T)):
         distances = cyclical_distances(table, start.features.grid, end.features.grid, start.foreground, end.foreground)
-        plots.overlay_map(axis, distances.cpu().numpy(), limits=(-10, 0), cmap="cividis", label="− distance (patches)")
-    return figure
+        maps[title] = distances.cpu().numpy()
+    style = {"limits": (-10, 0), "cmap": "cividis", "label": "− distance (patches)"}
+    return plots.show_maps([view.frame.rgb for view in views], maps, size=2.7, **style)
 
 
 def _scene_html(result: PairResult, scene_id: str) -> Markup:

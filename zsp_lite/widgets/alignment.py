@@ -9,8 +9,8 @@ from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
-from zsp_lite.widgets.common import Widget, interactive_figure, load_package, slider
-from zsp_lite.widgets.views import match_canvas
+from zsp_lite.widgets.common import Widget, interactive_figure, load_package, slider, small_text
+from zsp_lite.widgets.views import MatchCanvas
 
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -21,22 +21,17 @@ def ransac_settings(
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
 ) -> Widget:
-    """Show the inliers of RANSAC on the matches of two images; choose trials, threshold and seed.
-
-    A match is given by its pixels (x, y) in both images, which have one size, and its points in both camera frames.
-    """
+    """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in both cameras."""
     (source, target), n = points, len(points[0])
     figure, (matches, graph) = plt.subplots(1, 2, figsize=(9, 3.3), width_ratios=(1.5, 1), layout="constrained")
-    canvas = match_canvas(matches, *images, ("reference", "target"))
+    canvas = MatchCanvas(matches, *images, ("reference", "target"))
     inside = graph.scatter([], [], s=26, color=BLUE, marker="o", label="inlier")
     outside = graph.scatter([], [], s=26, color="0.45", marker="x", label="outlier")
     line = graph.axhline(1, color=VERMILLION, linestyle="--", label="threshold")
     graph.set(xlim=(-1, n), ylim=(0.01, 10), yscale="log", title="residuals")
-    graph.set_xlabel("match, sorted by residual", fontsize=8)
-    graph.set_ylabel("residual (scene units)", fontsize=8)
-    graph.tick_params(labelsize=8)
-    graph.title.set_fontsize(9)
-    graph.legend(fontsize=8, loc="upper left")
+    graph.set(xlabel="match, sorted by residual", ylabel="residual (scene units)")
+    graph.legend(loc="upper left")
+    small_text(graph)
 
     def update(trials: int, threshold: float, seed: int) -> str:
         line.set_ydata([threshold, threshold])
@@ -67,10 +62,7 @@ def ransac_settings(
 
 
 def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Widget:
-    """Show the least-squares fit of corresponding points while the last target point moves along x.
-
-    The plot shows x to the right and y down. The caption compares the fit with that of the unmoved points.
-    """
+    """Show the least-squares fit of corresponding points while the last target point moves along x."""
     exact = umeyama(source, target)
     figure, axis = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
     circles = axis.scatter(*target[:, :2].T, s=70, facecolors="none", edgecolors=ORANGE, linewidths=1.8, label="target")

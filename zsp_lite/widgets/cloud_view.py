@@ -37,7 +37,6 @@ class ViewBox:
     @classmethod
     def around(cls, points: Real[np.ndarray, "n 3"]) -> "ViewBox":
         """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers."""
-        points = np.asarray(points, dtype=np.float64)
         if len(points) == 0 or not np.isfinite(points).all():
             raise InputError(f"point cloud of shape {points.shape} is empty or not finite, expected finite points")
         low, high = np.percentile(points, [1, 99], axis=0)
@@ -52,11 +51,7 @@ class ViewBox:
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points; the same points give the same indices.
-
-    The indices follow the Morton (Z-order) curve, so that neighbours on a slider are neighbours on the object.
-    """
-    points = np.asarray(points, dtype=np.float64)
+    """Return the indices of at most `most` points along the Morton (Z-order) curve, neighbours after each other."""
     kept = np.arange(len(points))
     if len(points) > most:
         kept = np.random.default_rng(0).choice(len(points), most, replace=False)
@@ -71,9 +66,8 @@ def point_under(
 ) -> int | None:
     """Return the index of the clicked point, or None.
 
-    Of the points (in view units) within `reach` of the click on the screen, those far behind the front one are ignored;
-    the nearest of the others is returned. The rows of `view` are the directions right, down and forward; `at` is the
-    click (right, down) relative to the centre of the canvas.
+    It is the nearest of the points (in view units) within `reach` of the click that are not far behind the front one.
+    The rows of `view` point right, down and forward; `at` is the click (right, down) from the centre of the canvas.
     """
     on_screen = points @ view.T
     distance = np.hypot(*(on_screen[:, :2] - at).T)
@@ -88,16 +82,12 @@ class CloudView:
     """A canvas with one point cloud; `widget` is its Jupyter widget."""
 
     def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any], side: int = 400):
-        """Create an empty canvas with the CSS class `name`.
-
-        After a click, `on_pick` is called with the clicked world point, or None if there is no point.
-        """
+        """Create an empty canvas with the CSS class `name`; a click calls `on_pick` with the world point, or None."""
         self.widget = _cloud_widget()(side=side)
         self.widget.add_class(name)
         self.widget.on_msg(self._receive)
         self.on_pick = on_pick
-        self._cloud: np.ndarray = np.zeros((0, 3))
-        self._in_view: np.ndarray = self._cloud
+        self._cloud = self._in_view = np.zeros((0, 3))
         self._box: ViewBox | None = None
 
     def show(
@@ -106,8 +96,7 @@ class CloudView:
     ) -> None:  # fmt: skip
         """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps the present one).
 
-        An `overlay` has the world points of a second cloud (drawn as crosses), its colour, and the colour of the first
-        one (drawn as discs). `alt` is the description for screen readers.
+        An `overlay` has the points of a second cloud (crosses), its colour, and that of the first one (discs).
         """
         self._box = box = ViewBox.around(points)
         self._cloud, self._in_view = np.asarray(points, dtype=np.float64), box.to_view(points)

@@ -70,20 +70,10 @@ def choice(label: str, options: list[str], value: str | None = None) -> "ValueWi
 def interactive_figure(
     figure: Figure, controls: Mapping[str, "ValueWidget"], update: Callable[..., str], alt: str
 ) -> Widget:
-    """Return a widget of controls above a figure above a caption.
+    """Return a widget of controls above a figure above a caption, which are its attributes, as is `redraw()`.
 
-    Args:
-        figure: Figure with all its artists.
-        controls: Controls by the name of the argument of `update`.
-        update: Called with the value of each control; changes the figure and returns the caption.
-        alt: Description of the figure for screen readers, valid for all values of the controls.
-
-    Returns:
-        Widget with the attributes `controls`, `figure`, `picture` and `caption` (the image and text widgets), and
-        `redraw()`.
-
-    Raises:
-        InputError: ipywidgets is not installed.
+    `update` is called with the values of the `controls`, which have the names of its arguments; it changes the figure
+    and returns the caption. `alt` describes the figure for screen readers, whatever the controls are.
     """
     widgets = load_package()
     plt.close(figure)  # otherwise the notebook shows it a second time
@@ -112,6 +102,15 @@ def interactive_figure(
     box = widgets.VBox([row, described, picture, caption])
     box.redraw, box.controls, box.figure, box.picture, box.caption = redraw, dict(controls), figure, picture, caption
     return box
+
+
+def small_text(axis: Axes) -> None:
+    """Give the texts of an axis the size of a panel in a row of several."""
+    axis.tick_params(labelsize=8)
+    axis.title.set_fontsize(9)
+    texts = axis.get_legend().get_texts() if axis.get_legend() else []
+    for text in (axis.xaxis.label, axis.yaxis.label, *texts):
+        text.set_fontsize(8)
 
 
 def patch_outline(

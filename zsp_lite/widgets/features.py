@@ -43,10 +43,7 @@ def attention(
     grid: tuple[int, int],
     heads: int,
 ) -> Widget:
-    """Show the attention weights of one patch over all patches; choose the patch, the layer and the head.
-
-    `queries` and `keys` are those of all tokens, CLS first, with the heads concatenated.
-    """
+    """Show the attention weights of one patch; queries and keys are of all tokens, CLS first, heads concatenated."""
     layers, _, dim = queries.shape
     size = image.shape[:2]
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
@@ -86,26 +83,25 @@ def facets(
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
 ) -> Widget:
-    """Show the similarities of one patch, its nearest neighbour and its true match; choose patch, layer and facet.
+    """Show the similarities of one patch by each (layer, facet), its nearest neighbour and its true match.
 
-    `features` maps (layer, facet) to the features of both images; `cells` and `valid` are the true matches of the
-    reference patches, from `ground_truth_matches`.
+    `cells` and `valid` are the true matches of the reference patches, from `ground_truth_matches`.
     """
     layers, names = sorted({layer for layer, _ in features}), list(dict.fromkeys(facet for _, facet in features))
     grid = valid.shape
 
     @cache
-    def compared(layer: int, facet: str) -> tuple[np.ndarray, np.ndarray, float]:
+    def compared(layer: int, facet: str) -> tuple[np.ndarray, float]:
         sim = similarity(*features[layer, facet])
         nearest = np.stack(np.divmod(sim.argmax(1).numpy(), grid[1]), -1).reshape(*grid, 2)
-        return sim.numpy(), nearest, correct_matches(nearest, cells)[valid].mean()
+        return sim.numpy(), correct_matches(nearest, cells)[valid].mean()
 
     panels = _SimilarityPanels(reference, [target], grid, ["similarity to the patch u"])
 
     def update(row: int, col: int, layer: int, facet: str) -> str:
-        sim, nearest, share = compared(layer, facet)
+        sim, share = compared(layer, facet)
         panels.place(row, col, cells[row, col] if valid[row, col] else None)
-        text = panels.fill(0, sim[row * grid[1] + col].reshape(grid), nearest[row, col])
+        text = panels.fill(0, sim[row * grid[1] + col].reshape(grid))
         return (
             f"Layer {layer}, {facet}: {text} Of the {valid.sum()} patches with a true match, {share:.0%} have their "
             "nearest neighbour within one patch of it."
@@ -129,17 +125,13 @@ def context(
 ) -> Widget:
     """Show the similarities of one patch by keys alone and by log-binned descriptors."""
     grid = valid.shape
-    kinds = {"keys": key_similarities(keys[0], [keys[1]])[0], "log-binned": similarity(*keys)}
-    sims = [sim.numpy() for sim in kinds.values()]
-    panels = _SimilarityPanels(reference, [target, target], grid, list(kinds))
+    sims = {"keys": key_similarities(keys[0], [keys[1]])[0].numpy(), "log-binned": similarity(*keys).numpy()}
+    panels = _SimilarityPanels(reference, [target, target], grid, list(sims))
 
     def update(row: int, col: int) -> str:
         panels.place(row, col, cells[row, col] if valid[row, col] else None)
-        texts = []
-        for panel, (kind, sim) in enumerate(zip(kinds, sims)):
-            similar = sim[row * grid[1] + col].reshape(grid)
-            texts.append(f"{kind}: {panels.fill(panel, similar, np.array(np.unravel_index(similar.argmax(), grid)))}")
-        return "<br>".join(texts)
+        texts = [panels.fill(panel, sim[row * grid[1] + col].reshape(grid)) for panel, sim in enumerate(sims.values())]
+        return "<br>".join(f"{kind}: {text}" for kind, text in zip(sims, texts))
 
     alt = "A patch of the reference; its similarities in the target without and with context."
     return interactive_figure(panels.figure, patch_sliders(grid, _first_patch(valid)), update, alt)
@@ -204,8 +196,9 @@ class _SimilarityPanels:
         for star in self._stars:
             star.set_data(*([[], []] if true is None else plots.patch_centres(true[None], self.grid, self.size).T))
 
-    def fill(self, panel: int, similar: Float[np.ndarray, "rows cols"], nearest: Int[np.ndarray, "2"]) -> str:
+    def fill(self, panel: int, similar: Float[np.ndarray, "rows cols"]) -> str:
         """Draw the similarities and the nearest neighbour of the patch; returns the text about them."""
+        nearest = np.array(np.unravel_index(similar.argmax(), similar.shape))
         self._maps[panel].set_data(similar)
         self._dots[panel].set_data(*plots.patch_centres(nearest[None], self.grid, self.size).T)
         text = f"nearest neighbour ({nearest[0]}, {nearest[1]}), cosine {similar[tuple(nearest)]:.2f}; "

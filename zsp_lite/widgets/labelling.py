@@ -27,28 +27,18 @@ if TYPE_CHECKING:
 def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> Widget:
     """Label a category: the point cloud of the reference on the left, that of the current sequence on the right.
 
-    Args:
-        labelling: Session to continue.
-        backbone: Backbone of the button "guess"; the default of `load_backbone`, loaded when needed.
-
-    Returns:
-        Widget with the attributes `controls`, `buttons`, `views` (two canvases), `tables`, `message`, and `name` (the
-        field for the name of a keypoint).
-
-    Raises:
-        InputError: ipywidgets or anywidget is not installed.
+    The button "guess" uses `backbone`, by default that of `load_backbone`.
     """
     return _LabellingWidget(labelling, backbone).panel.box
 
 
 class _LabellingWidget:
-    """The actions of the widget, and what it displays after each."""
+    """The actions of the widget, each of which returns the message to show, and what it displays after each."""
 
     def __init__(self, labelling: Labelling, backbone: "Backbone | None"):
         self.labelling, self.backbone = labelling, backbone
         self.history: list[tuple[str, np.ndarray, tuple[str, ...]]] = []
         self.shown: dict[str, object] = {}
-        self.subsamples: dict[str, np.ndarray] = {}
         self.asked: tuple[str, str, bytes] | None = None  # the label in doubt that accept was pressed for
         self.refreshing = False
         self.actions = {
@@ -68,8 +58,6 @@ class _LabellingWidget:
     @property
     def on_reference(self) -> bool:
         return self.current == self.labelling.reference
-
-    # Actions; each returns the message to show.
 
     def pick(self, sequence: str, point: np.ndarray | None) -> str:
         """Add the next keypoint, or move the chosen one."""
@@ -161,8 +149,6 @@ class _LabellingWidget:
         self.labelling.rename(index, name)
         return f"Keypoint {index + 1} is now named {self.labelling.names[index]}."
 
-    # Events.
-
     def _clicked(self, view: str, point: np.ndarray | None) -> None:
         self._do(lambda: self.pick(self.labelling.reference if view == "reference" else self.current, point))
 
@@ -172,10 +158,9 @@ class _LabellingWidget:
             return
         if control == "point":
             self._move_cursor()
-        elif control == "name":
-            if index != NEW_KEYPOINT:
-                self._do(self.rename)
-        else:
+        elif control == "name" and index != NEW_KEYPOINT:
+            self._do(self.rename)
+        elif control != "name":
             if control == "keypoint":
                 self.controls["name"].value = "" if index == NEW_KEYPOINT else self.labelling.names[index]
             self._do(self._instruction)
@@ -212,8 +197,6 @@ class _LabellingWidget:
         following = rows[index + 1 :] + rows[:index]
         return next((row.sequence for row in following if row.state == OPEN), sequence)
 
-    # Display.
-
     def _instruction(self) -> str:
         """Return what the user can do next."""
         labelling, names = self.labelling, self.labelling.names
@@ -239,8 +222,7 @@ class _LabellingWidget:
         self._fill_keypoint_menu(names, len(picks))
         alignment = None if self.on_reference or row.problem else labelling.alignment(self.current)
         aligned = self._aligned_reference(alignment)
-        if aligned is None:
-            controls["overlay"].value = False
+        controls["overlay"].value &= aligned is not None
         controls["overlay"].disabled = aligned is None
         chosen = None if controls["keypoint"].value == NEW_KEYPOINT else controls["keypoint"].value
         controls["name"].disabled = not self.on_reference and chosen is None
@@ -262,7 +244,7 @@ class _LabellingWidget:
             panel.captions["sequence"].value = f"{_dot(ORANGE)} {html.escape(self.current)}{suffix}"
             self._show_cloud("sequence", self.current, overlay)
             self.views["sequence"].mark(picks, chosen)
-        controls["point"].max = max(len(self._subsample(self.current)) - 1, 0)
+        controls["point"].max = max(len(self._slider_points()) - 1, 0)
         self._move_cursor(only_if_shown=True)
         if row.problem:
             raise InputError(row.problem)
@@ -273,11 +255,10 @@ class _LabellingWidget:
         following = f"next: {picked + 1}"
         if not self.on_reference:
             following = f"next: {picked + 1} {names[picked]}" if picked < len(names) else "all picked"
-        options = [(following, NEW_KEYPOINT), *((f"{i + 1} {name}", i) for i, name in enumerate(names[:picked]))]
-        if tuple(options) != menu.options:
-            chosen = menu.value if menu.value in [value for _, value in options] else NEW_KEYPOINT
-            menu.options = options
-            menu.value = chosen
+        options = (following, NEW_KEYPOINT), *((f"{i + 1} {name}", i) for i, name in enumerate(names[:picked]))
+        if options != menu.options:
+            chosen = menu.value if menu.value in dict(options).values() else NEW_KEYPOINT
+            menu.options, menu.value = options, chosen
 
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
         """Return the reference cloud in the world of the sequence, by its keypoints or by an imported label."""
@@ -310,14 +291,14 @@ class _LabellingWidget:
             raise InputError(f"sequence {sequence}: {error}") from error
         self.shown[name] = key
 
-    def _subsample(self, sequence: str) -> np.ndarray:
-        if sequence not in self.subsamples:
-            self.subsamples[sequence] = subsample(self.labelling.cloud(sequence)[0])
-        return self.subsamples[sequence]
-
     def _slider_point(self) -> np.ndarray:
-        indices = self._subsample(self.current)
-        return self.labelling.cloud(self.current)[0][indices[min(self.controls["point"].value, len(indices) - 1)]]
+        points = self._slider_points()
+        return points[min(self.controls["point"].value, len(points) - 1)]
+
+    def _slider_points(self) -> np.ndarray:
+        """Return the points that the slider goes through, neighbours after each other."""
+        cloud = self.labelling.cloud(self.current)[0]
+        return cloud[subsample(cloud)]
 
     def _move_cursor(self, only_if_shown: bool = False) -> None:
         """Move the cross-hair to the point of the slider."""

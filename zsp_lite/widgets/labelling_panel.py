@@ -49,10 +49,7 @@ class Panel:
         on_change: Callable[[str], Any],
         on_button: Callable[[str], Any],
     ):
-        """Create the widgets; the first of the sequences is the reference.
-
-        `on_click` is called with the name of a canvas and the clicked world point, the others with the name of a part.
-        """
+        """Create the widgets; `on_click` gets the name of a canvas and the world point, the others that of a part."""
         widgets = load_package()
         options = [(f"{sequences[0]} (reference)", sequences[0]), *((name, name) for name in sequences[1:])]
         style = {"description_width": "initial"}

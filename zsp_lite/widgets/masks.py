@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from zsp_lite.data.frames import ON_OBJECT
-from zsp_lite.errors import InputError
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
 from zsp_lite.widgets.common import Widget, interactive_figure, slider
@@ -17,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def box_to_mask(frame: "Frame", box: "Box") -> Widget:
-    """Show the mask that GrabCut segments in a bounding box; choose the sides of the box.
-
-    The initial box is (top, left, height, width) in pixels. If the frame has a mask, the caption gives the overlap.
-    """
+    """Show the mask that GrabCut segments in a box (top, left, height, width), and its overlap with the frame's."""
     height, width = frame.camera.size
     top, left, box_height, box_width = box
     figure, (axis,) = show_images([frame.rgb], ["box and mask"], size=4.2)
@@ -29,16 +25,8 @@ def box_to_mask(frame: "Frame", box: "Box") -> Widget:
 
     def update(top: int, left: int, bottom: int, right: int) -> str:
         outline.set(xy=(left, top), width=right - left, height=bottom - top)
-        dark = np.zeros((height, width, 4))
-        try:
-            if bottom - top < 4 or right - left < 4:
-                raise InputError("the box is empty, expected top above bottom and left before right")
-            mask = grab_cut(frame.rgb, (top, left, bottom - top, right - left)) > ON_OBJECT
-        except InputError as error:
-            shade.set_data(dark)
-            return str(error)
-        dark[~mask] = (0, 0, 0, 0.65)
-        shade.set_data(dark)
+        mask = grab_cut(frame.rgb, (top, left, bottom - top, right - left)) > ON_OBJECT
+        shade.set_data(np.where(mask[..., None], 0, (0, 0, 0, 0.65)))
         text = f"mask of {mask.sum():,} pixels"
         if frame.mask is not None:
             true = frame.mask > ON_OBJECT

@@ -19,11 +19,7 @@ from zsp_lite.widgets.common import Widget, interactive_figure, patch_outline, p
 
 
 def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
-    """Show the cycle of a reference patch (eq. 2).
-
-    v is the nearest neighbour of the patch u in the target, u' the nearest neighbour of v in the reference, and
-    d(u, u') the cyclical distance.
-    """
+    """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u' (eq. 2)."""
     grid, grid2 = reference.features.grid, target.features.grid
     forth, back = (x.numpy() for x in nearest_neighbours(sim))
     values = sim.cpu().numpy()
@@ -55,18 +51,13 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
         returned.set_data(*ends[1:].T)
         for arrow, end in zip(arrows, ends):
             arrow.xy1, arrow.xy2 = end, v_centre
-        background = [
-            name
-            for name, on in (
-                ("u", reference.foreground[row, col]), ("v", target.foreground[v_row, v_col]),
-                ("u'", reference.foreground[w_row, w_col]),
-            ) if not on
-        ]  # fmt: skip
-        distance = np.hypot(row - w_row, col - w_col)
+        on = {"u": reference.foreground[row, col], "v": target.foreground[v_row, v_col]}
+        on["u'"] = reference.foreground[w_row, w_col]
+        off = ", ".join(name for name, foreground in on.items() if not foreground)
         return (
             f"u ({row}, {col}) → v ({v_row}, {v_col}), cosine {values[u, v]:.2f} → u' ({w_row}, {w_col}), cosine "
-            f"{values[w, v]:.2f}: d(u, u') = {distance:.1f} patches"
-            + (f"; {', '.join(background)} not on the foreground, so the distance is infinite." if background else ".")
+            f"{values[w, v]:.2f}: d(u, u') = {np.hypot(row - w_row, col - w_col):.1f} patches"
+            + (f"; {off} not on the foreground, so the distance is infinite." if off else ".")
         )
 
     start = divmod(int(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax()), grid[1])
@@ -84,8 +75,7 @@ def matches(
 ) -> Widget:
     """Show which matches are correct; choose the matcher, the number of matches and k-means."""
     grid = reference.features.grid
-    height, width = reference.frame.rgb.shape[:2]
-    gap = 12
+    (height, width), gap = reference.frame.rgb.shape[:2], 12
     side = np.full((height, gap, 3), 255, np.uint8)
     picture = np.concatenate([reference.frame.rgb, side, target.frame.rgb], axis=1)
     figure, (axis,) = plots.show_images([picture], ["reference and target"], size=7.4)
@@ -113,13 +103,9 @@ def matches(
         found = compute(matcher, k, kmeans)
         known = valid[tuple(found.reference.T)]
         correct = correct_matches(found.target, cells[tuple(found.reference.T)]) & known
-        ends = np.stack(
-            [
-                plots.patch_centres(found.reference, grid, (height, width)),
-                plots.patch_centres(found.target, target.features.grid, target.frame.rgb.shape[:2]) + (width + gap, 0),
-            ],
-            axis=1,
-        )
+        first = plots.patch_centres(found.reference, grid, (height, width))
+        second = plots.patch_centres(found.target, target.features.grid, target.frame.rgb.shape[:2])
+        ends = np.stack([first, second + (width + gap, 0)], axis=1)
         for kind, which in zip(lines, (correct, known & ~correct, ~known)):
             lines[kind].set_segments(ends[which])
         dots.set_data(*ends.reshape(-1, 2).T)

@@ -10,27 +10,18 @@ from scipy.stats import binom
 from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider
-
-_STEP = 5  # degrees between the angles with precomputed distances
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider, small_text
 
 
 def order_probabilities(n: int, first: float, second: float) -> tuple[float, float]:
-    """Return the probabilities that the second method measures above, and below, the first.
-
-    The methods have true accuracies in [0, 1], and n pairs of their own each.
-    """
+    """Return how likely the second of two true accuracies in [0, 1] measures above, and below, each on n pairs."""
     k = np.arange(n + 1)
     probability = binom.pmf(k, n, second)
     return float(probability @ binom.cdf(k - 1, n, first)), float(probability @ binom.sf(k, n, first))
 
 
 def measured_accuracy() -> Widget:
-    """Show the distributions of the measured Acc30 of two methods.
-
-    The controls are the number of pairs, the true accuracy of the first method, and the gain of the second. The
-    caption gives the probability that a benchmark ranks both correctly.
-    """
+    """Show the distributions of the measured Acc30 of two methods, and how often a benchmark ranks them correctly."""
     figure, axis = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
     lines = [
         axis.plot([], [], color=colour, linestyle=style, linewidth=2, label=label)[0]
@@ -68,34 +59,28 @@ def rotated_distance(
 ) -> Float[np.ndarray, " k"]:
     """Return the mean closest-point distance of a cloud, rotated about z, to another cloud.
 
-    With the same cloud twice, this is the error for symmetric objects of Hinterstoisser et al. (ADD-S) of a pose with
-    that rotation error.
+    With the same cloud twice, it is the error for symmetric objects (ADD-S) of Hinterstoisser et al.
     """
-    cloud, other = np.asarray(cloud, np.float64), np.asarray(other, np.float64)
     search = NearestNeighbors(n_neighbors=1).fit(other)
-    return np.array([search.kneighbors(_rotate_z(cloud, angle))[0].mean() for angle in np.asarray(degrees, np.float64)])
+    return np.array([search.kneighbors(_rotate_z(cloud, angle))[0].mean() for angle in degrees])
 
 
 def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> Widget:
-    """Show an object rotated about z over itself, with its rotation error and its closest-point distance.
-
-    The clouds, by name, are centred, in scene units with z up, and have about a thousand points each.
-    """
-    angles = np.arange(0, 181, _STEP)
+    """Show a centred cloud rotated about z over itself, with its rotation error and its closest-point distance."""
+    angles = np.arange(0, 181, 5)
     curves = {name: rotated_distance(cloud, cloud, angles) for name, cloud in clouds.items()}
     figure, (above, graph) = plt.subplots(1, 2, figsize=(8, 3.3), width_ratios=(1, 1.3), layout="constrained")
     fixed = above.scatter([], [], s=5, color=ORANGE, marker="D", linewidths=0, label="true pose")
     rotated = above.scatter([], [], s=5, color=BLUE, linewidths=0, label="rotated")
     reach = 1.05 * max(np.linalg.norm(np.asarray(cloud)[:, :2], axis=1).max() for cloud in clouds.values())
     above.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title="from above (scene units)")
-    above.tick_params(labelsize=8)
-    above.legend(fontsize=8, loc="upper right", markerscale=2)
+    above.legend(loc="upper right", markerscale=2)
     (line,) = graph.plot(angles, angles, color="0.3")
     (dot,) = graph.plot([], [], "o", color=BLUE, markersize=9, clip_on=False)
     graph.set(xlim=(-4, 184), ylim=(0, 1.1 * max(curve.max() for curve in curves.values())), xticks=range(0, 181, 45))
     graph.set(xlabel="rotation error (degrees)", ylabel="closest-point distance (scene units)")
-    for axis in (above, graph):
-        axis.title.set_fontsize(9)
+    small_text(above)
+    small_text(graph)
 
     def update(cloud: str, angle: int) -> str:
         points = np.asarray(clouds[cloud])

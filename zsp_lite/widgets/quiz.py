@@ -31,15 +31,7 @@ def read_questions(notebook: str) -> list[list[dict]]:
 
 
 def self_check(notebook: str, number: int) -> None:
-    """Show the questions of a self-check below the cell; the answers get feedback at once, without a kernel.
-
-    Args:
-        notebook: Number of the notebook with two digits, "00".
-        number: Number of the self-check in the notebook, counted from 1.
-
-    Raises:
-        InputError: There is no such self-check, or jupyterquiz is not installed, or no notebook is running.
-    """
+    """Show a self-check of a notebook ("00") below the cell, the first by 1; answers get feedback without a kernel."""
     checks = read_questions(notebook)
     check_integer("number", number, 1, len(checks))
     jupyterquiz = load_package("jupyterquiz")

@@ -13,7 +13,7 @@ from zsp_lite.verified.poses import rotation_angles
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, forward_terms
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.viz.verified import POINT_CLASSES, classify_points, score_contributions
-from zsp_lite.widgets.common import Widget, interactive_figure, slider
+from zsp_lite.widgets.common import Widget, interactive_figure, slider, small_text
 
 if TYPE_CHECKING:
     from zsp_lite.views import View
@@ -25,10 +25,7 @@ _LIMIT = 2.2  # of the 3D axes, in standard deviations of the object
 def ranked_hypotheses(
     solution: Solution, targets: Sequence["View"], weights: ScoreCoefficients = ScoreCoefficients()
 ) -> Widget:
-    """Show one hypothesis: point clouds in 3D, points in a target view, and the terms of the score.
-
-    The controls are the rank of the hypothesis, the target view, and the azimuth of the 3D plot.
-    """
+    """Show one hypothesis: point clouds in 3D, points in a target view, and the terms of the score."""
     used = sorted(solution.view_order)
     found, scene = solution.hypotheses, solution.scene
     point_terms = forward_terms(scene, solution.poses)
@@ -67,8 +64,8 @@ def ranked_hypotheses(
     bar_axis.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     values = [part[name] for part in parts for name in names]
     bar_axis.set_xlim(min(0.0, *values) * 1.1 - 0.1, max(0.0, *values) * 1.1 + 0.1)
-    bar_axis.set_xlabel("weight × term (nats)", fontsize=8)
-    bar_axis.tick_params(labelsize=8)
+    bar_axis.set_xlabel("weight × term (nats)")
+    small_text(bar_axis)
 
     def update(rank: int, view: int, azimuth: int) -> str:
         index, position = rank - 1, solution.view_order.index(used[view - 1])
@@ -77,12 +74,10 @@ def ranked_hypotheses(
         space.view_init(elev=15, azim=azimuth)
         frame = targets[used[view - 1]].frame
         picture.set_data(frame.rgb)
-        limits = np.array(frame.camera.size[::-1])
-        counts = []
+        limits, shown = np.array(frame.camera.size[::-1]), classes[index][position]
         for point_class, mark in enumerate(marks):
-            at = pixels[index, position][classes[index][position] == point_class]
-            mark.set_offsets(np.clip(at, 0, limits))
-            counts.append(len(at))
+            mark.set_offsets(np.clip(pixels[index, position][shown == point_class], 0, limits))
+        counts = np.bincount(shown, minlength=len(marks))
         image_axis.set_title(f"target {used[view - 1] + 1}", fontsize=9)
         for bar, name in zip(bars, names):
             bar.set_width(parts[index][name])
@@ -117,9 +112,9 @@ def _clouds(figure: Figure, cell, solution: Solution, moved: np.ndarray):
     )
     span = (-_LIMIT, _LIMIT)
     space.set(xlim=span, ylim=span, zlim=span, xticks=[], yticks=[], zticks=[])
-    space.set_xlabel("right", fontsize=8, labelpad=-14)
-    space.set_ylabel("forward", fontsize=8, labelpad=-14)
-    space.set_zlabel("up", fontsize=8, labelpad=-14)
+    for axis, name in ((space.xaxis, "right"), (space.yaxis, "forward"), (space.zaxis, "up")):
+        axis.set_label_text(name, fontsize=8)
+        axis.labelpad = -14
     space.set_box_aspect((1, 1, 1), zoom=1.2)
     space.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2, fontsize=7, frameon=False, markerscale=2)
     return space, cloud

@@ -1,32 +1,40 @@
 """Widget on the best view: the target views around their object, their scores, and the matches of the best."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Bool, Float, Real
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.image import AxesImage
 
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch
 from zsp_lite.data.cameras import Camera, ground_axes
 from zsp_lite.views import View
 from zsp_lite.viz.plots import BLUE, CHOSEN, patch_centres
-from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider, small_text
 
 _GAP = 16  # pixels between the two images of a `MatchCanvas`
 
 
-@dataclass(frozen=True, eq=False)
 class MatchCanvas:
-    """Two images side by side in one axes; `draw` replaces the lines between them."""
+    """Two images (H, W, 3) side by side in one axes; `draw` replaces the lines between them."""
 
-    images: tuple[AxesImage, AxesImage]
-    inliers: LineCollection
-    outliers: LineCollection
-    offset: float
+    def __init__(self, axis: Axes, first: np.ndarray, second: np.ndarray, titles: tuple[str, str]):
+        """Draw the images; both have one size."""
+        height, width = first.shape[:2]
+        self.offset = width + _GAP
+        self.images = []
+        for image, title, left in zip((first, second), titles, (0, self.offset)):
+            extent = (left, left + width, height, 0)
+            self.images.append(axis.imshow(image, extent=extent, interpolation="nearest"))
+            axis.text(left + width / 2, -5, title, ha="center", va="bottom", fontsize=9)
+        axis.set(xlim=(0, self.offset + width), ylim=(height, -22))
+        axis.set_axis_off()
+        dashed = LineCollection([], colors="0.45", linewidths=0.7, linestyles="dashed", alpha=0.8)
+        self.outliers = axis.add_collection(dashed)
+        self.inliers = axis.add_collection(LineCollection([], cmap="cividis", linewidths=1.5))
+        self.inliers.set_clim(0, 1.1 * height)  # without the brightest end of the colour map, invisible on light images
 
     def draw(
         self,
@@ -36,30 +44,10 @@ class MatchCanvas:
     ) -> None:
         """Draw lines between matched pixels; the lines of outliers are thin, dashed and grey."""
         segments = np.stack([first, np.asarray(second) + (self.offset, 0)], axis=1)
-        inliers = np.ones(len(segments), bool) if inliers is None else np.asarray(inliers, bool)
+        inliers = np.ones(len(segments), bool) if inliers is None else inliers
         self.inliers.set_segments(segments[inliers])
         self.inliers.set_array(segments[inliers, 0, 1])
         self.outliers.set_segments(segments[~inliers])
-
-
-def match_canvas(axis: Axes, first: np.ndarray, second: np.ndarray, titles: tuple[str, str]) -> MatchCanvas:
-    """Draw two images (H, W, 3) side by side, prepared for the lines of matches."""
-    height, width = first.shape[:2]
-    offset = width + _GAP
-    images = tuple(
-        axis.imshow(image, extent=(left, left + width, height, 0), interpolation="nearest")
-        for image, left in ((first, 0), (second, offset))
-    )
-    axis.set(xlim=(0, offset + width), ylim=(height, -22))
-    axis.set_axis_off()
-    for title, left in zip(titles, (0, offset), strict=True):
-        axis.text(left + width / 2, -5, title, ha="center", va="bottom", fontsize=9)
-    outliers = LineCollection([], colors="0.45", linewidths=0.7, linestyles="dashed", alpha=0.8)
-    inliers = LineCollection([], cmap="cividis", linewidths=1.5)
-    inliers.set_clim(0, 1.1 * height)  # without the brightest end of the colour map, invisible on light images
-    axis.add_collection(outliers)
-    axis.add_collection(inliers)
-    return MatchCanvas(images, inliers, outliers, offset)
 
 
 def viewpoints_from_above(
@@ -83,11 +71,10 @@ def best_view(
     positions: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "1 2"]],
     angles: Float[np.ndarray, " n"],
 ) -> Widget:
-    """Show the best of N target views by each view selector, and its matches.
+    """Show the best of N target views, in the order of the camera's path, by each view selector, and its matches.
 
-    The controls are the selector, the number of target views, and the first of them. Targets are in the order of the
-    camera's path; `positions` are those of the targets and of the reference, from `viewpoints_from_above`, and `angles`
-    the rotation in degrees between each target view and the reference.
+    `positions` are those of the targets and of the reference, from `viewpoints_from_above`, and `angles` the rotation
+    in degrees between each target view and the reference.
     """
     n = len(targets)
     scores = {name: np.array([score(pair) for pair in pairs]) for name, score in VIEW_SELECTORS.items()}
@@ -107,12 +94,11 @@ def best_view(
     dots = graph.scatter(angles, np.zeros(n), s=40, c=np.zeros(n), cmap="cividis", edgecolors="0.3", zorder=3)
     circle = graph.scatter([], [], s=150, facecolors="none", edgecolors=CHOSEN, linewidths=2.5)
     graph.set(xlim=(-8, 188), xticks=(0, 90, 180), title="score against angle")
-    graph.set_xlabel("angle to the reference (degrees)", fontsize=8)
-    graph.tick_params(labelsize=8)
-    for axis in (above, graph):
-        axis.title.set_fontsize(9)
+    graph.set_xlabel("angle to the reference (degrees)")
+    small_text(above)
+    small_text(graph)
     rgb = [view.frame.rgb for view in targets]
-    canvas = match_canvas(images, reference.frame.rgb, rgb[0], ("reference", "best view"))
+    canvas = MatchCanvas(images, reference.frame.rgb, rgb[0], ("reference", "best view"))
 
     def update(score: str, views: int, first: int) -> str:
         available = evenly_spaced(n, views, first - 1)
