@@ -19,8 +19,7 @@ from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
-
-Triple = tuple[float, float, float]
+Row = tuple[float, float, float]
 
 
 class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
@@ -42,8 +41,8 @@ class MaskAnnotation(msgspec.Struct, frozen=True, gc=False):
 class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """PyTorch3D camera (see `Camera.from_pytorch3d`); v1 files have no `intrinsics_format`."""
 
-    R: tuple[Triple, Triple, Triple]
-    T: Triple
+    R: tuple[Row, Row, Row]
+    T: Row
     focal_length: tuple[float, float]
     principal_point: tuple[float, float]
     intrinsics_format: Literal["ndc_norm_image_bounds", "ndc_isotropic"] = NDC_NORM_IMAGE_BOUNDS
@@ -101,8 +100,8 @@ class FrameIndex:
     def frame(self, position: int) -> FrameAnnotation:
         """Decode the entry at a position; InputError, which names file, frame and field, if a field is invalid."""
         key = self.keys[position]
-        where = f"(entry {position}: frame {key.frame_number} of {key.sequence_name})"
-        return decode_json(self.entries[position], FrameAnnotation, f"frame annotations {self.path} {where}")
+        what = f"frame annotations {self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
+        return decode_json(self.entries[position], FrameAnnotation, what)
 
 
 def read_frame_index(path: Path) -> FrameIndex:

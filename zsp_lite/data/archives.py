@@ -153,7 +153,7 @@ def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipIn
     wanted = [one for one in members if _is_annotation(one) or sizes.get(one) != one.file_size]
     wanted.sort(key=lambda one: (_is_annotation(one), one.header_offset))
     for member in tqdm(wanted, "unpacking", disable=None):
-        _write_member(zipped, member, targets[member])
+        write_atomic(targets[member], zipped.read(member))
 
 
 def _members(zipped: zipfile.ZipFile, category: str, sequences: Collection[str] | None = None) -> list[zipfile.ZipInfo]:
@@ -189,17 +189,6 @@ def _zip(file: io.RawIOBase, where: str) -> Iterator[zipfile.ZipFile]:
 
 def _is_annotation(member: zipfile.ZipInfo) -> bool:
     return member.filename.count("/") == 1
-
-
-def _write_member(zipped: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(target.name + ".part")  # renamed when complete, so that sizes tell what is there
-    try:
-        with zipped.open(member) as source, open(part, "wb") as file:
-            shutil.copyfileobj(source, file, 1 << 20)
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _read_record(root: Path) -> dict[str, _Unpacked]:

@@ -229,24 +229,21 @@ def write_co3d(
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
     with writing(folder):
-        entries, keys = [], []
+        frames, listed = [], []  # the name of the sequence, and the entry in the file
         if frames_path.is_file():
             index = read_frame_index(frames_path)
-            entries, keys = index.entries, index.keys
-        listed = []
+            frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
         if sequences_path.is_file():
             names = [one.sequence_name for one in read_sequences(sequences_path)]
             listed = list(zip(names, msgspec.json.decode(read_annotations(sequences_path), type=list[msgspec.Raw])))
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
-            kept = [position for position, key in enumerate(keys) if key.sequence_name != sequence.name]
-            entries = [entries[position] for position in kept] + annotations
-            keys = [keys[position] for position in kept]
-            keys += [FrameKey(frame.sequence_name, frame.frame_number) for frame in annotations]
-            listed = [item for item in listed if item[0] != sequence.name] + [(sequence.name, annotation)]
-            write_atomic(frames_path, compress(msgspec.json.encode(entries, enc_hook=np.ndarray.tolist)))
-            write_atomic(sequences_path, compress(msgspec.json.encode([entry for _, entry in listed])))
+            frames = [one for one in frames if one[0] != sequence.name] + [(sequence.name, one) for one in annotations]
+            listed = [one for one in listed if one[0] != sequence.name] + [(sequence.name, annotation)]
+            for path, entries in ((frames_path, frames), (sequences_path, listed)):
+                content = msgspec.json.encode([entry for _, entry in entries], enc_hook=np.ndarray.tolist)
+                write_atomic(path, compress(content))
 
 
 def _write_sequence(
@@ -270,8 +267,7 @@ def _write_sequence(
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)
         view = Viewpoint(**frame.camera.to_pytorch3d(intrinsics_format))  # its arrays are written as lists
-        is_v2 = intrinsics_format == NDC_ISOTROPIC
-        meta = {"frame_splits": [], "eval_batch_maps": []} if is_v2 else msgspec.UNSET
+        meta = {"frame_splits": [], "eval_batch_maps": []} if intrinsics_format == NDC_ISOTROPIC else msgspec.UNSET
         annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta))
     cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)

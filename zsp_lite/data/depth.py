@@ -66,10 +66,8 @@ def patch_points(
     depth takes the in-painted depth at its central pixel. (The paper in-paints the depth and unprojects the matches;
     it does not say which of a patch's 64 pixels it takes.)
 
-    In-painting takes most of the time; without, the point of a patch without known depth is the origin.
-
-    Returns:
-        Points (rows, columns, 3), and (rows, columns) whether the patch has a known depth.
+    Also returns whether each patch has a known depth. In-painting takes most of the time; without, the point of a patch
+    without known depth is the origin.
     """
     depth = np.asarray(depth, dtype=np.float32)
     rows, row_valid, row_middle = _split(depth.shape[0], grid[0])

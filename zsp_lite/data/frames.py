@@ -134,10 +134,7 @@ def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
-    """Read a CO3D depth file, a 16-bit PNG that holds the bits of float16 values; InputError if it is no such file.
-
-    The result is (H, W) depth, 0 where unknown: the stored depth times `scale_adjustment`.
-    """
+    """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is no such file."""
     return decode_depth(read_grey16(path), scale_adjustment)
 
 

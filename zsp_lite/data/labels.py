@@ -110,16 +110,8 @@ def relative_pose(
 ) -> Float[np.ndarray, "4 4"]:
     """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
 
-    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it from left to right.
-
-    Args:
-        label_a: Label T0a of the reference frame's sequence.
-        camera_a: Camera of the reference frame.
-        label_b: Label T0b of the target frame's sequence.
-        camera_b: Camera of the target frame.
-
-    Returns:
-        (4, 4) transform from the coordinates of camera a to those of camera b, for column vectors.
+    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it from left to right. It
+    leads from the coordinates of the reference frame's camera a to those of the target's camera b, for column vectors.
     """
     if label_a.reference_seq != label_b.reference_seq:
         raise InputError(

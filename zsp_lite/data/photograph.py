@@ -36,9 +36,8 @@ def motorcycle_photograph() -> Frame:
         D. Scharstein, H. Hirschmueller, Y. Kitajima, G. Krathwohl, N. Nesic, X. Wang and P. Westling.
         High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
 
-    Returns:
-        Frame of 500 x 741 pixels. Its world is the camera's frame. Lengths are scaled as in CO3D (supplement), so that
-        the points of the object have unit standard deviation, averaged over the axes; one unit is about 0.22 m.
+    The world is the camera's frame. Lengths are scaled as in CO3D (supplement), so that the points of the object have
+    unit standard deviation, averaged over the axes; one unit is about 0.22 m.
     """
     import skimage.data
 

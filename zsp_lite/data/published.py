@@ -47,8 +47,7 @@ def write_all(files: dict[Path, bytes], replace: bool) -> None:
     """Write all files; without `replace`, InputError and none is written if one exists with other content."""
     conflicts = [path for path, data in files.items() if path.exists() and read_bytes(path, "file") != data]
     if conflicts and not replace:
-        more = f" and {len(conflicts) - 1} more" if len(conflicts) > 1 else ""
-        raise InputError(f"{conflicts[0]}{more} would be replaced by other content, expected --replace to do so")
+        raise InputError(f"{conflicts[0]} would be replaced by other content, expected --replace to do so")
     for path, data in files.items():
         write_atomic(path, data)
 

@@ -69,7 +69,7 @@ def labelled_v2_categories(root: str | Path) -> list[str]:
     dataset, found = Co3D(root), []
     for category in dataset.categories():
         names = {key.sequence_name for key in dataset.frame_list(category)} & set(read_labels(root, category))
-        views = (one.viewpoint for name in sorted(names)[:1] for one in dataset.frames(category, name))
-        if any(view is not None and view.intrinsics_format == NDC_ISOTROPIC for view in views):
+        views = [one.viewpoint for name in sorted(names)[:1] for one in dataset.frames(category, name)]
+        if any(view and view.intrinsics_format == NDC_ISOTROPIC for view in views):
             found.append(category)
     return found

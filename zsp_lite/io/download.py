@@ -74,13 +74,9 @@ def remote_size(url: str) -> int | None:
 
 
 class RemoteFile(io.RawIOBase):
-    """A file on a server, of which only the parts that are read are transferred (HTTP range requests).
-
-    For zipfile and the like; `io.BufferedReader(RemoteFile(url), size)` makes few large requests of many small reads.
-    """
+    """A file on a server, of which only the parts that are read are transferred (HTTP range requests)."""
 
     def __init__(self, url: str):
-        """Ask for the size of the file; InputError if the server cannot be reached."""
         super().__init__()
         self.url, self.size, self._position = url, remote_size(url) or 0, 0
 
@@ -140,12 +136,11 @@ def _fetch_rest(url: str, part: Path, most: float) -> bool:
         start = start if _is_part(response, start) else 0
         length = response.headers.get("Content-Length")
         total = None if length is None else start + int(length)
-        bar = tqdm(desc=part.stem, total=total, initial=start, unit="B", unit_scale=True, disable=None)
-        with bar, open(part, "ab" if start else "wb") as file:
+        shown = tqdm.wrapattr(response, "read", total, desc=part.stem, initial=start, disable=None)
+        with shown as source, open(part, "ab" if start else "wb") as file:
             try:
-                while file.tell() <= most and (chunk := response.read(CHUNK)):
+                while file.tell() <= most and (chunk := source.read(CHUNK)):
                     file.write(chunk)
-                    bar.update(len(chunk))
             except (http.client.IncompleteRead, ConnectionError, TimeoutError):
                 return False
             return total is None or file.tell() >= min(total, most)

@@ -63,22 +63,19 @@ def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
 
 def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
     """Return the size of a file in bytes; InputError if it is longer than `most`, no file, or cannot be read."""
-    size, problem = 0, ""
     try:
         status = os.stat(path)
-        size = status.st_size
-        if not stat.S_ISREG(status.st_mode):
-            # A pipe or a device may never end.
+        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
             problem = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
-        elif size > most:
-            problem = f"{size} bytes, expected at most {most}"
-        elif not os.access(path, os.R_OK):
+        elif status.st_size > most:
+            problem = f"{status.st_size} bytes, expected at most {most}"
+        elif os.access(path, os.R_OK):
+            return status.st_size
+        else:
             problem = "permission denied"
     except (OSError, ValueError) as error:
         problem = _reason(error)
-    if problem:
-        raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
-    return size
+    raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
 
 
 def sha256(path: str | Path, what: str) -> str:
@@ -98,13 +95,12 @@ def decompress(data: bytes, what: str) -> bytes:
     limit = min(MAX_FILE, max(GROWTH_ALLOWED, _GROWTH_FACTOR * len(data)))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            content = file.read(limit + 1)
-        problem = f"{len(data)} bytes grow to more than {limit}" if len(content) > limit else ""
+            if len(content := file.read(limit + 1)) <= limit:
+                return content
+        problem = f"{len(data)} bytes grow to more than {limit}"
     except (OSError, EOFError, zlib.error) as error:
         problem = str(error)
-    if problem:
-        raise InputError(f"{what}: not complete gzip data: {problem}")
-    return content
+    raise InputError(f"{what}: not complete gzip data: {problem}")
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
@@ -113,12 +109,12 @@ def path_inside(root: str | Path, relative: str) -> Path:
     try:
         resolved = (root / relative).resolve()
         resolved.exists()  # raises OSError where a name is too long
-        problem = "" if resolved.is_relative_to(root) and not Path(relative).is_absolute() else "leads out of"
+        if resolved.is_relative_to(root) and not Path(relative).is_absolute():
+            return resolved
+        problem = "leads out of"
     except (ValueError, OSError, RuntimeError):  # null byte, name too long, cyclic links
         problem = "is invalid in"
-    if problem:
-        raise InputError(f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside")
-    return resolved
+    raise InputError(f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside")
 
 
 def plain_name(name: str, what: str) -> str:

@@ -10,9 +10,8 @@ import sys
 def load_open3d():
     """Import and return the `open3d` module.
 
-    Open3D's Linux wheels link against libusb-1.0, which is often not installed. The package `libusb-package` contains
-    that library; it is loaded first, with global symbols. Open3D's web viewer is disabled unless the environment
-    variable is set, because in a notebook it starts a server and prints a message.
+    Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded first, from the package
+    `libusb-package`. Open3D's web viewer, which starts a server in a notebook, is disabled unless the variable is set.
     """
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     if sys.platform.startswith("linux"):

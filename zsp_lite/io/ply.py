@@ -20,10 +20,7 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit colours.
-
-    Written here rather than by trimesh, because the sample data must be reproducible byte for byte.
-    """
+    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit colours."""
     check_magnitude(f"point cloud {path}", points)
     vertices = np.zeros(len(points), dtype=_VERTEX)
     vertices["position"], vertices["colour"] = points, colours
@@ -40,21 +37,17 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
     Colours are rescaled from [0, 1] if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken
     as [0, 255] otherwise. InputError if the file is damaged, or positions are not finite or above 1e9.
     """
+    from trimesh.exchange.ply import load_ply  # takes 0.5 s to import
+
     data = read_bytes(path, "point cloud")
     try:
-        points, colours = _parse(data)
+        loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
+        points, colours = loaded["vertices"].astype(np.float64), loaded["vertex_colors"]
+        colours = None if colours is None else _to_8_bit(colours[:, :3])
     except Exception as error:  # trimesh raises IndexError, KeyError and others for malformed files
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
     check_magnitude(f"point cloud {path}", points)
     return points, colours
-
-
-def _parse(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
-    from trimesh.exchange.ply import load_ply  # takes 0.5 s to import
-
-    loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
-    colours = loaded["vertex_colors"]
-    return loaded["vertices"].astype(np.float64), None if colours is None else _to_8_bit(colours[:, :3])
 
 
 def _to_8_bit(colours: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
