@@ -15,12 +15,7 @@ from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import icp as icp_module
 from zsp_lite.baselines.essential_matrix import essential_rotation
 from zsp_lite.baselines.icp import align, icp
-from zsp_lite.baselines.posecontrast import (
-    ViewpointHead,
-    euler_to_rotation,
-    load_posecontrast,
-    square_crop,
-)
+from zsp_lite.baselines.posecontrast import ViewpointHead, euler_to_rotation, load_posecontrast, square_crop
 from zsp_lite.baselines.resnet import ResNet50
 from zsp_lite.baselines.sift import Keypoints, Sift, mutual_matches, unproject_pixels
 from zsp_lite.baselines.swav import load_swav
@@ -31,46 +26,14 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 
 
-def torchvision_shapes() -> dict[str, tuple[int, ...]]:
-    """Keys and shapes of torchvision's ResNet-50 without its last layer, by its definition."""
-    shapes: dict[str, tuple[int, ...]] = {"conv1.weight": (64, 3, 7, 7)}
-    norms = {"bn1": 64}
-    entering = 64
-    for i, blocks in enumerate((3, 4, 6, 3)):
-        width = 64 * 2**i
-        for j in range(blocks):
-            at = f"layer{i + 1}.{j}"
-            shapes[f"{at}.conv1.weight"] = (width, entering, 1, 1)
-            shapes[f"{at}.conv2.weight"] = (width, width, 3, 3)
-            shapes[f"{at}.conv3.weight"] = (4 * width, width, 1, 1)
-            norms |= {f"{at}.bn1": width, f"{at}.bn2": width, f"{at}.bn3": 4 * width}
-            if j == 0:
-                shapes[f"{at}.downsample.0.weight"] = (4 * width, entering, 1, 1)
-                norms[f"{at}.downsample.1"] = 4 * width
-            entering = 4 * width
-    for name, channels in norms.items():
-        shapes |= {f"{name}.{part}": (channels,) for part in ("weight", "bias", "running_mean", "running_var")}
-        shapes[f"{name}.num_batches_tracked"] = ()
-    return shapes
-
-
-def random_state(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    state = {}
-    for name, shape in shapes.items():
-        if name.endswith("num_batches_tracked"):
-            state[name] = torch.tensor(3)
-        else:
-            scale = max(1, int(np.prod(shape[1:]))) ** -0.5
-            state[name] = scale * torch.randn(shape, generator=generator)
-            if name.endswith("running_var"):
-                state[name] = state[name].abs() + 0.5
-    return state
-
-
-def test_resnet50_has_torchvisions_keys_and_its_layers_their_strides():
+def test_resnet50_has_torchvisions_weights_and_its_layers_their_strides():
     model = ResNet50()
-    assert {key: tuple(x.shape) for key, x in model.state_dict().items()} == torchvision_shapes()
+    shapes = {key: tuple(x.shape) for key, x in model.state_dict().items()}
+    # torchvision's 25,557,032 parameters and 320 entries without the last layer
+    assert sum(x.numel() for x in model.parameters()) == 25_557_032 - 1000 * 2049 and len(shapes) == 318
+    assert shapes["conv1.weight"] == (64, 3, 7, 7) and shapes["layer1.0.downsample.0.weight"] == (256, 64, 1, 1)
+    assert shapes["layer2.0.conv2.weight"] == (128, 128, 3, 3) and shapes["layer3.5.bn3.running_var"] == (1024,)
+    assert shapes["layer4.0.downsample.1.bias"] == (2048,) and shapes["layer4.2.conv1.weight"] == (512, 2048, 1, 1)
     layers = model(torch.zeros(1, 3, 64, 64))
     assert [tuple(x.shape[1:]) for x in layers] == [(256, 16, 16), (512, 8, 8), (1024, 4, 4), (2048, 2, 2)]
 
@@ -89,13 +52,12 @@ def test_a_block_is_three_convolutions_and_a_shortcut():
 @pytest.mark.slow
 def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
-    state = {f"module.{key}": x for key, x in random_state(torchvision_shapes()).items()}
-    heads = {"projection_head.0.weight": (8, 2048), "projection_head.0.bias": (8,), "prototypes.weight": (5, 8)}
+    state = ResNet50().state_dict() | {"projection_head.0.weight": torch.ones(8), "prototypes.weight": torch.ones(8)}
+    state = {f"module.{key}": x for key, x in state.items()}
     path = tmp_path / "swav_800ep_pretrain.pth.tar"
-    torch.save(state | {f"module.{key}": x for key, x in random_state(heads).items()}, path)
+    torch.save(state, path)
     (found,) = load_swav()([np.full((224, 224, 3), 100, np.uint8)])
-    assert found.keys.shape == (28, 28, 1024) and found.global_feature.shape == (2048,)
-    assert found.saliency.min() == 1
+    assert found.keys.shape == (28, 28, 1024) and found.global_feature.shape == (2048,) and found.saliency.min() == 1
     torch.save(state | {"module.conv1.weight": torch.zeros(64, 3, 5, 5)}, path)
     with pytest.raises(InputError, match="conv1.weight"):
         load_swav()
@@ -127,16 +89,14 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
 
 @pytest.mark.slow
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path, monkeypatch):
-    head, path = ViewpointHead().eval().requires_grad_(False), tmp_path / "posecontrast.pth"
-    features = random_state(torchvision_shapes() | {"fc.weight": (128, 2048), "fc.bias": (128,)})
+    head, network, path = ViewpointHead().eval().requires_grad_(False), ResNet50(), tmp_path / "posecontrast.pth"
+    features = network.state_dict() | {"fc.weight": torch.ones(128, 2048), "fc.bias": torch.ones(128)}
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head.state_dict()}, path)
     monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))
     model = load_posecontrast()
     frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
     (found,) = model.describe([frame])
     assert found.feature.shape == (2048,)
-    network = ResNet50()
-    network.load_state_dict(features, strict=False)
     batch = normalize(torch.from_numpy(square_crop(frame)).permute(2, 0, 1)[None] / 255)
     feature = head.compress(network(batch)[-1].mean((2, 3)))
     angles = []
@@ -202,9 +162,8 @@ def test_sift_matches_an_image_with_its_rotated_copy():
     camera = look_at((1, 0, 0), size=(224, 224))
     mask = np.zeros((224, 224), np.float32)
     mask[40:200, 30:190] = 1
-    first, second = (Frame(np.ascontiguousarray(t), None, m, camera) for t, m in (
-        (texture, mask), (np.rot90(texture), np.rot90(mask)),
-    ))  # fmt: skip
+    turned = Frame(np.ascontiguousarray(np.rot90(texture)), None, np.rot90(mask), camera)
+    first, second = Frame(texture, None, mask, camera), turned
     one, two = Sift().describe([first, second])
     a, b, similarity = mutual_matches(one, two)
     assert len(a) == 50 and (np.diff(similarity) <= 0).all()

@@ -139,11 +139,6 @@ def fails(problem):
     raise KeyError("angle")
 
 
-class NotANumber(CoordinateBackbone):
-    def __call__(self, images):
-        return [replace(one, keys=one.keys * float("nan")) for one in super().__call__(images)]
-
-
 def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
     settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     where = r"failed: .*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"
@@ -159,6 +154,10 @@ def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
 
 
 def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_failed(tmp_path):
+    class NotANumber(CoordinateBackbone):
+        def __call__(self, images):
+            return [replace(one, keys=one.keys * float("nan")) for one in super().__call__(images)]
+
     settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     with pytest.raises(InputError, match="keys, .* hold values that are not finite"):
         evaluate(small_folder(), NotANumber(grid=8), ["ours"], **settings)

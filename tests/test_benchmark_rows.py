@@ -7,6 +7,8 @@ import torch
 from benchmark_folder import small_folder
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import extractors
@@ -35,14 +37,10 @@ def run(tmp_path_factory):
     return summary["methods"], read_records(out).rows
 
 
-def test_every_row_answers_every_pair(run):
+def test_every_row_answers_every_pair_and_with_perfect_features_every_way_to_match_and_fit_is_right(run):
     rows, _ = run
     assert set(rows) == set(ROWS)
     assert all(row["n"] == 6 and row["failed"] == 0 for row in rows.values())
-
-
-def test_with_perfect_features_every_way_to_match_and_fit_is_right(run):
-    rows, _ = run
     exact = [*GROUPS["correspondences"], *GROUPS["matchers"], *GROUPS["trials"], *GROUPS["published"]]
     assert all(rows[name]["acc30"] >= 80 for name in exact)
     assert rows["ours-n1"]["acc30"] <= rows["ours-n3"]["acc30"] <= rows["ours-n5"]["acc30"]
@@ -143,9 +141,6 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
 
 
 def test_a_fingerprint_tells_apart_whatever_changes_the_features():
-    from zsp_lite.backbones.backbone import Backbone
-    from zsp_lite.backbones.vit import VisionTransformer
-
     torch.manual_seed(0)
     vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)
 
@@ -154,11 +149,8 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features():
 
     plain = of()
     assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
-    changes = [
-        dict(layer=1), dict(facet="query"), dict(saliency_heads=[1]), dict(image_size=64), dict(mean=(0, 0, 0)),
-        dict(std=(1, 1, 1)),
-    ]  # fmt: skip
-    assert len({plain, *(of(**change) for change in changes)}) == 1 + len(changes)
+    changes = {"layer": 1, "facet": "query", "saliency_heads": [1], "image_size": 64, "mean": (0,) * 3, "std": (1,) * 3}
+    assert len({plain, *(of(**{name: value}) for name, value in changes.items())}) == 1 + len(changes)
     with torch.no_grad():
         vit.cls_token += 1
     assert of() != plain

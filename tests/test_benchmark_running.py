@@ -51,33 +51,18 @@ def undisturbed(tmp_path_factory):
     return out, evaluate(small_folder(), QUICK, ROWS, 6, 3, out=out)
 
 
-def start(out: Path, workers: int = 1) -> subprocess.Popen:
-    command = [sys.executable, str(TESTS / "benchmark_folder.py"), str(small_folder()), str(out), str(workers)]
-    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
-    return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, text=True)
-
-
-def wait_for_pairs(process: subprocess.Popen, n: int) -> int:
-    """Wait until a process has stored so many pairs; returns how many it has."""
-    return next(int(line) for line in process.stdout if int(line) >= n)
-
-
-def kill(process: subprocess.Popen) -> None:
-    process.kill()
-    process.stdout.close()
-    process.wait()
+PATHS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
 
 
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
     stored = 0
     for workers, more in ((2, 1), (1, 3)):
-        process = start(tmp_path, workers)
-        reached = wait_for_pairs(process, stored + more)
-        process.send_signal(signal.SIGSTOP)  # it must not finish before it is killed
-        children = _children(process.pid)
-        with pytest.raises(InputError, match="another process is writing"):
-            evaluate(small_folder(), QUICK, ROWS, 6, 3, out=tmp_path)
-        kill(process)
+        command = [sys.executable, str(TESTS / "benchmark_folder.py"), str(small_folder()), str(tmp_path), str(workers)]
+        with subprocess.Popen(command, env=PATHS, stdout=subprocess.PIPE, text=True) as process:
+            reached = next(int(line) for line in process.stdout if int(line) >= stored + more)
+            process.send_signal(signal.SIGSTOP)  # it must not finish before it is killed
+            children = _children(process.pid)
+            process.kill()
         stored = len(read_records(tmp_path).evaluations)
         assert stored >= reached
         wait_for_end(children)  # a killed run's workers end by themselves
@@ -113,14 +98,13 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
 
 
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path):
-    seen = []
+    seen, before = [], _children(os.getpid())
 
     def kill_a_worker(done: int, total: int) -> None:
         if not seen:
             os.kill(max(_children(os.getpid()) - before), signal.SIGKILL)
         seen.append((done, total))
 
-    before = _children(os.getpid())
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3)
     with pytest.raises(InputError, match="run again"):
         evaluate(*arguments, out=tmp_path, workers=2, progress=kill_a_worker)
@@ -139,8 +123,7 @@ def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
-        victim = cluster.workers[0].pid
-        killed = []
+        victim, killed = cluster.workers[0].pid, []
 
         def kill_once(done: int, total: int) -> None:
             if not killed:
@@ -162,8 +145,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path):
         if done == 3:
             code = "import sys; from zsp_lite.cli.main import main; sys.exit(main(sys.argv[1:]))"
             command = [sys.executable, "-c", code, "tables", str(tmp_path), "--out", str(tmp_path / "tables")]
-            environment = os.environ | {"PYTHONPATH": str(TESTS.parent)}
-            assert subprocess.run(command, env=environment, stdout=subprocess.DEVNULL).returncode == 0
+            assert subprocess.run(command, env=PATHS, stdout=subprocess.DEVNULL).returncode == 0
             with pytest.raises(InputError, match="another process is writing"):
                 evaluate(*arguments, out=tmp_path)
         seen.append(read_results(tmp_path).summary["methods"]["ours-bv"]["n"])
@@ -183,10 +165,7 @@ def test_any_executor_will_do(undisturbed, tmp_path):
 class FirstFails(Executor):
     """Evaluates chunks at once; the first one fails."""
 
-    _max_workers = 2
-
-    def __init__(self):
-        self.submitted = 0
+    _max_workers, submitted = 2, 0
 
     def submit(self, function, *arguments):
         future = Future()
@@ -317,9 +296,6 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
         evaluate(small_folder(), QUICK, ROWS, 6, 3, out=run)
     with pytest.raises(InputError, match="nowhere/run.jsonl cannot be read"):
         read_records(tmp_path / "nowhere")
-
-
-def test_a_full_disk_is_bad_input(tmp_path):
     (tmp_path / RECORDS).symlink_to("/dev/full")
     with pytest.raises(InputError, match="run.jsonl cannot be written: .*No space left"):
         add_lines(tmp_path, [{"seconds": 1.0}])
@@ -402,9 +378,8 @@ def test_a_cached_feature_is_of_the_same_extractor_and_the_same_pixels(tmp_path)
 
 def test_hypotheses_are_kept_on_demand_and_the_second_poses_error_always(tmp_path):
     arguments = {"pairs": 2, "targets": 2, "categories": ["lump"]}
-    summary = evaluate(
-        small_folder(), BACKBONE, ["verified", "ours"], out=tmp_path / "a", keep_hypotheses=True, **arguments
-    )
+    both = {"methods": ["verified", "ours"], "out": tmp_path / "a", "keep_hypotheses": True}
+    summary = evaluate(small_folder(), BACKBONE, **both, **arguments)
     evaluate(small_folder(), BACKBONE, ["verified"], out=tmp_path / "b", **arguments)
     rows, either = read_records(tmp_path / "a").rows, []
     for key, plain in read_records(tmp_path / "b").rows["verified"].items():

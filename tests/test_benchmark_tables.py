@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from zsp_lite.benchmark import published
+from zsp_lite.benchmark import figures, published, tables
 from zsp_lite.benchmark.compare import compare, comparison_table, split_rows
-from zsp_lite.benchmark.figures import (
-    accuracy_against_views,
-    error_curves,
-    error_distribution,
-    reliability_diagram,
-    write_figures,
-)
 from zsp_lite.benchmark.formats import as_csv, as_html, as_latex, as_markdown, insert_tables, write_tables
 from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.published import PAPER_TABLES, VERIFIED_TARGETS
@@ -27,18 +20,7 @@ from zsp_lite.benchmark.reports import write_reports
 from zsp_lite.benchmark.results import Results, export_results, pool, read_results, read_runs
 from zsp_lite.benchmark.statistics import bootstrap_ci, object_draws, paired_test
 from zsp_lite.benchmark.summary import category_of, draws_of_pairs, objects_of, summarise_run
-from zsp_lite.benchmark.tables import (
-    PUBLISHED,
-    THIS_RUN,
-    PValue,
-    all_rows,
-    best_two_tables,
-    by_category,
-    category_tables,
-    every_table,
-    make_table,
-    paper_tables,
-)
+from zsp_lite.benchmark.tables import PUBLISHED, THIS_RUN, PValue, all_rows, every_table, make_table, paper_tables
 from zsp_lite.cli.terminal import as_rich
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
@@ -63,21 +45,14 @@ def made_up_run(out, rows=ROWS, seed=0, objects=PAIRS):
             Pair(category, names[i % objects], i, names[(i * i + 1) % objects], tuple(range(n or 5)))
             for category in CATEGORIES for i in range(PAIRS)
         ]  # fmt: skip
-    settings = {
-        "data": "made up", "seed": seed, "targets": 5, "methods": dict.fromkeys(rows, "x"), "backbone": "none",
-        "library": {"version": "0"},
-    }  # fmt: skip
+    settings = {"data": "made up", "seed": seed, "targets": 5, "backbone": "none", "library": {"version": "0"}}
+    settings |= {"methods": dict.fromkeys(rows, "x")}
     call = {"command": ["zsp-lite", "benchmark"], "rows": rows, "categories": list(CATEGORIES)}
     with open_run(out, settings):
         add_lines(out, [{"call": call}])
-        add_lines(out, (
-            {
-                "pair": pair.key, "seconds": 1.0, "timings": {}, "saliency_iou": {},
-                "results": {name: {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "",
-                                   "inliers": 9}},
-            }
-            for name in rows for pair in pairs[name]
-        ))  # fmt: skip
+        for name, pair in ((name, pair) for name in rows for pair in pairs[name]):
+            found = {"error": float(rng.uniform(0, 180)), "view": 0, "scale": 1.0, "note": "", "inliers": 9}
+            add_lines(out, [{"pair": pair.key, "seconds": 1.0, "timings": {}, "results": {name: found}}])
     return read_results(out).summary
 
 
@@ -97,32 +72,25 @@ def cell(table, row, column, group=THIS_RUN):
     return table.cells.loc[row, (group, column)]
 
 
-def test_every_table_of_the_paper_is_there(run):
-    names = [table.name for table in paper_tables(run[1])]
-    assert names == [
-        "table_1", "table_2", "table_3", "table_a_targets", "table_a_matchers", "table_a_correspondences",
-        "table_a_trials", "table_a_depth", "published_code", "beyond",
-    ]  # fmt: skip
-
-
 def test_a_tables_figures_are_the_runs_and_the_published_ones_stand_apart(run):
-    tables = {table.name: table for table in paper_tables(run[1])}
+    found = {table.name: table for table in paper_tables(run[1])}
+    assert list(found) == [*(table.name for table in PAPER_TABLES), "beyond"]
     ours = run[1]["methods"]["ours"]
-    found = cell(tables["table_1"], "Ours (K=50)", "Acc30 (%)")
-    assert (found.value, found.low, found.high) == (ours["acc30"], *ours["acc30_ci"])
+    acc30 = cell(found["table_1"], "Ours (K=50)", "Acc30 (%)")
+    assert (acc30.value, acc30.low, acc30.high) == (ours["acc30"], *ours["acc30_ci"])
     medians = [ours["per_category"][category]["median"] for category in CATEGORIES]
-    found = cell(tables["table_1"], "Ours (K=50)", "Med. err. (°)")
-    assert found.value == pytest.approx(np.mean(medians)) and found.low < found.value < found.high
+    median = cell(found["table_1"], "Ours (K=50)", "Med. err. (°)")
+    assert median.value == pytest.approx(np.mean(medians)) and median.low < median.value < median.high
+    assert "ours-n1" in run[1]["against_ours"] and "ours" not in run[1]["against_ours"]
     toasters = run[1]["methods"]["icp"]["per_category"]["toaster"]
-    assert cell(tables["table_1"], "ICP", "toaster Acc30").value == toasters["acc30"]
-    assert cell(tables["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
-    assert cell(tables["table_1"], "SWaV", "Acc30 (%)") is None
-    assert cell(tables["table_1"], "SWaV", "Acc30 (%)", PUBLISHED).value == 7.5
-    assert cell(tables["table_1"], "SWaV", "Acc30 (%)", THIS_RUN) is None
-    found = cell(tables["table_a_correspondences"], "K = 70", "Acc15 (%)", f"{THIS_RUN}: without k-means")
-    assert found.value == run[1]["methods"]["ours-k70-nokmeans"]["acc15"]
-    assert cell(tables["table_a_targets"], "views = 20", "full: Acc30 (%)", PUBLISHED).value == 52.1
-    assert list(tables["beyond"].cells.index) == ["ours", "rootsift", "verified"]
+    assert cell(found["table_1"], "ICP", "toaster Acc30").value == toasters["acc30"]
+    assert cell(found["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
+    assert cell(found["table_1"], "SWaV", "Acc30 (%)") is None
+    assert cell(found["table_1"], "SWaV", "Acc30 (%)", PUBLISHED).value == 7.5
+    acc15 = cell(found["table_a_correspondences"], "K = 70", "Acc15 (%)", f"{THIS_RUN}: without k-means")
+    assert acc15.value == run[1]["methods"]["ours-k70-nokmeans"]["acc15"]
+    assert cell(found["table_a_targets"], "views = 20", "full: Acc30 (%)", PUBLISHED).value == 52.1
+    assert list(found["beyond"].cells.index) == ["ours", "rootsift", "verified"]
 
 
 def test_a_run_of_three_rows_has_no_table_of_what_it_lacks(tmp_path):
@@ -146,24 +114,19 @@ def test_the_verified_solver_stands_beside_the_papers_by_number_of_views(tmp_pat
         found = cell(table, f"views = {n}", "Acc30 (%)", f"{THIS_RUN}: verified, true mask")
         assert found.value == summary["methods"][name]["acc30"]
     assert cell(table, "views = 3", "Acc30 (%)", f"{THIS_RUN}: the paper's") is None
-    left, _ = accuracy_against_views(read_results(tmp_path)).axes
+    left, _ = figures.accuracy_against_views(read_results(tmp_path)).axes
     assert list(left.get_lines()[-1].get_xdata()) == [1, 3, 5, 10]
 
 
-def test_rows_of_other_numbers_of_views_are_tested_where_they_ask_the_same(run):
-    against = run[1]["against_ours"]
-    assert "ours-n1" in against and "ours" not in against
-
-
 def test_figures_by_category_are_those_of_the_summary(run):
-    tables = [*zip(category_tables(run[1]), ("median", "acc30", "acc15")), (by_category(run[1], ROWS[:2]), None)]
-    for table, figure in tables:
+    found = [*zip(tables.category_tables(run[1]), ("median", "acc30", "acc15"))]
+    for table, figure in [*found, (tables.by_category(run[1], ROWS[:2]), None)]:
         for category in CATEGORIES:
             for name in ROWS[:2]:
                 at = (name, ("", category)) if figure else (category, ("", name))
                 assert table.cells.loc[at].value == run[1]["methods"][name]["per_category"][category][figure or "acc30"]
     with pytest.raises(InputError, match="no row nobody, expected some of icp"):
-        by_category(run[1], ["nobody"])
+        tables.by_category(run[1], ["nobody"])
 
 
 @pytest.mark.parametrize("content", [b"no gzip", gzip.compress(b'{"pairs": []}'), gzip.compress(b"{}")[:15]])
@@ -174,7 +137,7 @@ def test_what_is_no_run_is_refused(tmp_path, content):
             read_results(path)
 
 
-def test_all_formats_say_the_same(run):
+def test_all_formats_say_the_same(run, tmp_path):
     table = next(table for table in paper_tables(run[1]) if table.name == "table_3")
     ours = run[1]["methods"]["ours"]
     text = f"{ours['acc30']:.1f} [{ours['acc30_ci'][0]:.1f}, {ours['acc30_ci'][1]:.1f}]"
@@ -189,12 +152,9 @@ def test_all_formats_say_the_same(run):
     console.print(as_rich(table))
     for other in (as_latex(table), as_html(table), console.file.getvalue()):
         assert all(part in other for part in (*text.split(" ", 1), "46.3", "CorrespondSim"))
-
-
-def test_tables_are_written_in_all_formats(run, tmp_path):
-    written = write_tables(every_table(run[1]), tmp_path)
-    assert len(written) == 4 * len(every_table(run[1])) + 1 and all(path.stat().st_size for path in written)
-    assert (tmp_path / "tables.html").read_text().count("<table") == len(every_table(run[1]))
+    written = write_tables([table] * 2, tmp_path)
+    assert len(written) == 2 * 4 + 1 and all(path.stat().st_size for path in written)
+    assert written[-1].read_text().count("<table") == 2
 
 
 def test_a_document_gets_the_tables_that_it_has_marks_for(run):
@@ -221,9 +181,9 @@ def test_the_papers_figures_were_copied_right():
     assert published.TABLE_1["Ours (K=50)"] == ("ours", 53.8, 46.3, 31.1, 71.0, 26.0, 82.0, 39.0, 42.0)
     for table in (*PAPER_TABLES, VERIFIED_TARGETS):
         for line in table.rows.values():
-            rows, figures = line[: len(table.groups)], line[len(table.groups) :]
-            assert METHODS.keys() >= {row.removesuffix("-n5") for row in rows} and len(figures) == len(table.published)
-            assert all(0 <= figure <= 180 for figure in figures)
+            rows, values = line[: len(table.groups)], line[len(table.groups) :]
+            assert METHODS.keys() >= {row.removesuffix("-n5") for row in rows} and len(values) == len(table.published)
+            assert all(0 <= value <= 180 for value in values)
 
 
 def test_a_run_in_one_file_gives_the_same_tables(run, tmp_path):
@@ -250,11 +210,7 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
     a, b = first.errors("icp"), second.errors("icp")
     keys = sorted(a)
     test = paired_test([a[key] for key in keys], [b[key] for key in keys], weights=draws_of_pairs(keys))
-    assert (
-        found["icp"].test == test
-        and found["icp"].test["accuracy_gain_ci"]
-        != paired_test([a[key] for key in keys], [b[key] for key in keys])["accuracy_gain_ci"]
-    )
+    assert found["icp"].test == test
     assert found["icp"].acc30[1] - found["icp"].acc30[0] == pytest.approx(test["accuracy_gain"])
     (mixed,) = compare(first, first, [("ours", "icp")])
     table = comparison_table([mixed], "a", "b")
@@ -275,12 +231,6 @@ def test_rows_to_compare_may_have_colons_in_their_names():
     for text in ("my:row", "ours:", "", ":ours", "ours:my:row"):
         with pytest.raises(InputError, match="not in the runs, expected A:B or A with A one of ours, my:row and B"):
             split_rows(text, first, second)
-
-
-def test_the_names_of_objects_are_read_from_a_pairs_key():
-    pair = Pair("car", "seat_leon", 4, "wooden_car", (1, 2, 3))
-    assert category_of(pair.key) == "car"
-    assert objects_of(pair.key) == ("car/seat_leon", "car/wooden_car")
 
 
 def test_runs_on_different_objects_are_pooled(tmp_path):
@@ -326,31 +276,24 @@ def test_small_p_values_are_not_printed_as_zero(p, text):
     assert f"| {text} |" in as_markdown(make_table("t", "T", [("", "p")], {"ours": [PValue(p)]}))
 
 
-def test_a_run_against_itself_shows_no_difference(run):
-    results = read_once(run[0])
-    for one in compare(results, results):
-        assert one.test["accuracy_gain"] == one.test["error_drop"] == 0
-        assert {value for name, value in one.test.items() if name.endswith("_p")} == {1}
-
-
 def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_path):
     results = read_once(run[0])
-    (axis,) = error_distribution(results).axes
+    (axis,) = figures.error_distribution(results).axes
     assert sum(len(points.get_offsets()) for points in axis.collections) == 48
     assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES, reverse=True)
-    left, right = accuracy_against_views(results).axes
+    left, right = figures.accuracy_against_views(results).axes
     line = left.get_lines()[0]
     assert list(line.get_xdata()) == [1, 3, 5, 10, 20]
     assert line.get_ydata()[2] == results.summary["methods"]["ours-n5"]["acc30"]
     assert list(right.get_lines()[1].get_ydata()) == [13.4, 26.2, 31.1, 38.2, 38.3]
-    (axis,) = error_curves(results, ["ours", "icp"]).axes
+    (axis,) = figures.error_curves(results, ["ours", "icp"]).axes
     curve = axis.get_lines()[0]
     errors = np.array(list(results.errors("ours").values()))
     height = curve.get_ydata()[np.searchsorted(curve.get_xdata(), 30, side="right") - 1]
     assert height == pytest.approx(100 * np.mean(errors <= 30))
     made_up_run(tmp_path / "few", ["ours"])
     few = read_results(tmp_path / "few")
-    assert {path.stem for path in write_figures(few, tmp_path / "f")} == {"error_distribution", "error_curves"}
+    assert {path.stem for path in figures.write_figures(few, tmp_path / "f")} == {"error_distribution", "error_curves"}
     write_reports(run[0], tmp_path / "all")
     assert len(list((tmp_path / "all" / "figures").glob("*.png"))) == 3
     assert (tmp_path / "all" / "results.json.gz").is_file()
@@ -358,7 +301,7 @@ def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_pa
 
 def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     with pytest.raises(InputError, match="reliability: no row has 20 confidences"):
-        reliability_diagram(read_once(run[0]))
+        figures.reliability_diagram(read_once(run[0]))
     rng = np.random.default_rng(0)
     sure = rng.random(200)
     right = rng.random(200) < sure
@@ -372,7 +315,7 @@ def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     results = read_results(export_results(written, tmp_path / "results.json.gz"))
     assert results.confidences("ours") == {}
     np.testing.assert_allclose(list(results.confidences("verified").values()), sure, atol=1e-4)
-    figure = reliability_diagram(results)
+    figure = figures.reliability_diagram(results)
     line = figure.axes[0].lines[1]  # after the diagonal
     order = np.argsort(sure)
     np.testing.assert_allclose(line.get_xdata(), sure[order].reshape(10, 20).mean(1), atol=1e-3)
@@ -380,7 +323,7 @@ def test_confidences_are_kept_and_drawn_where_a_row_states_them(run, tmp_path):
     assert f"(all: {100 * right.mean():.0f} %)" in figure.axes[0].get_title()
 
 
-def made_up_answers(out):
+def made_up_answers():
     """A run of four pairs: of the row "verified", the second pose is right where the first is not, but for one pair."""
     answers = [
         {"error": 10.0, "second_error": 170.0, "one_of_two": False},
@@ -388,36 +331,28 @@ def made_up_answers(out):
         {"error": 120.0, "second_error": 90.0, "one_of_two": True},
         {"error": 180.0, "failed": "no depth"},
     ]
-    settings = {
-        "data": "made up", "seed": 0, "targets": 1, "methods": {"ours": "x", "verified": "x"}, "backbone": "none",
-        "library": {"version": "0"},
-    }  # fmt: skip
-    with open_run(out, settings):
-        add_lines(out, [{"call": {"command": [], "rows": ["ours", "verified"], "categories": ["chair"]}}])
-        add_lines(out, (
-            {"pair": Pair("chair", f"a{i}", 0, f"b{i}", (0,)).key, "seconds": 1.0, "timings": {}, "saliency_iou": {},
-             "results": {"ours": {"error": 40.0}, "verified": one}}
-            for i, one in enumerate(answers)
-        ))  # fmt: skip
-    return read_results(out)
+    keys = [Pair("chair", f"a{i}", 0, f"b{i}", (0,)).key for i in range(4)]
+    rows = {"ours": {key: {"error": 40.0} for key in keys}, "verified": dict(zip(keys, answers))}
+    data = {"root": "", "categories": ["chair"], "pairs": 4, "targets": 1}
+    return Results(summarise_run(rows, {}, data, "none"), {}, [], rows)
 
 
-def test_right_if_one_of_the_two_is_right_has_a_table_of_its_own(tmp_path):
-    results = made_up_answers(tmp_path / "run")
+def test_right_if_one_of_the_two_is_right_has_a_table_of_its_own():
+    results = made_up_answers()
     verified = results.summary["methods"]["verified"]
     assert verified["acc30"] == 25  # is what it was without alternatives
-    figures = dict(verified["best_two"])
-    low, high = figures.pop("acc30_ci")
+    best_two = dict(verified["best_two"])
+    low, high = best_two.pop("acc30_ci")
     assert 0 <= low < 50 < high <= 100
-    assert figures == {"acc30": 50, "one_of_two": 2, "one_of_two_acc30": 50, "one_of_two_first_acc30": 0}
-    (table,) = best_two_tables(results.summary)
+    assert best_two == {"acc30": 50, "one_of_two": 2, "one_of_two_acc30": 50, "one_of_two_first_acc30": 0}
+    (table,) = tables.best_two_tables(results.summary)
     assert list(table.text.index) == ["verified"] and "not comparable with Acc30" in table.note
     assert list(table.text.loc["verified"])[2:] == ["2", "50.0", "0.0"]
     assert table.name in [one.name for one in every_table(results.summary)]
 
 
 def test_the_second_errors_survive_the_export_and_are_checked(tmp_path):
-    results = made_up_answers(tmp_path / "run")
+    results = made_up_answers()
     again = read_results(export_results(results, tmp_path / "results.json.gz"))
     assert again.summary == results.summary
     for key, found in results.rows["verified"].items():

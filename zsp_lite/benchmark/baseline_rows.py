@@ -45,11 +45,9 @@ def sift(problem: Problem) -> Answer:
     one, two, _ = found[view]
     details = {"matches": len(one), "inliers": 0}
     try:
-        points = (
-            unproject_pixels(reference, first.pixels[one]),
-            unproject_pixels(targets[view], others[view].pixels[two]),
-        )
-        sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
+        source = unproject_pixels(reference, first.pixels[one])
+        target = unproject_pixels(targets[view], others[view].pixels[two])
+        sim3, inliers = ransac(source, target, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
     return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})

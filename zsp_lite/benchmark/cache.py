@@ -17,11 +17,10 @@ _PARTS = ("keys", "saliency", "global_feature")
 
 
 class FeatureCache:
-    """A folder of feature maps in full precision: results with it equal those without it.
+    """A folder of feature maps in full precision, named by the library's source, the extractor and the crop's pixels.
 
-    A file's name is a hash of the library's source, of the extractor's fingerprint and of the crop's pixels. The
-    fingerprint of a user-defined extractor without weights is its name: use another folder when its code changes.
-    Extractors that see more than the pixels, by `describe`, are not cached.
+    A user-defined extractor without weights is known by its name: use another folder when its code changes. Extractors
+    that see more than the pixels, by `describe`, are not cached.
     """
 
     def __init__(self, folder: str | Path, extractors: Mapping[str, Any]):

@@ -36,11 +36,8 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
     Raises:
         InputError: If there is no common row or pair.
     """
-    rows = [(name, name) for name in first.rows if name in second.rows] if rows is None else rows
-    if not rows:
-        raise InputError(f"runs have no row in common: {', '.join(first.rows)} and {', '.join(second.rows)}")
     found = []
-    for one, other in rows:
+    for one, other in [(name, name) for name in first.rows if name in second.rows] if rows is None else rows:
         a, b = first.errors(one), second.errors(other)
         keys = sorted(key for key in a if key in b)
         if not keys:
@@ -48,6 +45,8 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
         errors = np.array([[run[key] for key in keys] for run in (a, b)])
         test = paired_test(*errors, weights=draws_of_pairs(keys))
         found.append(Difference(one, other, len(keys), tuple(accuracy(errors, 30)), tuple(median(errors)), test))
+    if not found:
+        raise InputError(f"runs have no row in common: {', '.join(first.rows)} and {', '.join(second.rows)}")
     return found
 
 
@@ -57,9 +56,9 @@ def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
     for one, other in ((text, text), *((text[:i], text[i + 1 :]) for i in colons)):
         if one in first.rows and other in second.rows:
             return one, other
+    of_first, of_second = (", ".join(run.rows) for run in (first, second))
     raise InputError(
-        f"rows {text!r}: not in the runs, expected A:B or A with A one of {', '.join(first.rows)} and B one of "
-        f"{', '.join(second.rows)}"
+        f"rows {text!r}: not in the runs, expected A:B or A with A one of {of_first} and B one of {of_second}"
     )
 
 
@@ -67,16 +66,13 @@ def comparison_table(differences: Sequence[Difference], first: str, second: str)
     """Tabulate differences; `first` and `second` name the runs."""
     groups = {"Acc30 (%)": ("B - A", "sign test"), "error (°)": ("mean of A - B", "permutation test")}
     columns = [("", "pairs")]
-    columns += [
-        (group, title) for group, (gain, test) in groups.items() for title in ("A", "B", gain, "p", f"p, {test}")
-    ]
+    for group, (gain, test) in groups.items():
+        columns += [(group, title) for title in ("A", "B", gain, "p", f"p, {test}")]
     rows = {}
     for one in differences:
         cells: list[Cell] = [Cell(one.n, decimals=0)]
-        for figures, gain, test in (
-            (one.acc30, "accuracy_gain", "sign_test_p"),
-            (one.median, "error_drop", "permutation_test_p"),
-        ):
+        parts = (one.acc30, "accuracy_gain", "sign_test_p"), (one.median, "error_drop", "permutation_test_p")
+        for figures, gain, test in parts:
             cells += [*map(Cell, figures), Cell(one.test[gain], *one.test[f"{gain}_ci"])]
             cells += [PValue(one.test[f"{gain}_p"]), PValue(one.test[test])]
         rows[one.first if one.first == one.second else f"{one.first}:{one.second}"] = cells

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from zsp_lite.views import has_saliency, patch_mask
 
 # Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
 FAILED = 180.0
+Poses = Float[np.ndarray, "n 4 4"]
 
 
 def evaluate_pair(
@@ -47,16 +49,14 @@ def evaluate_pair(
     return {"pair": pair.key, "results": results} | cost
 
 
-def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Float[np.ndarray, "n 4 4"]:
+def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Poses:
     """Ground truth from the reference's camera to each target's."""
     first, second = (labels[name] for name in (problem.pair.reference_sequence, problem.pair.target_sequence))
     reference, *targets = problem.frames()
     return np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
 
 
-def _evaluate(
-    method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"], keep_hypotheses: bool
-) -> dict[str, Any]:
+def _evaluate(method: Method, problem: Problem, truths: Poses, keep_hypotheses: bool) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         answer = _solve(method, problem) if method.solve else _answer(method, problem, truths)
@@ -102,7 +102,7 @@ def _solve(method: Method, problem: Problem) -> Answer:
         raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
 
 
-def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
+def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
     nearest = None
     if method.answer == "true view":
@@ -110,7 +110,7 @@ def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]
     estimate = problem.estimate(method.features, method.settings, nearest)
     answer = as_answer(estimate)
     if nearest is not None:
-        return Answer(answer.rotation, nearest, answer.translation, answer.scale, answer.note, answer.details)
+        return replace(answer, view=nearest, hypotheses=())
     if method.answer == "best view":
         sim3 = view_alignment(estimate.reference_view, estimate.target_views[estimate.view])
         return Answer(sim3.R, answer.view, sim3.t, sim3.scale, "", answer.details)

@@ -168,12 +168,12 @@ def evaluate_chunks(
                 return
             finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             # Failures last: all that has been evaluated is saved before an error ends the run.
-            for future in sorted(finished, key=_failed):
+            for future in sorted(finished, key=lambda one: one.cancelled() or one.exception() is not None):
                 save(future.result())
     except workers.deaths as error:
+        fewer = f"run again to continue, with fewer workers than {workers.number}"
         raise InputError(
-            "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-            f"with fewer workers than {workers.number}"
+            f"a worker ended abruptly, perhaps out of memory; finished pairs are stored: {fewer}"
         ) from error
     finally:
         for future in running:
@@ -196,10 +196,6 @@ def one_thread() -> Iterator[None]:
             yield
         finally:
             cv2.setNumThreads(cv2_threads)
-
-
-def _failed(future: Future) -> bool:
-    return future.cancelled() or future.exception() is not None
 
 
 _worker = threading.local()  # an executor's workers may be threads

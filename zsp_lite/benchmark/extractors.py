@@ -27,8 +27,7 @@ def random_backbone(like: Backbone, seed: int = 0) -> Backbone:
     return Backbone(fresh, f"random like {like.name}", like.layer, like.saliency_heads, like.device, **same)
 
 
-# Functions that make an extractor from the backbone under test. An extractor is called on a list of images, or, if it
-# has the method `describe`, on a list of frames.
+# Functions of the backbone under test. An extractor is called on images, or its method `describe` on frames.
 EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "none": lambda backbone: None,  # for rows that use depth only
     "backbone": lambda backbone: backbone,

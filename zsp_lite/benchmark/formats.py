@@ -75,10 +75,9 @@ def insert_tables(text: str, tables: Sequence[Table], pairs: int) -> str:
     by_name = {table.name: table for table in tables}
     marks, marked = _MARK.findall(text), [name for _, name, _, _ in _MARKED.findall(text)]
     if not marks or 2 * len(marked) != len(marks) or not set(marked) <= by_name.keys():
-        raise InputError(
-            f"document has the marks {', '.join(marks) or 'of no table'}, expected <!-- table NAME --> and "
-            f"<!-- end of table --> for each table, with names out of {', '.join(by_name)}"
-        )
+        expected = "<!-- table NAME --> and <!-- end of table --> for each table, with names out of"
+        found = ", ".join(marks) or "of no table"
+        raise InputError(f"document has the marks {found}, expected {expected} {', '.join(by_name)}")
 
     def render(found: re.Match[str]) -> str:
         start, name, _, end = found.groups()

@@ -145,12 +145,9 @@ class Problem:
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
     ) -> PoseEstimate:
-        """Run the paper's method. Estimates that differ in later stages only share the matches.
+        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index.
 
-        Args:
-            features: Name of the extractor.
-            settings: Settings of `ZeroShotPose` that differ from the defaults.
-            target: Index of the only target view to use; None uses all.
+        Estimates that differ in later stages only share the matches.
         """
         name = (features, target, tuple(sorted((settings or {}).items(), key=lambda item: item[0])))
         if name not in self._shared:

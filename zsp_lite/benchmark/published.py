@@ -1,8 +1,6 @@
 """Tables of the paper (Goodwin et al., ECCV 2022): which rows of a run they show, and the published figures.
 
-The published figures were measured on CO3D (20 categories with 100 pairs each) with DINO ViT-S/8. These are other data
-than those of the synthetic benchmark, so the tables show them in separate columns.
-
+They were measured on CO3D (20 categories with 100 pairs each) with DINO ViT-S/8: other data than the synthetic ones.
 TABLE_1 and so on hold, by label, the row of a run for each group of columns, then the published figures. "ROW-n5" is
 also the row ROW of a run with 5 target views.
 """

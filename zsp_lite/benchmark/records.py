@@ -6,8 +6,7 @@ A line of run.jsonl is one of
     what `evaluate_pair` returns for a pair
     {"seconds": what the last call took}
 
-One process writes to a folder; others can read it meanwhile. A process killed at any moment loses no line but the one
-that it was writing.
+One process writes to a folder; others can read it meanwhile. A killed process loses only the line it was writing.
 """
 
 import json

@@ -112,10 +112,9 @@ def read_results(path: str | Path) -> Results:
         return results_of(read_settings(path), read_records(path))
     what = f"results {path}"
     content = checked_json(decompress(read_bytes(path, "results"), what), _File, what)
-    summary = content["summary"]
-    rows = {name: _row(columns, content["pairs"]) for name, columns in content["rows"].items()}
-    counts = {name: len(row) for name, row in rows.items()}
-    if not counts or counts != {name: row["n"] for name, row in summary["methods"].items()}:
+    summary, keys = content["summary"], content["pairs"]
+    rows = {name: _row(columns, keys) for name, columns in content["rows"].items()}
+    if not rows or {name: len(row) for name, row in rows.items()} != {n: r["n"] for n, r in summary["methods"].items()}:
         raise InputError(f"{what}: summary and rows do not fit, expected the rows {', '.join(rows)}, each pair once")
     return Results(summary, content["settings"], content["invocations"], checked_json(rows, _Rows, what))
 
@@ -162,9 +161,10 @@ def read_runs(paths: Sequence[str | Path]) -> Results:
 def pool(runs: Sequence[Results]) -> Results:
     """Pool runs of one benchmark on different objects, such as folders of different seeds, into one without timings.
 
-    Rows that not all of the runs have are left out. Sequences of one category and name are one object. InputError if
-    the runs have no row in common, share a pair, or differ in the backbone, the number of target views or the settings
-    of a row.
+    Rows that not all of the runs have are left out. Sequences of one category and name are one object.
+
+    Raises:
+        InputError: If the runs share no row or share a pair, or differ in the backbone, the views or a row's settings.
     """
     names = [name for name in runs[0].rows if all(name in run.rows for run in runs)]
     if missing := sorted({name for run in runs for name in run.rows} - set(names)):
@@ -172,13 +172,12 @@ def pool(runs: Sequence[Results]) -> Results:
     rows = {name: {key: found for run in runs for key, found in run.rows[name].items()} for name in names}
     if problem := _not_one_benchmark(runs, rows):
         raise InputError(f"runs to pool {problem}")
+    parts = [run.summary["data"] for run in runs]
     data = {
-        "root": ", ".join(run.summary["data"]["root"] for run in runs),
-        "categories": list(dict.fromkeys(category for run in runs for category in run.summary["data"]["categories"])),
-        "pairs": sum(run.summary["data"]["pairs"] for run in runs),
-        "targets": runs[0].summary["data"]["targets"],
-        "runs": len(runs),
+        "root": ", ".join(one["root"] for one in parts),
+        "categories": list(dict.fromkeys(category for one in parts for category in one["categories"])),
     }
+    data |= {"pairs": sum(one["pairs"] for one in parts), "targets": parts[0]["targets"], "runs": len(runs)}
     summary = {"data": data, "backbone": runs[0].summary["backbone"], **summarise_rows(rows)}
     return Results(summary, runs[0].settings, [one for run in runs for one in run.invocations], rows)
 

@@ -82,7 +82,8 @@ def evaluate(
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
     settings = {"data": str(root).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "pairs": pairs}
     settings |= {"targets": targets, "seed": seed, "library": library_version()}
-    settings |= {"methods": {name: _identity(row, extractors) for name, row in rows.items()}}
+    others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
+    settings |= {"methods": {name: description(row) + others.get(row.features, "") for name, row in rows.items()}}
     settings |= {"labels": _labels(root, work)}
     if threads is not None:
         check_integer("threads", threads, 1, execution.MOST_WORKERS)
@@ -154,11 +155,6 @@ def rows_of_pairs(row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, dict[Pai
         for pair in dict.fromkeys(pairs):
             work.setdefault(pair.category, {}).setdefault(pair, []).append(name)
     return work
-
-
-def _identity(row: Method, extractors: Mapping[str, Any]) -> str:
-    """What decides the results of a row, as text."""
-    return description(row) + ("" if row.features == "backbone" else f"; {fingerprint(extractors[row.features])}")
 
 
 def _labels(root: str | Path, work: Mapping[str, Mapping[Pair, Any]]) -> dict[str, str]:

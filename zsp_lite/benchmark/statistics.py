@@ -120,12 +120,8 @@ def paired_difference(
     """Measure by how much the second method is better than the first on the same pairs (see `paired_test`)."""
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
     weights = pair_draws(len(first)) if weights is None else weights
-    differences = {
-        "accuracy_gain": 100.0 * (second < threshold) - 100.0 * (first < threshold),
-        "error_drop": first - second,
-    }
-    result = {}
-    for name, values in differences.items():
+    gain, result = 100.0 * (second < threshold) - 100.0 * (first < threshold), {}
+    for name, values in (("accuracy_gain", gain), ("error_drop", first - second)):
         replicates = weighted_mean(values, weights).round(9)  # rounding errors must not hide a difference of 0
         p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
         found = {"": float(values.mean()), "_ci": list(_interval(replicates)), "_p": min(1.0, float(p))}

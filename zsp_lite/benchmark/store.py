@@ -77,8 +77,7 @@ class FrameStore:
         """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
         views, name = self._entry(key).views, (features, foreground)
         if name not in views:
-            feature_map = self.describe(features, key)
-            views[name] = frame_view(self.frame(key), feature_map, foreground)
+            views[name] = frame_view(self.frame(key), self.describe(features, key), foreground)
         view = views[name]
         # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
         for other in views.values():
@@ -116,10 +115,7 @@ class FrameStore:
             return cached
         # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
         with self._timed(features), torch_threads(self.threads):
-            if hasattr(extractor, "describe"):
-                (found,) = extractor.describe([frame])
-            else:
-                (found,) = extractor([frame.rgb])
+            (found,) = extractor.describe([frame]) if hasattr(extractor, "describe") else extractor([frame.rgb])
         if self.cache is not None:
             self.cache.write(features, frame, found)
         return found

@@ -36,10 +36,8 @@ class Cell:
     decimals: int = 1
 
     def __str__(self) -> str:
-        text = f"{self.value:.{self.decimals}f}"
-        if self.low is None or self.high is None:
-            return text
-        return f"{text} [{self.low:.{self.decimals}f}, {self.high:.{self.decimals}f}]"
+        value, low, high = ("" if x is None else f"{x:.{self.decimals}f}" for x in (self.value, self.low, self.high))
+        return f"{value} [{low}, {high}]" if low else value
 
 
 class PValue(Cell):
