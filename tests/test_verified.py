@@ -154,16 +154,6 @@ def test_a_given_mask_replaces_the_saliency(method, frames):
     assert masked.reference_view.object_mask is masked.reference_view.frame.mask
 
 
-def holes(depth: np.ndarray, seed: int) -> np.ndarray:
-    unknown = np.kron(np.random.default_rng(seed).random((14, 14)) < 0.4, np.ones((16, 16))) > 0
-    return np.where(unknown, 0, depth).astype(np.float32)
-
-
-def test_holes_in_the_depth_change_the_estimate_little(method, views, frames):
-    pierced = [changed(view, depth=holes(view.frame.depth, seed)) for seed, view in enumerate(views)]
-    assert error(method.estimate_from_views(pierced[0], pierced[1:]), frames) < 10
-
-
 def test_noise_of_cameras_and_depth_changes_the_estimate_little(method, views, frames):
     rng = np.random.default_rng(0)
 

@@ -39,14 +39,11 @@ class Evidence:
 
     span: float  # share of the circle around the target that its views span, in [0, 1) (see `cameras.view_span`)
     log_views: float  # logarithm of the number N of target views
-    # \exp(-(\theta / 45 degrees)^2), where \theta is the angle between the reference's camera and the nearest target
-    # view's under the best pose
+    # \exp(-(\theta / 45 degrees)^2), \theta the angle from the reference's camera to the nearest target view's
     nearness: float
-    # standard deviation of the target views' feature similarity to the reference. If it is small, the features hardly
-    # distinguish the sides of the object
+    # standard deviation of the target views' similarity to the reference; small if the features distinguish no sides
     view_std: float
-    # the part of the best score that compares shapes (overlap, silhouettes and free space). If it is small, the two
-    # shapes do not fit under any pose that was found
+    # part of the best score that compares shapes (overlap, silhouettes and free space); small if the shapes do not fit
     shape_fit: float
 
 
@@ -69,14 +66,15 @@ class Calibration:
         return (1 - self.unseen * hidden_share(evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
-def hidden_share(span: ArrayLike) -> np.ndarray:
+def hidden_share(span: ArrayLike) -> np.ndarray | float:
     """Return h of the probabilities (see the module's docstring) for a share of the circle that the views span."""
     return np.maximum(0.0, 1 - 1.5 * np.asarray(span))
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Return for each hypothesis the index of the one that stands for its pose: the nearest better one that stands for
-    itself within 30 degrees, or its own.
+    """Return for each hypothesis the index of the one that stands for its pose.
+
+    That is the nearest better one within 30 degrees that stands for itself, or its own.
     """
     found: list[int] = []
     for i, row in enumerate(angle):
@@ -108,8 +106,9 @@ def nearly_as_probable(probability: Float[np.ndarray, " m"], mode: Int[np.ndarra
 def is_one_of_two(
     probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]
 ) -> bool:
-    """Tell whether the answer is one of two poses: both nearly as probable and no third, together more probable than
-    not, and more than 60 degrees apart, so that no rotation is within 30 degrees of both.
+    """Tell whether the answer is one of two poses, nearly as probable, together more probable than not, no third.
+
+    They are more than 60 degrees apart, so that no rotation is within 30 degrees of both.
     """
     likely = nearly_as_probable(probability, mode)
     return bool(len(likely) == 2 and probability[likely].sum() > 0.5 and angle[likely[0], likely[1]] > 2 * MODE_ANGLE)
