@@ -10,9 +10,8 @@ from synthetic_views import look_at
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.photograph import motorcycle_photograph
 from zsp_lite.errors import InputError
-from zsp_lite.importers.fusion import scale_frame
-from zsp_lite.importers.geometry_masks import masks_from_depth
-from zsp_lite.importers.mask_flags import mask_flags
+from zsp_lite.importers.convert import scale_frame
+from zsp_lite.importers.geometry_masks import mask_flags, masks_from_depth
 from zsp_lite.importers.masks import masks_from_box
 
 RADIUS = 0.3

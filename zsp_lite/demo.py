@@ -18,22 +18,19 @@ from zsp_lite.data.photograph import (
     motorcycle_photograph,
 )
 from zsp_lite.errors import InputError
-from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
+from zsp_lite.estimates import PairResult, PoseEstimate, label_error
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
 from zsp_lite.synthetic.ground_truth import object_poses
 from zsp_lite.synthetic.recording import POSES_FILE
 
 N_TARGETS = 5
-# Settings of `ZeroShotPose` on the photograph.
-PHOTOGRAPH_FOREGROUNDS, PHOTOGRAPH_SOLVERS = ("mask", "saliency"), ("paper", "verified")
 
 
 def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
-    """Select one pair of every category with pose labels, independently of its result.
+    """Select, independently of results, the first evaluation pair of every category with pose labels.
 
-    This is the first evaluation pair in the data folder, or, for a category without pairs of `n_targets` target views,
-    the first of a sample with seed 0.
+    For a category without pairs of `n_targets` target views, it is the first of a sample with seed 0.
     """
     pairs = []
     for category in labelled_categories(dataset):
@@ -43,10 +40,9 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
 
 
 def example_pair(dataset: Co3D) -> Pair:
-    """Return a pair of the sample data for a first try.
+    """Return a pair for a first try: a stored pair of cars in `data_samples/`, else the first of the first category.
 
-    Of `data_samples/`, this is a pair of cars that is chosen by its result: a stored pair with five targets on which
-    both solvers are within 5 degrees with zsp-tiny. Of other data, it is the first pair of the first category.
+    The pair of cars is chosen by its result: both solvers are within 5 degrees with zsp-tiny.
     """
     chosen = Pair("car", "peugeot_308", 11, "suv", (18, 22, 3, 8, 13))
     folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))
@@ -61,38 +57,20 @@ def run_demo(dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] =
 
 
 def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None) -> PairResult:
-    """Load a pair's frames, estimate its pose, and compare it with the ground truth of the labels.
-
-    Args:
-        dataset: Data folder.
-        pair: Evaluation pair.
-        method: The method.
-        solvers: Names of solvers; by default the method's own.
-
-    Raises:
-        InputError: A frame or a label of the pair is missing, or the pose cannot be estimated.
-    """
+    """Estimate the pose of a pair by each solver, by default the method's own, and its error by the pose labels."""
     reference, targets = dataset.load_pair(pair)
     estimates = solve_pair(method, reference, targets, solvers)
-    labels = read_labels(dataset.root, pair.category)
-    for sequence in (pair.reference_sequence, pair.target_sequence):
-        if sequence not in labels:
-            raise InputError(f"{pair.category}/{sequence}: no pose label, expected one to compare the estimate with")
-    errors = {
-        solver: label_error(estimate, labels[pair.reference_sequence], reference, labels[pair.target_sequence], targets)
-        for solver, estimate in estimates.items()
-    }
-    annotations = dataset.frames(pair.category, pair.target_sequence)
-    chosen = np.linspace(0, len(annotations), SEQUENCE_FRAMES, endpoint=False).astype(int)
-    return PairResult(
-        pair.category,
-        (
-            f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
-            f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
-        ),
-        reference, tuple(targets), estimates, errors, tuple(dataset.load(annotations[i]) for i in np.unique(chosen)),
-        pair, backbone=getattr(method.backbone, "name", ""),
-    )  # fmt: skip
+    labels, sequences = read_labels(dataset.root, pair.category), (pair.reference_sequence, pair.target_sequence)
+    if missing := [name for name in sequences if name not in labels]:
+        raise InputError(f"{pair.category}/{missing[0]}: no pose label, expected one to compare the estimate with")
+    first, second = (labels[name] for name in sequences)
+    errors = {name: label_error(one, first, reference, second, targets) for name, one in estimates.items()}
+    sources = (
+        f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
+        f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
+    )
+    name = getattr(method.backbone, "name", "")
+    return PairResult(pair.category, sources, reference, tuple(targets), estimates, errors, pair, backbone=name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +84,10 @@ class PhotographResult:
     sequence: str  # sequence of the synthetic motorcycle
     foreground: str  # setting of `ZeroShotPose`
     solver: str  # setting of `ZeroShotPose`
-    estimate: PoseEstimate  # pose estimate with the photograph as the reference
+    estimate: PoseEstimate  # the photograph is the reference
     axes: Float[np.ndarray, "3 3"]  # columns: front, left and up of the photographed motorcycle, as estimated
     cloud: Float[np.ndarray, "n 3"]  # point cloud of the synthetic motorcycle, aligned with the photographed one
-    # position of each point of the cloud, from the rear (0) to the front (1) of the synthetic motorcycle
-    along: Float[np.ndarray, " n"]
+    along: Float[np.ndarray, " n"]  # position of each point of the cloud, from the rear (0) to the front (1)
 
     @property
     def front_error(self) -> float:
@@ -127,26 +104,15 @@ def run_photograph(
     dataset: Co3D,
     backbone: FeatureExtractor,
     sequence: str | None = None,
-    foregrounds: Sequence[str] = PHOTOGRAPH_FOREGROUNDS,
-    solvers: Sequence[str] = PHOTOGRAPH_SOLVERS,
+    foregrounds: Sequence[str] = ("mask", "saliency"),
+    solvers: Sequence[str] = ("paper", "verified"),
 ) -> Iterator[PhotographResult]:
     """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
 
-    Args:
-        dataset: Data folder. Without a category of synthetic motorcycles there is no result.
-        backbone: Computes the features.
-        sequence: Sequence of the synthetic motorcycle; by default `PHOTOGRAPH_TARGET`, or the first of other
-            data. Both are independent of the results.
-        foregrounds: Settings `foreground` of `ZeroShotPose`.
-        solvers: Settings `solver` of `ZeroShotPose`.
-
-    Yields:
-        One result for each foreground and solver.
-
-    Raises:
-        InputError: The category has no such sequence, or a setting is unknown.
+    There is one result for each of the settings `foreground` and `solver` of `ZeroShotPose`, and none without a
+    category of synthetic motorcycles. By default the sequence is `PHOTOGRAPH_TARGET`, or the first of other data; both
+    are independent of the results.
     """
-    methods = {foreground: ZeroShotPose(backbone, foreground=foreground) for foreground in foregrounds}
     if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
         return
     poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
@@ -155,7 +121,8 @@ def run_photograph(
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
     photograph, pose = motorcycle_photograph(), poses[sequence]
     points, _ = dataset.point_cloud(PHOTOGRAPH_CATEGORY, sequence)
-    for foreground, method in methods.items():
+    for foreground in foregrounds:
+        method = ZeroShotPose(backbone, foreground=foreground)
         reference, *views = method.views([photograph, *targets])
         for solver in solvers:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)
@@ -167,6 +134,4 @@ def run_photograph(
 
 def _angle(first: np.ndarray, second: np.ndarray | tuple[float, ...]) -> float:
     """Return the angle between two vectors in degrees."""
-    second = np.asarray(second)
-    cosine = first @ second / np.linalg.norm(first) / np.linalg.norm(second)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))

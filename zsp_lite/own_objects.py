@@ -15,33 +15,29 @@ from jaxtyping import Float
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.backbones.pretrained import DEFAULT
-from zsp_lite.choices import MASKS, SOLVERS
+from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.estimates import SEQUENCE_FRAMES, PairResult, PoseEstimate, label_error
+from zsp_lite.estimates import PairResult, PoseEstimate, label_error
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
-from zsp_lite.importers.convert import READERS, capture_format
-from zsp_lite.importers.fusion import scale_frame
-from zsp_lite.importers.geometry_masks import masks_from_depth
-from zsp_lite.importers.mask_flags import mask_flags
+from zsp_lite.importers.convert import READERS, SIGNS, scale_frame
+from zsp_lite.importers.geometry_masks import mask_flags, masks_from_depth
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
 from zsp_lite.points import object_pixels, unit_scale, world_cloud
-from zsp_lite.views import View, has_saliency
+from zsp_lite.views import has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
-# What each format of `_format` is, and the options that it takes.
-_WHAT = {"image": "an image", "sequence": "a sequence of a data folder"} | {
-    name: f"a capture of the format {name}" for name in READERS
-}
-_TAKEN = {"image": ("intrinsics", "depth", "depth_unit"), "lists": ("depth_unit",)}
+# Options that each format takes; "open" is a source that is open already.
+_TAKEN = {"open": (), "image": ("mask", "box", "intrinsics", "depth", "depth_unit")}
+_TAKEN |= {"sequence": ("mask", "box"), "nerfstudio": ("mask", "box"), "lists": ("mask", "box", "depth_unit")}
 # What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
 _UNIT_OPTION = "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)"
 _UNITS = {"nerfstudio": "set depth_unit_scale_factor in transforms.json"}
@@ -52,25 +48,15 @@ _CONTEXT = 8  # frames of a source that are segmented together with the referenc
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Frames of one object in one world, read when needed.
+    """Frames of one object in one world, read when needed."""
 
-    Attributes:
-        path: The sequence, the capture or the image.
-        format: "sequence", "image", or the format of a capture.
-        numbers: Number of each frame: that of the annotations, or its position in the capture.
-        read: Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
-        mask: Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours).
-        box: Bounding box of the object in the first frame, for "box".
-        unit_given: Whether the unit of the depth is not the default, but the user's or the format's.
-    """
-
-    path: Path
-    format: str
-    numbers: tuple[int, ...]
-    read: Callable[[int], Frame]
-    mask: str
-    box: Box | None = None
-    unit_given: bool = True
+    path: Path  # the sequence, the capture or the image
+    format: str  # "sequence", "image", or the format of a capture
+    numbers: tuple[int, ...]  # number of each frame: that of the annotations, or its position in the capture
+    read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
+    mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
+    box: Box | None = None  # bounding box of the object in the first frame, for "box"
+    unit_given: bool = True  # whether the unit of the depth is not the default, but the user's or the format's
 
     @property
     def name(self) -> str:
@@ -91,21 +77,17 @@ class Source:
 
     def load(self, positions: Sequence[int]) -> list[Frame]:
         """Load frames with masks of the object; InputError if a file cannot be read, or no frame shows the object."""
-        ordered = set(positions)
-        if self.mask == "box":
-            ordered |= {0}  # the box is that of the first frame
-        elif self.mask == "auto":
-            ordered |= set(np.linspace(0, len(self.numbers) - 1, _CONTEXT).round().astype(int).tolist())
-        frames = {position: self.read(position) for position in sorted(ordered)}
-        if not self.unit_given and (flags := self.unit_flags(list(frames.values()))):
+        # The box is that of the first frame, and automatic masks are better with more frames.
+        others = {"given": [], "box": [0], "auto": np.linspace(0, len(self.numbers) - 1, _CONTEXT).round()}[self.mask]
+        frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
+        some = list(frames.values())
+        if not self.unit_given and (flags := self.unit_flags(some)):
             raise InputError(flags[0])
         if self.mask != "given":
-            some = list(frames.values())
             frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
-        for position, frame in frames.items():
-            if frame.mask is None:
-                where = f"{self.path}, frame {self.numbers[position]}"
-                raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+        elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
+            where = f"{self.path}, frame {without[0]}"
+            raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
         return [frames[position] for position in positions]
 
     def unit_flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
@@ -150,11 +132,10 @@ def estimate_pose(
     out: str | Path | None = None,
     upright: bool = True,
 ) -> PairResult:
-    """Estimate the pose between two objects of one category, each named by a path.
+    """Estimate the pose between two objects of one category, each named by a path; no label is needed.
 
-    Each path is a sequence of a data folder, a folder with a capture, or an image with depth. `open_source` explains
-    them, and takes the settings that only one of the two has, such as a box around the object. No label is needed.
-    Implausible lengths, doubtful masks, and target views that show one side of the object, are flags of the estimates.
+    `open_source` explains the paths, and takes the settings that only one of the two has, such as a box around the
+    object. Implausible lengths, doubtful masks, and target views that show one side of the object, are flags.
 
     Args:
         reference: The reference object.
@@ -162,47 +143,38 @@ def estimate_pose(
         solver: "verified", "paper" or "both".
         reference_frame: Frame number of the reference; by default its first frame with known depth and an object.
         targets: Number of target views, evenly spaced over the target's frames.
-        mask: Where the masks of both come from: "given", "auto", or as `open_source` decides. For "box", open the
-            sources, which take a box each.
+        mask: Where the masks of both come from: "given", "auto", or as `open_source` decides.
         intrinsics: Camera intrinsics of both, where they are images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
         upright: Whether the reference image is upright; False tries its four turns by 90 degrees (see `ZeroShotPose`).
 
     Raises:
-        InputError: An input cannot be read, an option is missing, `out` cannot be written, or the pose cannot be
-            estimated.
+        InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
     if solver not in SOLVERS:
         raise InputError(f"solver is {solver!r}, expected one of {', '.join(SOLVERS)}")
     check_integer("targets", targets, 1)
-    given = {"mask": mask, "intrinsics": intrinsics}
+    given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
-        first, second = open_pair(reference, target, {name: (one,) for name, one in given.items() if one is not None})
+        first, second = open_pair(reference, target, given)
         position, frame = first.reference(reference_frame)
-        positions, shown = second.spread(targets), second.spread(SEQUENCE_FRAMES)
-        wanted = sorted({*positions, *shown})
-        loaded = dict(zip(wanted, second.load(wanted)))
-        frames = [loaded[k] for k in positions]
+        positions = second.spread(targets)
+        frames = second.load(positions)
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        scales = [
-            1.0 if source.format == "sequence" or len(cloud) < 2 else unit_scale(cloud)
-            for source, cloud in zip((first, second), clouds)
-        ]
+        pairs = zip((first, second), clouds)
+        scales = [1.0 if one.format == "sequence" or len(cloud) < 2 else unit_scale(cloud) for one, cloud in pairs]
         scaled = [scale_frame(one, scales[1]) for one in frames]
-        estimates = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
-        estimates = {
-            name: replace(_in_units(one, *scales), flags=(*one.flags, *flags)) for name, one in estimates.items()
-        }
+        solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
+        estimates = {name: _in_units(one, *scales, flags) for name, one in solved.items()}
         result = PairResult(
             f"{first.name} to {second.name}", (first.describe([position]), second.describe(positions)), frame,
             tuple(frames), estimates, _errors(first, second, frame, frames, estimates),
-            tuple(loaded[k] for k in shown), masks=(first.mask, second.mask),
-            backbone=getattr(model, "name", str(backbone)),
+            masks=(first.mask, second.mask), backbone=getattr(model, "name", str(backbone)),
         )  # fmt: skip
         if out is not None:
             write_pair(result, out)
@@ -210,17 +182,12 @@ def estimate_pose(
 
 
 def write_pair(result: PairResult, out: str | Path) -> list[Path]:
-    """Write the report and the point clouds of a pair.
+    """Write the report and the point clouds of a result of `estimate_pose` to a folder, and return the paths.
 
-    Args:
-        result: The result of `estimate_pose`.
-        out: Folder to write; created if missing.
-
-    Returns:
-        `report.html`; `target.ply`, the points of the target object in all its views; and for each solver
-        `aligned_SOLVER.ply`, the points of the reference object after the pose, and `aligned_SOLVER_2.ply`, after the
-        first alternative, where the answer is one of two. The clouds are in the world of the target views, which for
-        an image is its camera's frame.
+    They are `report.html`; `target.ply`, the points of the target object in all its views; and for each solver
+    `aligned_SOLVER.ply`, the points of the reference object after the pose, and `aligned_SOLVER_2.ply`, after the first
+    alternative, where the answer is one of two. The clouds are in the world of the target views, which for an image is
+    its camera's frame.
     """
     from zsp_lite.viz.report import write_pair_report
 
@@ -230,10 +197,8 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
     points, colours = world_cloud([result.reference])
     points = result.reference.camera.to_camera(points)
     for solver, estimate in result.estimates.items():
-        poses = {f"aligned_{solver}.ply": estimate}
-        if estimate.one_of_two:
-            poses[f"aligned_{solver}_2.ply"] = estimate.alternatives[0]
-        for name, pose in poses.items():
+        poses = [estimate, *estimate.alternatives[:1]] if estimate.one_of_two else [estimate]
+        for name, pose in zip((f"aligned_{solver}.ply", f"aligned_{solver}_2.ply"), poses):
             paths.append(out / name)
             write_ply(paths[-1], result.targets[pose.view].camera.to_world(pose.sim3.apply(points)), colours)
     return [write_pair_report(out / "report.html", result), *paths]
@@ -264,117 +229,89 @@ def open_source(
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or does not fit.
     """
-    given = {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
-    given = {name: value for name, value in given.items() if value is not None}
-    return _open(Path(path), _format(Path(path)), mask, box, **given)
-
-
-def _open(path: Path, layout: str, mask: str | None = None, box: Box | None = None, **options) -> Source:
-    """Open a source whose format is known; `options` are those of `_TAKEN`."""
-    if mask not in (None, *MASKS):
-        raise InputError(f"mask is {mask!r}, expected one of {', '.join(MASKS)}")
-    if mask == "box" and box is None:
-        raise InputError(
-            f"{path}: --mask box needs the bounding box of the object, expected --box TOP,LEFT,HEIGHT,WIDTH"
-        )
-    if box is not None and mask not in (None, "box"):
-        raise InputError(f"{path}: --box goes with --mask box, got --mask {mask}")
+    path, options = Path(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+    layout, options = _format(path), {name: value for name, value in options.items() if value is not None}
     for name in options:
-        if name not in _TAKEN.get(layout, ()):
-            raise InputError(f"--{name.replace('_', '-')} does not go with {_WHAT[layout]}")
+        if name not in _TAKEN[layout]:
+            raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
+    if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
+        raise InputError(
+            f"{path}: mask is {mask!r} and box is {box}, expected --mask given, --mask auto, or --mask box with --box "
+            "TOP,LEFT,HEIGHT,WIDTH"
+        )
     if layout == "sequence":
-        numbers, read = _open_sequence(path)
+        folder = Path(os.path.abspath(path))
+        dataset = Co3D(folder.parents[1])
+        frames = dataset.frames(folder.parent.name, folder.name)
+        frames = [one for one in frames if one.viewpoint is not None and one.depth is not None]
+        if not frames:
+            raise InputError(f"{path}: no frame has a camera and depth, expected some")
+        numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
         capture = [_open_image(path, **options)] if layout == "image" else READERS[layout](path, **options)
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    unit_given = "depth_unit" in options or "depth_unit" not in _TAKEN.get(layout, ())
-    return Source(path, layout, numbers, read, mask, box, unit_given)
+    return Source(path, layout, numbers, read, mask, box, depth_unit is not None or "depth_unit" not in _TAKEN[layout])
 
 
 def open_pair(
     reference: str | Path | Source, target: str | Path | Source, options: Mapping[str, Sequence]
-) -> tuple[Source, Source]:
-    """Open two sources with the options of a command line.
+) -> list[Source]:
+    """Open two sources with the options of a command line, by the names of arguments of `open_source`.
 
-    Args:
-        reference: Path of the reference, see `open_source`; or an open source, which takes no options.
-        target: The same of the target.
-        options: For each argument of `open_source` at most two values: the reference's and the target's. A single one
-            is for each path that takes the option; a single box for the first whose mask is "box", if any, or first.
-
-    Raises:
-        InputError: See `open_source`; or an option has too many values, or goes with neither path.
+    An option has one value for each path that takes it, or one for all of them: but one `depth` for each image, and a
+    single `box` is for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
     """
     sides = reference, target
     formats = ["open" if isinstance(side, Source) else _format(Path(side)) for side in sides]
     given: list[dict] = [{}, {}]
     for name, values in options.items():
-        option = f"--{name.replace('_', '-')}"
-        takers = [k for k in (0, 1) if formats[k] != "open"]
-        if name not in ("mask", "box"):
-            takers = [k for k in takers if name in _TAKEN.get(formats[k], ())]
-        if values and not takers:
-            raise InputError(f"{option} does not go with {' and '.join(_WHAT.get(one, one) for one in formats)}")
-        if len(values) > 2 or (name == "depth" and values and len(values) != len(takers)):
-            expected = "one for each image" if name == "depth" else "at most two: the reference's and the target's"
-            raise InputError(f"{option} is given {len(values)} times, expected {expected}")
-        if len(values) == 2 and name != "depth":
-            takers = [0, 1]
-        elif name == "box":
+        takers = [k for k in (0, 1) if name in _TAKEN[formats[k]]]
+        counts = sorted({len(takers), len(takers) if name == "depth" else min(len(takers), 1)})
+        if values and len(values) not in counts:
+            option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, counts))
+            raise InputError(f"{option}: {len(values)} values with {' and '.join(formats)}, expected {expected}")
+        if len(values) == 1 and name == "box":
             boxed = [k for k, way in enumerate(options.get("mask", ())) if way == "box" and k in takers]
             takers = (boxed or takers)[:1]
         for k, value in zip(takers, values if len(values) == 2 else [*values] * 2):
             given[k][name] = value
-    first, second = (
-        side if isinstance(side, Source) else _open(Path(side), layout, **some)
-        for side, layout, some in zip(sides, formats, given)
-    )
-    return first, second
+    return [side if isinstance(side, Source) else open_source(side, **some) for side, some in zip(sides, given)]
 
 
 def _format(path: Path) -> str:
     """Tell a "sequence" from an "image" and from a capture, of which the format is returned."""
     if path.is_file() and path.suffix.lower() in _IMAGES:
         return "image"
-    if not path.is_dir():
-        state = "is neither a folder nor a JPEG or PNG file" if path.exists() else "does not exist"
-        raise InputError(f"{path} {state}, expected CATEGORY/SEQUENCE in a data folder, a capture or an image")
     whole = Path(os.path.abspath(path))  # for the names of "." and of "mine/cup/.."
-    if (whole.parent / FRAMES_FILE).is_file():
+    if path.is_dir() and (whole.parent / FRAMES_FILE).is_file():
         return "sequence"
+    for name, sign in SIGNS.items():
+        if (path / sign).is_file():
+            return name
+    found = "has another format" if path.exists() else "does not exist"
     if (whole / FRAMES_FILE).is_file():
-        known = ", ".join(sorted(one.sequence_name for one in Co3D(whole.parent).sequences(whole.name)))
-        raise InputError(f"{path} is a category, expected one of its sequences: {known}")
-    return capture_format(path)
-
-
-def _open_sequence(path: Path) -> tuple[tuple[int, ...], Callable[[int], Frame]]:
-    whole = Path(os.path.abspath(path))
-    dataset = Co3D(whole.parent.parent)
-    frames = dataset.frames(whole.parent.name, whole.name)
-    frames = [one for one in frames if one.viewpoint is not None and one.depth is not None]
-    if not frames:
-        raise InputError(f"{path}: no frame has a camera and depth, expected some")
-    return tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
+        found = "is a category"
+    signs = " or ".join(f"{sign} ({name})" for name, sign in SIGNS.items())
+    raise InputError(
+        f"{path} {found}, expected a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or a folder with {signs}; "
+        "`zsp-lite data import --help` lists what each format holds"
+    )
 
 
 def _open_image(
-    path: Path,
-    intrinsics: tuple[float, ...] | None = None,
-    depth: str | Path | None = None,
-    depth_unit: float = 0.001,
+    path: Path, intrinsics: tuple[float, ...] | None = None, depth: str | Path | None = None, depth_unit: float = 0.001
 ) -> CaptureFrame:
+    """Name the files and the camera of an image, whose world is its camera's frame."""
     if intrinsics is None:
         raise InputError(f"image {path}: no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels")
-    size = read_image(path).shape[:2]
     beside = [path.with_name(f"{path.stem}_depth{suffix}") for suffix in (".png", ".npy")]
     found = [Path(depth)] if depth is not None else [file for file in beside if file.is_file()]
     if not found:
         names = " or ".join(file.name for file in beside)
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
-    camera = camera_from_pose(np.eye(4), intrinsics, size, f"image {path}")
+    camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}")
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 
@@ -403,19 +340,20 @@ def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> t
     return (f"the target was seen from {seen}: if the reference was taken from another side, this pose is wrong",)
 
 
-def _in_units(estimate: PoseEstimate, reference_scale: float, target_scale: float) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling."""
+def _in_units(
+    estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
+) -> PoseEstimate:
+    """Express an estimate on scaled frames in the lengths before scaling, and add flags."""
 
     def unscaled(sim3: Sim3) -> Sim3:
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
-    def view(one: View, scale: float) -> View:
-        return replace(one, frame=scale_frame(one.frame, 1 / scale))
-
+    reference, targets = estimate.reference_view, estimate.target_views
     return replace(
         estimate,
+        flags=(*estimate.flags, *flags),
         sim3=unscaled(estimate.sim3),
         hypotheses=tuple(replace(one, sim3=unscaled(one.sim3)) for one in estimate.hypotheses),
-        reference_view=view(estimate.reference_view, reference_scale),
-        target_views=tuple(view(one, target_scale) for one in estimate.target_views),
+        reference_view=replace(reference, frame=scale_frame(reference.frame, 1 / reference_scale)),
+        target_views=tuple(replace(one, frame=scale_frame(one.frame, 1 / target_scale)) for one in targets),
     )

@@ -13,7 +13,6 @@ logger = logging.getLogger(__name__)
 
 DATA_VARIABLE = "ZSP_LITE_DATA"  # environment variable with the path of the user's CO3D folder
 REPOSITORY = Path(__file__).resolve().parents[1]
-MADE_SAMPLES = "samples"  # in the cache
 
 
 def default_data() -> Path:
@@ -22,17 +21,11 @@ def default_data() -> Path:
 
 
 def find_sample_data() -> Path:
-    """Return the path of the sample data, without making it.
-
-    This is `data_samples/` in the current folder or else in the repository, or, outside a clone, the folder in the
-    cache in which `sample_data` makes synthetic objects.
-    """
+    """Return `data_samples/` here or in the repository, else `samples/` in the cache, which may not exist."""
     from zsp_lite.io.download import cache_folder
 
-    for folder in (Path("data_samples"), REPOSITORY / "data_samples"):
-        if folder.is_dir():
-            return folder
-    return cache_folder() / MADE_SAMPLES
+    folders = Path("data_samples"), REPOSITORY / "data_samples"
+    return next((folder for folder in folders if folder.is_dir()), cache_folder() / "samples")
 
 
 def sample_data() -> Path:
@@ -40,9 +33,6 @@ def sample_data() -> Path:
 
     Outside a clone of the repository, synthetic objects are made once in the cache, which takes about 15 s (the preset
     "demo" of `zsp-lite synth`). An interrupted call is completed by the next one.
-
-    Raises:
-        InputError: Another process is still making the samples, or the cache cannot be written.
     """
     folder = find_sample_data()
     if folder.is_dir():

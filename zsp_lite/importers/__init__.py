@@ -2,10 +2,9 @@
 
 capture: a frame of a capture
 nerfstudio, lists: one reader per format
-masks, geometry_masks: object masks by colours from a bounding box, from files, or from depth
-mask_flags: what speaks against a mask
-fusion: fused point cloud of the object
-convert: the whole import
+masks: object masks by colours, from a bounding box
+geometry_masks: object masks by depth and colours, and what speaks against a mask
+convert: the whole import, with the fused point cloud of the object
 """
 
 from zsp_lite.importers.capture import CaptureFrame

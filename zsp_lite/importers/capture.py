@@ -87,15 +87,15 @@ def camera_from_pose(
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     """Read the stored values of a depth map, 0 where unknown."""
-    if path.suffix == ".npy":
-        data = read_bytes(path, "depth")
-        try:
-            values = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        except (ValueError, OSError, EOFError, MemoryError) as error:
-            raise InputError(f"depth {path} cannot be read as .npy: {error}, expected numbers (H, W)") from error
-        if values.ndim != 2 or values.dtype.kind not in "fiu":
-            raise InputError(f"depth {path} holds {values.dtype} of shape {values.shape}, expected numbers (H, W)")
-    else:
-        values = read_grey16(path)
+    if path.suffix != ".npy":
+        return read_grey16(path).astype(np.float32)
+    data = read_bytes(path, "depth")
+    try:
+        values = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        found = f"{values.dtype} of shape {values.shape}" if values.ndim != 2 or values.dtype.kind not in "fiu" else ""
+    except (ValueError, OSError, EOFError, MemoryError) as error:
+        found = f"no array ({error})"
+    if found:
+        raise InputError(f"depth {path} holds {found}, expected an .npy file of numbers (H, W)")
     values = values.astype(np.float32)
     return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))

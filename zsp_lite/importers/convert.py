@@ -1,37 +1,31 @@
-"""Conversion of a capture to a sequence of a data folder in CO3D's layout."""
+"""Conversion of a capture to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float, UInt8
+
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
-from zsp_lite.data.frames import ON_OBJECT
+from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import CaptureFrame, evenly_spaced, files_by_stem
-from zsp_lite.importers.fusion import fuse, scale_frame
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
+from zsp_lite.importers.geometry_masks import mask_flags
 from zsp_lite.importers.lists import read_lists
-from zsp_lite.importers.mask_flags import mask_flags
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
-from zsp_lite.points import unit_scale
+from zsp_lite.io.open3d import load_open3d
+from zsp_lite.points import object_pixels, object_points, unit_scale
 
 READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
-_SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
-
-
-def capture_format(folder: str | Path) -> str:
-    """Return the name in `READERS` of a capture's format, by the names of its files; InputError if there is none."""
-    for name, sign in _SIGNS.items():
-        if (Path(folder) / sign).is_file():
-            return name
-    files = ", ".join(f"{sign} ({name})" for name, sign in _SIGNS.items())
-    raise InputError(
-        f"folder {folder} is neither CATEGORY/SEQUENCE of a data folder nor a capture, expected one of its files "
-        f"{files}; `zsp-lite data import --help` lists what each format holds"
-    )
+SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
+_VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
+_MAX_POINTS = 50_000
+_MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
 @dataclass(frozen=True)
@@ -69,8 +63,7 @@ def import_capture(
         max_frames: Maximum number of frames, evenly spaced; CO3D's sequences have about 100.
 
     Raises:
-        InputError: The capture cannot be read, segmented or fused, the sequence exists, or another process imports into
-            the folder. Nothing is written then.
+        InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     unfinished = folder / ".unfinished"
@@ -81,17 +74,15 @@ def import_capture(
     capture = evenly_spaced(capture, max_frames)
     if masks is not None:
         files = files_by_stem(masks)
-        if missing := [frame.image.stem for frame in capture if frame.image.stem not in files]:
-            raise InputError(f"folder {masks} has no mask {missing[0]}.png, expected one named like each image")
-        capture = [replace(frame, mask=files[frame.image.stem]) for frame in capture]
+        capture = [replace(frame, mask=files.get(frame.image.stem)) for frame in capture]
+    if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
+        raise InputError(
+            f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
+            "of masks that are named like the pictures (--masks DIR)"
+        )
     frames = [frame.load() for frame in capture]
     if box is not None:
         frames = masks_from_box(frames, box)
-    if any(frame.mask is None for frame in frames):
-        raise InputError(
-            "the capture has no masks of its own, expected a box in its first picture (--box TOP,LEFT,HEIGHT,WIDTH) or "
-            "a folder of masks (--masks DIR)"
-        )
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
     if not seen:
         raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
@@ -107,3 +98,51 @@ def import_capture(
         write_co3d(root, category, [data])
         unfinished.unlink()
     return ImportResult(len(frames), empty, len(points), scale, flags)
+
+
+def fuse(
+    frames: Sequence[Frame],
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Fuse the depth maps inside the masks by truncated signed distances (TSDF; Curless and Levoy 1996).
+
+    Returns world points (n, 3), RGB colours (n, 3) and normals (n, 3); InputError if too few frames see a surface.
+    """
+    o3d = load_open3d()
+    voxel = 3 * _spread(frames) / _VOXELS
+    types, shapes = (o3d.core.float32,) * 3, ((1,), (1,), (3,))
+    volume = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), types, shapes, voxel, 16, 2000)
+    for frame in frames:
+        depth = np.where(object_pixels(frame), frame.depth, 0).astype(np.float32)
+        if not depth.any():
+            continue
+        intrinsic = o3d.core.Tensor(frame.camera.K - HALF_PIXEL)
+        extrinsic = o3d.core.Tensor(frame.camera.matrix)
+        options = {"depth_scale": 1.0, "depth_max": 1.01 * float(depth.max()), "trunc_voxel_multiplier": 4.0}
+        depth = o3d.t.geometry.Image(depth)
+        colour = o3d.t.geometry.Image(frame.rgb.astype(np.float32) / 255)
+        blocks = volume.compute_unique_block_coordinates(depth, intrinsic, extrinsic, **options)
+        volume.integrate(blocks, depth, colour, intrinsic, intrinsic, extrinsic, **options)
+    weight = min(_MIN_VIEWS, len(frames)) - 0.5  # Open3D keeps voxels of a greater weight
+    cloud = volume.extract_point_cloud(weight_threshold=weight).to_legacy()
+    cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
+    if len(cloud.points) > _MAX_POINTS:
+        cloud = cloud.uniform_down_sample(int(np.ceil(len(cloud.points) / _MAX_POINTS)))
+    if len(cloud.points) < 4:
+        raise InputError(f"{len(frames)} frames fuse to {len(cloud.points)} points, expected overlapping depth maps")
+    colours = np.rint(np.asarray(cloud.colors) * 255).clip(0, 255).astype(np.uint8)
+    return np.asarray(cloud.points).copy(), colours, np.asarray(cloud.normals).copy()
+
+
+def scale_frame(frame: Frame, scale: float) -> Frame:
+    """Multiply all lengths of a frame, of its depth and of its camera's translation, by `scale`."""
+    camera = replace(frame.camera, t=frame.camera.t * scale)
+    return replace(frame, camera=camera, depth=(frame.depth * scale).astype(np.float32))
+
+
+def _spread(frames: Sequence[Frame]) -> float:
+    """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
+    points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
+    if len(points) < 4:
+        raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
+    deviation = np.abs(points - np.median(points, axis=0))
+    return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise

@@ -16,33 +16,25 @@ from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose, files_by_stem
 from zsp_lite.io.files import path_inside, read_bytes
 
-_LISTS = ("rgb.txt", "depth.txt", "poses.txt")
-
 
 def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
-    """Read a capture: line n of each list describes frame n. `depth_unit` is in world units per stored depth value.
-
-    Raises:
-        InputError: A list is missing or invalid, or the lists differ in length.
-    """
-    lists = {name: _read_lines(folder, name) for name in _LISTS}
+    """Read a capture: line n of each list describes frame n. `depth_unit` is in world units per stored depth value."""
+    lists = {name: _read_lines(folder, name) for name in ("rgb.txt", "depth.txt", "poses.txt")}
     counts = {name: len(lines) for name, lines in lists.items()}
     if len(set(counts.values())) > 1 or not lists["rgb.txt"]:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers, at least 1")
-    rows = [_numbers(text, f"{folder}/intrinsics.txt", (3,)) for text in _read_lines(folder, "intrinsics.txt")]
+    where = f"{folder}/intrinsics.txt"
+    rows = [_numbers(text, where, (3,)) for text in _read_lines(folder, "intrinsics.txt")]
     if len(rows) != 3 or [*rows[2], rows[1][0], rows[0][1]] != [0, 0, 1, 0, 0] or min(rows[0][0], rows[1][1]) <= 0:
-        raise InputError(f"intrinsics {folder}/intrinsics.txt are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+        raise InputError(f"intrinsics {where} are {rows}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
     (fx, _, cx), (_, fy, cy), _ = rows
-    masks = files_by_stem(Path(folder) / "masks")
-    size, frames = None, []
+    masks, size = files_by_stem(Path(folder) / "masks"), read_image(path_inside(folder, lists["rgb.txt"][0])).shape[:2]
+    frames = []
     for number, (image, depth, numbers) in enumerate(zip(*lists.values()), 1):
         where = f"{folder}/poses.txt, line {number}"
-        pose = np.eye(4)
-        values = np.array(_numbers(numbers, where, (12, 16))).reshape(-1, 4)
-        pose[: len(values)] = values
+        pose = np.array([*_numbers(numbers, where, (12, 16)), 0, 0, 0, 1][:16]).reshape(4, 4)
         image, depth = path_inside(folder, image), path_inside(folder, depth)
-        size = size or read_image(image).shape[:2]
         camera = camera_from_pose(pose, (fx, fy, cx, cy), size, where)
         frames.append(CaptureFrame(image, depth, camera, depth_unit, mask=masks.get(image.stem)))
     return frames

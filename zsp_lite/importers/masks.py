@@ -25,12 +25,8 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
-    every further frame is the projection of the object points of the previous frames and of a ball as wide as the first
-    box, which stands for the parts of the object that are not visible there. A mask is empty where a further frame does
-    not show the object.
-
-    Raises:
-        InputError: The box extends beyond the image, or the object is not found in the first frame.
+    a further frame is the projection of the object points of the frames before it and of a ball as wide as the first
+    box, which stands for what is not visible there. A mask is empty where a further frame does not show the object.
     """
     height, width = frames[0].camera.size
     top, left, box_height, box_width = box
@@ -40,14 +36,18 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     first = replace(frames[0], mask=grab_cut(frames[0].rgb, box))
     points = _inner_points(first)
     if not len(points):
-        raise InputError(
-            f"frame {first.name}: GrabCut finds no object with known depth in the box {tuple(box)}, expected another "
-            "--box or mask files (--masks DIR)"
-        )
-    ball, masked = _ball(first, box), [first]
+        raise InputError(f"frame {first.name}: no object with known depth in the box {tuple(box)}, expected another")
+    depth = float(np.median(first.depth[object_pixels(first)]))
+    radius = depth * (np.array([box_width, box_height]) / first.camera.focal_length).max() / 2
+    middle = np.array([left + box_width / 2, top + box_height / 2])
+    directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))
+    ball = radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    ball += first.camera.unproject(middle, depth + _BALL_OFFSET * radius)
+    masked = [first]
     for frame in frames[1:]:
-        found = None if frame_defect(frame) else _project_box(frame, np.concatenate([points, ball]))
-        mask = np.zeros(frame.camera.size, np.float32) if found is None else grab_cut(frame.rgb, found)
+        found = _project_box(frame, np.concatenate([points, ball]))
+        seen = min(found[2:]) >= _SMALLEST_BOX and not frame_defect(frame)
+        mask = grab_cut(frame.rgb, found) if seen else np.zeros(frame.camera.size, np.float32)
         masked.append(replace(frame, mask=mask))
         points = np.concatenate([points, _inner_points(masked[-1])])
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
@@ -57,14 +57,17 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
     """Return the mask of the largest region in a box (top, left, height, width) with other colours than around it."""
     top, left, height, width = box
-    labels = np.full(rgb.shape[:2], cv2.GC_BGD, np.uint8)
-    labels[top : top + height, left : left + width] = cv2.GC_PR_FGD
-    return largest_region(separate_colours(rgb, labels)).astype(np.float32)
+    inside = np.zeros(rgb.shape[:2], bool)
+    inside[top : top + height, left : left + width] = True
+    return largest_region(separate_colours(rgb, inside)).astype(np.float32)
 
 
-def separate_colours(rgb: UInt8[np.ndarray, "h w 3"], labels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground by GrabCut on the image or a smaller copy, given OpenCV's label of each pixel."""
-    height, width = labels.shape
+def separate_colours(
+    rgb: UInt8[np.ndarray, "h w 3"], possible: Bool[np.ndarray, "h w"], certain: Bool[np.ndarray, "h w"] | bool = False
+) -> Bool[np.ndarray, "h w"]:
+    """Select the foreground by GrabCut on the image or a smaller copy: `certain` pixels, and some `possible` ones."""
+    height, width = possible.shape
+    labels = np.where(certain, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
@@ -84,26 +87,15 @@ def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     return frame.camera.to_world(object_points(inner))
 
 
-def _ball(frame: Frame, box: Box) -> Float[np.ndarray, "n 3"]:
-    """Points (n, 3) on a ball that may contain the object, given its bounding box in the frame."""
-    top, left, height, width = box
-    depth = float(np.median(frame.depth[object_pixels(frame)]))
-    radius = depth * max(width / frame.camera.focal_length[0], height / frame.camera.focal_length[1]) / 2
-    centre = frame.camera.unproject(np.array([left + width / 2, top + height / 2]), depth + _BALL_OFFSET * radius)
-    directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))
-    return centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box | None:
-    """Compute the padded bounding box of projected world points; None if they are not in the image."""
+def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
+    """Compute the padded bounding box of projected world points, of size 0 if they are not in the image."""
     height, width = frame.camera.size
     pixels, depth = frame.camera.project(points)
     pixels = pixels[depth > 0]
     if not len(pixels):
-        return None
+        return 0, 0, 0, 0
     low, high = np.percentile(pixels, [1, 99], axis=0)
     margin = _PADDING / 2 * (high - low).max()
     left, top = np.floor(low - margin).clip(0, (width - 1, height - 1)).astype(int)
     right, bottom = np.ceil(high + margin).clip(1, (width, height)).astype(int)
-    box = int(top), int(left), int(bottom - top), int(right - left)
-    return box if min(box[2:]) >= _SMALLEST_BOX else None
+    return int(top), int(left), int(bottom - top), int(right - left)

@@ -14,7 +14,6 @@ from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
 from zsp_lite.io.files import decode_json, path_inside, read_json
 
-FILE = "transforms.json"
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
@@ -52,16 +51,8 @@ class _File(msgspec.Struct):
 
 
 def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
-    """Read the frames that have depth.
-
-    Stored depth is in millimetres unless the file has `depth_unit_scale_factor`. Radial and tangential distortion are
-    corrected on loading.
-
-    Raises:
-        InputError: The file is invalid, no frame has depth, the camera model is another one, intrinsics are missing, or
-            k4 is not 0.
-    """
-    path = path_inside(folder, FILE)
+    """Read the frames that have depth, which is in millimetres unless the file has `depth_unit_scale_factor`."""
+    path = path_inside(folder, "transforms.json")
     common, listed = read_json(path, dict[str, Any], "capture"), read_json(path, _File, "capture").frames
     del common["frames"]
     frames = []

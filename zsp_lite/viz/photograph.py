@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
-from zsp_lite.demo import PHOTOGRAPH_SOLVERS, PhotographResult
+from zsp_lite.demo import PhotographResult
 from zsp_lite.points import object_points
 from zsp_lite.viz import plots
 
@@ -41,7 +41,7 @@ def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) ->
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)  # to the aspect of the photograph
     left = [np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255), photograph.rgb]
     titles = [f"a view of the synthetic motorcycle,\n{sequence}", "directions judged by eye\n"]
-    columns, pictures, texts = len(PHOTOGRAPH_SOLVERS), [], []
+    columns, pictures, texts = len({result.solver for result in results}), [], []
     for row, start in enumerate(range(0, len(results), columns)):
         found = results[start : start + columns]
         pictures += [left[row], *[photograph.rgb] * columns]
