@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.annotations import Triple
+from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError
@@ -30,7 +30,7 @@ OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
 class _Picks(msgspec.Struct):
     reference_seq: str
     names: list[str]
-    picks: dict[str, list[Triple]]
+    picks: dict[str, list[Row]]
     skipped: list[str]
 
 
