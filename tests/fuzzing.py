@@ -35,16 +35,10 @@ ROOT = Path(_FOLDER.name)  # every target overwrites its own files
 
 @dataclass(frozen=True)
 class Target:
-    """A reader.
-
-    Attributes:
-        read: Reads the content of a file.
-        seed: A valid content; text formats are mutated as bytes, JSON also as values.
-        is_json: Whether the content is JSON.
-    """
+    """A reader of the content of a file."""
 
     read: Callable[[bytes], object]
-    seed: bytes
+    seed: bytes  # a valid content; text formats are mutated as bytes, JSON also as values
     is_json: bool = False
 
 

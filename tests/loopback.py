@@ -6,22 +6,15 @@ import threading
 
 
 class Server:
-    """An HTTP server on loopback that counts requests and can misbehave.
-
-    Attributes:
-        files: Content by path.
-        ranges: Range header of each GET request so far, or None.
-        break_after: The connection is closed after so many bytes of a response.
-        stall_after: Nothing is sent after so many bytes of a response, but the connection stays open.
-        knows_ranges: Whether Range headers are honoured.
-        chunked: Whether the length is not sent.
-        surplus: Sent after the content.
-    """
+    """An HTTP server on loopback that counts requests and can misbehave."""
 
     def __init__(self, files: dict[str, bytes]):
-        self.files, self.ranges, self.break_after, self.stall_after = files, [], None, None
-        self.knows_ranges = True
-        self.chunked, self.surplus = False, b""
+        self.files = files  # content by path
+        self.ranges = []  # Range header of each GET request so far, or None
+        self.break_after = None  # the connection is closed after so many bytes of a response
+        self.stall_after = None  # nothing is sent after so many bytes, but the connection stays open
+        self.knows_ranges = True  # whether Range headers are honoured
+        self.chunked, self.surplus = False, b""  # whether the length is not sent; sent after the content
         self.closed = threading.Event()
         outer = self
 

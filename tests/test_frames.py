@@ -55,11 +55,6 @@ def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
     assert mask_to_bbox(sum(square_mask(*part) for part in parts), padding=padding) == box
 
 
-@given(st.floats(0.002, 1))
-def test_the_threshold_is_lowered_until_a_pixel_passes(value):
-    assert mask_to_bbox(square_mask(20, 40, 40, 60, value), padding=0) == (20, 40, 40, 60)
-
-
 def test_an_empty_mask_has_no_box():
     with pytest.raises(InputError, match="is empty"):
         mask_to_bbox(np.zeros((5, 5)))

@@ -77,8 +77,7 @@ class Camera:
     ) -> "Camera":
         """Convert a PyTorch3D camera, such as a CO3D viewpoint.
 
-        In the format "ndc_norm_image_bounds", each side of the image covers [-1, 1]; in "ndc_isotropic", the shorter
-        side does.
+        Each side of the image covers [-1, 1] in "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
         """
         R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)
