@@ -86,7 +86,7 @@ def similarities_of_patch(
     for axis, picture, values in zip(axes[1:], pictures, maps.values()):
         values = np.asarray(values)
         plots.overlay_map(axis, values, limits=limits, label="cosine")
-        plots.circle_patch(axis, np.unravel_index(values.argmax(), values.shape), values.shape, picture)
+        plots.circle_patch(axis, divmod(int(values.argmax()), values.shape[1]), values.shape, picture)
         if true_cell is not None:
             centre = plots.patch_centres(true_cell[None], values.shape, picture.shape[:2])[0]
             axis.plot(*centre, "*", color=plots.ORANGE, markersize=18, markeredgecolor="black")
