@@ -260,11 +260,9 @@ def test_the_weights_and_the_calibration_reach_the_verified_solver(views, verifi
 def test_the_seed_reaches_the_verified_proposals_and_refinement(views, verified, monkeypatch):
     propose, refine = solver.propose_poses, solver.refine_coarse_to_fine
     with monkeypatch.context() as patch:
-        patch.setattr(solver, "propose_poses", lambda scene, rng: propose(scene, 0))
+        patch.setattr(solver, "propose_poses", lambda scene, rng: propose(scene, np.random.default_rng(0)))
         assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))
-    monkeypatch.setattr(
-        solver, "refine_coarse_to_fine", lambda scene, poses, weights, rng: refine(scene, poses, weights)
-    )
+    monkeypatch.setattr(solver, "refine_coarse_to_fine", lambda *args: refine(*args[:3], np.random.default_rng(0)))
     assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))
 
 

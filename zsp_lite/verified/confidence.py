@@ -26,10 +26,8 @@ from zsp_lite.estimates import Hypothesis
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
 MODE_ANGLE = 30.0
 TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, another pose is nearly as probable
-# The estimate is flagged below this fraction of points that lie on an observed surface, in both directions.
-_MIN_OVERLAP = 0.05
-# The estimate is flagged below this similarity term, in both directions. Correct and wrong hypotheses have 0.06 and
-# more, views that share no side of the object 0.01.
+_MIN_OVERLAP = 0.05  # fraction of points on an observed surface; with less in both directions, a pose is flagged
+# The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no side 0.01.
 _MIN_SIMILARITY = 0.02
 
 

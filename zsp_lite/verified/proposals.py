@@ -27,27 +27,22 @@ _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 _POOL = 200  # best samples of a view that go into non-maximum suppression
 _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
-# Scale of the poses from views: one view shows a part of the object, all target views together show nearly the whole,
-# so the spread of the reference's points is about this fraction of the spread of the targets' points.
+# Scale of the poses from views: the spread of what one view shows is about this fraction of the whole object's.
 _VIEW_SCALE = 0.9
 
 
-def propose_poses(scene: Scene, seed: int | np.random.Generator = 0) -> Poses:
+def propose_poses(scene: Scene, rng: np.random.Generator) -> Poses:
     """Propose poses from the matches of each target view, followed by those of `poses_from_views`."""
-    rng = np.random.default_rng(seed)
     proposals = [poses_from_matches(source, target, rng) for source, target in scene.matches]
     return concatenate([*proposals, poses_from_views(scene)])
 
 
-def poses_from_matches(
-    source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], seed: int | np.random.Generator = 0
-) -> Poses:
+def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator) -> Poses:
     """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees.
 
     Samples are scored as in MSAC (Torr and Zisserman 2000), by the truncated quadratic
     sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2) over all matches.
     """
-    rng = np.random.default_rng(seed)
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     sample = torch.from_numpy(np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3].copy())

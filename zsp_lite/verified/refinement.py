@@ -18,12 +18,10 @@ from zsp_lite.verified.verification import ScoreCoefficients, score_terms
 
 # Hypotheses kept from round to round, and the smallest angle between them in degrees.
 MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
-# Of these, the best that are polished.
-_MAX_POLISHED = 3
+_MAX_POLISHED = 3  # of these, the best that are polished
 # About this many points of the reference and of the targets are scored during the search.
 _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
-# Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
-_PARENTS = 6
+_PARENTS = 6  # steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
 Score = Callable[[Poses], Float[Tensor, " m"]]
 
 
@@ -43,11 +41,8 @@ FINE = SearchSchedule(rounds=5, samples=24, rotation=4.7, translation=0.08, scal
 POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
 
 
-def refine_coarse_to_fine(
-    scene: Scene, poses: Poses, weights: ScoreCoefficients, seed: int | np.random.Generator = 0
-) -> Poses:
+def refine_coarse_to_fine(scene: Scene, poses: Poses, weights: ScoreCoefficients, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
-    rng = np.random.default_rng(seed)
     score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
@@ -57,7 +52,7 @@ def refine_coarse_to_fine(
 
 
 def refine(
-    poses: Poses, score: Score, schedule: SearchSchedule, seed: int | np.random.Generator = 0
+    poses: Poses, score: Score, schedule: SearchSchedule, rng: np.random.Generator
 ) -> tuple[Poses, Float[Tensor, " m"]]:
     """Improve every pose by random search; scales stay within `SCALE_RANGE`.
 
@@ -65,7 +60,6 @@ def refine(
     the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
     Rotations are about the centroid of the reference's points, which is the origin in working units.
     """
-    rng = np.random.default_rng(seed)
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
     parents = min(_PARENTS, schedule.samples)

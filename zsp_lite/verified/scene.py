@@ -122,8 +122,6 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
     A patch in the middle of an object is similar to most patches, one at the silhouette to few. Centring removes this
     and leaves how much more similar a patch is to one place than to the others.
     """
-    if similarity.numel() == 0:
-        return similarity
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
 

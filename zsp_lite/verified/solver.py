@@ -53,10 +53,7 @@ class VerifiedSolver:
     def __call__(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
     ) -> PoseEstimate:
-        """Estimate the pose of the reference object (see `estimates.Solver`): the best hypothesis of `solve`.
-
-        Inliers are matches with measured depth on both sides.
-        """
+        """Return the best hypothesis of `solve` (see `estimates.Solver`). Inliers have measured depth on both sides."""
         solution = self.solve(reference, targets, matched, seed)
         rotation, best = solution.poses.rotation, solution.hypotheses[0]
         flags, one_of_two = reliability_flags(solution.hypotheses, rotation_angles(rotation, rotation).numpy())
@@ -70,19 +67,10 @@ class VerifiedSolver:
             reference, tuple(targets), solution.timings, flags, solution.hypotheses, one_of_two,
         )  # fmt: skip
 
-    def solve(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        matched: Sequence[ViewMatch],
-        seed: int | np.random.Generator = 0,
-    ) -> Solution:
+    def solve(self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0) -> Solution:
         """Run all stages on usable target views and their matches with the reference.
 
         The result is equivariant to the order of the target views and to rotations of their world frame.
-
-        Raises:
-            InputError: The reference, or all targets together, have too few foreground patches of known depth.
         """
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():

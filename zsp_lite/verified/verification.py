@@ -77,8 +77,7 @@ class ScoreTerms:
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
-# Terms that need features; the others compare shapes.
-FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
+FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")  # the other terms compare shapes
 
 
 @dataclass(frozen=True)
@@ -157,8 +156,7 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
 def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
     """Compute the viewpoint term: high if the views from near the reference's viewpoint are the most similar to it.
 
-    The angle includes rotation about the line of sight, because features change with it. With one target view the
-    term is 0.
+    The angle includes rotation about the line of sight, because features change with it.
     """
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
     return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
