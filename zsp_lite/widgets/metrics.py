@@ -62,7 +62,7 @@ def rotated_distance(
     With the same cloud twice, it is the error for symmetric objects (ADD-S) of Hinterstoisser et al.
     """
     search = NearestNeighbors(n_neighbors=1).fit(other)
-    return np.array([search.kneighbors(_rotate_z(cloud, angle))[0].mean() for angle in degrees])
+    return np.array([search.kneighbors(_rotate_z(cloud, angle))[0].mean() for angle in degrees.tolist()])
 
 
 def symmetry_rotation(clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> Widget:
