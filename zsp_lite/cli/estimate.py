@@ -83,7 +83,7 @@ def _print_tables(found: "PairResult") -> None:
     print_rows(
         f"Pose from {found.title}, backbone {found.backbone}", COLUMNS[1:], [row[1:] for row in table_rows(found)]
     )
-    print(legend(COLUMNS[1:]))
+    print(legend([name for name in COLUMNS[1:] if name != "error" or found.errors]))
     for solver, one in found.estimates.items():
         view = f"view {one.view + 1} ({found.targets[one.view].name})"
         print(f"{solver}: reference-camera points to camera points of {view}")
