@@ -140,7 +140,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PairResult:
-    """Pose estimates of one pair by one or several solvers. `print` shows them."""
+    """Pose estimates of one pair by one solver, or by both. `print` shows them."""
 
     title: str  # name of the pair, such as its category
     sources: tuple[str, str]  # where the reference and the target views come from, in words

@@ -58,7 +58,7 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
-            num_heads = dim // 64 if dim % 64 == 0 else 0
+            num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads by a ValueError
         with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:

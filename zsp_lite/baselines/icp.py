@@ -42,7 +42,8 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
 def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int) -> Sim3:
     """Estimate the pose of a reference frame in target `view` by ICP, from camera points to camera points.
 
-    Initially, both cameras are placed where the first camera of their sequence is.
+    Both cameras start where the first camera of their sequence is (supplement), because the worlds of CO3D's sequences
+    are nearly aligned already, which would help.
     """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera
@@ -50,8 +51,8 @@ def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[C
     parts = [camera.to_camera(target.camera.to_world(_cloud(target))) for target in targets]
     target = _subsample(np.concatenate(parts), rng)
     aligned = icp(firsts[0].to_world(source), firsts[1].to_world(target))
-    from_reference, to_target = (Sim3(1.0, first.R, first.t) for first in firsts)
-    return to_target @ aligned @ from_reference.inverse()
+    to_reference, to_target = (Sim3(1.0, first.R, first.t) for first in firsts)
+    return to_target @ aligned @ to_reference.inverse()
 
 
 def _cloud(frame: Frame) -> Float[np.ndarray, "n 3"]:

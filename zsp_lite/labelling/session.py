@@ -244,6 +244,7 @@ class Labelling:
             problem = problem and f"has a {problem}; expected a smaller one, or confirmed=True"
         if problem:
             raise InputError(f"sequence {sequence} {problem}")
+        # A label has no scale: it moves the centre of the reference as the alignment does.
         centre = self.cloud(self.reference)[0].mean(axis=0)
         label = rigid_label(alignment.sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
@@ -256,7 +257,8 @@ class Labelling:
         path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
         if sequence == self.reference:
             raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
-        if path.is_file() and len(self.picks(sequence)) != len(self.names):
+        # Labels do not say where they come from: one with all its picks was made of them.
+        if path.is_file() and not 0 < len(self.names) == len(self.picks(sequence)):
             raise InputError(f"sequence {sequence} has a label not made of picks; remove {path} to leave it out")
         path.unlink(missing_ok=True)
         if sequence not in self._stored.skipped:

@@ -47,7 +47,7 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     as much as a reference and the nearest of a few target views, and never more than two views of different pairs.
     Each view shows another instance of the object, with its own proportions, materials and room.
     """
-    rng = np.random.default_rng([number, 0])
+    rng = np.random.default_rng([number, 0])  # [number, 1] draws the object itself
     start = rng.uniform(0, 2 * np.pi)
     views, step = [], SIZE // GRID
     for view in range(VIEWS):
@@ -57,9 +57,12 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         mesh, coordinates = make_instance(number, rng)
         vertices = mesh.vertices
         R, t = orbit_pose(
-            azimuth + (view % 2 - 0.5) * apart, np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1), rng.normal(0, 0.1),
-            rng.uniform(5, 10), (vertices.max(0) + vertices.min(0)) / 2,
-        )  # fmt: skip
+            azimuth=azimuth + (view % 2 - 0.5) * apart,
+            elevation=np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1),
+            roll=rng.normal(0, 0.1),
+            distance=rng.uniform(5, 10),
+            target=(vertices.max(0) + vertices.min(0)) / 2,
+        )
         camera = framed_camera(vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
         image = render_instance(number, mesh, coordinates, camera, rng)
         every = (slice(step // 2, None, step),) * 2

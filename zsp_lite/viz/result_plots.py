@@ -19,6 +19,8 @@ from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
 
+_HALF_WIDTH, _TOP = 3.7, 2.3  # limits of panels with objects of about unit standard deviation
+
 
 def crop_steps(frame: Frame, crop: Frame, size: float = 3.0) -> Figure:
     """Draw a frame with the box around its object, the object mask, and the crop."""
@@ -194,12 +196,12 @@ def cloud_overlays(
     panel: (0, 2) from the right side, (0, 1) from above; `low` is the lower end of the vertical axis.
     """
     rows = -(-len(overlays) // columns)
-    size = 9, rows * (0.5 + 9 / columns * (2.3 - low) / 7.4)
+    size = 9, rows * (0.5 + 9 / columns * (_TOP - low) / (2 * _HALF_WIDTH))
     figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
     for axis, (own, moved), title, shown in zip(axes.flat, overlays, titles, seen, strict=True):
         axis.scatter(*own[:, shown].T, s=4, c=ORANGE, marker="o", linewidths=0.5)
         axis.scatter(*moved[:, shown].T, s=6, c=BLUE, marker="x", linewidths=0.5)
-        axis.set(aspect="equal", xticks=[], yticks=[], xlim=(-3.7, 3.7), ylim=(low, 2.3))
+        axis.set(aspect="equal", xticks=[], yticks=[], xlim=(-_HALF_WIDTH, _HALF_WIDTH), ylim=(low, _TOP))
         axis.set_title(plots.plain_text(title), fontsize=9)
     return figure
 
