@@ -33,7 +33,7 @@ def box_to_mask(frame: "Frame", box: "Box") -> Widget:
             text += f", IoU with the true mask {(mask & true).sum() / (mask | true).sum():.2f}"
         return text
 
-    controls = {  # sides at least 4 pixels inside the image; GrabCut refuses an empty box, and the widget shows its error
+    controls = {  # sides at least 4 pixels inside the image; an empty box gives an empty mask
         "top": slider("top", 0, height - 4, top),
         "left": slider("left", 0, width - 4, left),
         "bottom": slider("bottom", 4, height, top + box_height),
