@@ -252,7 +252,7 @@ def test_json_has_every_number_of_the_estimates(own):
         assert one["error_degrees"] == found.errors[solver] and one["confidence"] == estimate.confidence
         assert one["one_of_two"] == estimate.one_of_two
         for other, alternative in zip(one["alternatives"], estimate.alternatives, strict=True):
-            assert other["probability"] == alternative.probability > 0
+            assert other["probability"] == alternative.confidence > 0
             np.testing.assert_array_equal(other["matrix"], alternative.sim3.matrix)
         assert len(one["alternatives"]) > 0 or solver == "paper"
     assert content["degrees_between_solvers"] == found.disagreement < 20

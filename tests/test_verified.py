@@ -230,10 +230,10 @@ def test_a_symmetric_object_is_flagged_as_ambiguous(method, symmetry):
     assert "the object may be symmetric" in found.note and not found.reliable
     assert ("one of two: poses" in found.note) == found.one_of_two
     assert ("poses more than 30 degrees apart explain the views equally well" in found.note) != found.one_of_two
-    assert sum(one.probability for one in found.alternatives) + found.confidence <= 1
+    assert sum(one.confidence for one in found.alternatives) + found.confidence <= 1
     if len(turns) == 1:
-        assert found.one_of_two and found.alternatives[0].angle > 150
-        assert found.confidence >= found.alternatives[0].probability > found.confidence / np.e
+        assert found.one_of_two and found.angle_to(found.alternatives[0]) > 150
+        assert found.confidence >= found.alternatives[0].confidence > found.confidence / np.e
     assert found.confidence < 0.75
     # Both answers are among the hypotheses, the one as true as the other.
     first = frames[0].camera

@@ -38,20 +38,6 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class Alternative:
-    """Another pose that explains the views, less well than the estimate."""
-
-    rank: int  # rank among the different poses; the estimate has 1
-    sim3: Sim3  # reference-camera points to camera points of target view `view`
-    view: int  # index of the target view that is closest to the reference viewpoint under this pose
-    # probability that its rotation error is below 30 degrees. Together with the estimate's confidence, the
-    # probabilities of all alternatives sum to at most 1; the rest is that of none of these
-    probability: float
-    angle: float  # angle between its rotation and that of the estimate in degrees
-    deficit: float  # score of the estimate minus its own, in nats
-
-
-@dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """Pose of the reference object in one of the target views, with the intermediate results behind it."""
 
@@ -90,22 +76,18 @@ class PoseEstimate:
         return self.hypotheses[0].confidence if self.hypotheses else None
 
     @cached_property
-    def alternatives(self) -> tuple[Alternative, ...]:
+    def alternatives(self) -> tuple[Hypothesis, ...]:
         """Other poses, most probable first, without those within 30 degrees of a better one; () without hypotheses."""
-        different = [one for index, one in enumerate(self.hypotheses) if one.mode == index]
-        return tuple(
-            Alternative(
-                rank, one.sim3, one.view, one.confidence,
-                float(rotation_error(self.world_rotation(), self.world_rotation(one))),
-                different[0].score - one.score,
-            )
-            for rank, one in enumerate(different[1:], 2)
-        )  # fmt: skip
+        return tuple(one for index, one in enumerate(self.hypotheses) if one.mode == index)[1:]
 
-    def world_rotation(self, pose: "Hypothesis | Alternative | None" = None) -> Float[np.ndarray, "3 3"]:
+    def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the reference camera's frame to the world of the target views."""
         sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
         return self.target_views[view].frame.camera.R.T @ sim3.R
+
+    def angle_to(self, pose: Hypothesis) -> float:
+        """Return the angle in degrees between the rotation of the estimate and that of another pose."""
+        return float(rotation_error(self.world_rotation(), self.world_rotation(pose)))
 
     @property
     def reliable(self) -> bool:
@@ -194,8 +176,9 @@ class PairResult:
                 "one_of_two": estimate.one_of_two,
                 "alternatives": [
                     {
-                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.probability,
-                        "degrees_from_best": one.angle, "score_below_best": one.deficit,
+                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.confidence,
+                        "degrees_from_best": estimate.angle_to(one),
+                        "score_below_best": estimate.hypotheses[0].score - one.score,
                     }
                     for one in estimate.alternatives
                 ],

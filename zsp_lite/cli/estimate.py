@@ -91,10 +91,10 @@ def _print_tables(found: "PairResult") -> None:
             print("  " + " ".join(f"{value:10.5f}" for value in line))
         if one.reference_turn:
             print(f"  features of the reference turned by {one.reference_turn}° counterclockwise")
-        for other in one.alternatives:
+        for rank, other in enumerate(one.alternatives, 2):
             print(
-                f"  hypothesis {other.rank}: turned by {other.angle:.0f}° from the best, "
-                f"score {other.deficit:.1f} nats below it, probability {other.probability:.2f}"
+                f"  hypothesis {rank}: turned by {one.angle_to(other):.0f}° from the best, "
+                f"score {one.hypotheses[0].score - other.score:.1f} nats below it, probability {other.confidence:.2f}"
             )
         for flag in one.flags:
             print(f"  flag: {flag}")

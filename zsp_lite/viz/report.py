@@ -254,7 +254,7 @@ def pose_pictures(result: PairResult) -> list[StageFigure]:
             )
         )
         if estimate.one_of_two:
-            angle = estimate.alternatives[0].angle
+            angle = estimate.angle_to(estimate.alternatives[0])
             pictures.append(
                 StageFigure(
                     f"One of two: both poses of the {solver} solver",
@@ -338,9 +338,9 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     poses = []
     for solver, estimate in result.estimates.items():
         poses.append((f"{solver} solver", estimate.propagate([camera])[0]))
-        for one in estimate.alternatives:
+        for rank, one in enumerate(estimate.alternatives, 2):
             (pose,) = replace(estimate, sim3=one.sim3, view=one.view).propagate([camera])
-            poses.append((f"{solver} solver, hypothesis {one.rank}", pose))
+            poses.append((f"{solver} solver, hypothesis {rank}", pose))
     scene = aligned_clouds(poses[0][1].apply(cloud), target, colours=(colours, target_colours))
     scene.update_layout(
         height=400, paper_bgcolor="rgba(0,0,0,0)", font={"color": _GREY},
@@ -372,7 +372,7 @@ def _two_poses_figure(estimate: PoseEstimate) -> Figure:
     second = estimate.alternatives[0]
     poses = {
         f"probability {estimate.confidence:.2f}": estimate,
-        f"turned by {second.angle:.0f}°, probability {second.probability:.2f}": replace(
+        f"turned by {estimate.angle_to(second):.0f}°, probability {second.confidence:.2f}": replace(
             estimate, sim3=second.sim3, view=second.view
         ),
     }
