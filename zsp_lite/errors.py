@@ -4,6 +4,8 @@ import math
 import numbers
 import reprlib
 import traceback
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -63,14 +65,26 @@ def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None
         raise InputError(f"{name} holds {np.max(sizes)}, expected finite numbers of at most {most:g}")
 
 
-def real_array(name: str, values: object) -> "np.ndarray":
-    """Convert real numbers to a float64 array; InputError for texts and complex numbers, which NumPy would convert."""
+def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise InputError if a value is none of those allowed."""
+    if value not in (allowed := list(allowed)):
+        raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
+
+
+def real_array(name: str, values: object, shape: tuple[int | None, ...] | None = None) -> "np.ndarray":
+    """Convert real numbers to a float64 array; InputError for texts and complex numbers, which NumPy would convert.
+
+    If a `shape` is given, in which None is any length, another one is an InputError, too.
+    """
     import numpy as np
 
-    try:
+    found, expected = f"is {reprlib.repr(values)}", "real numbers"
+    with suppress(TypeError, ValueError, RuntimeError):  # of NumPy, for instance for rows of different lengths
         array = np.asarray(values)
-        if array.dtype.kind not in "biuf":
-            raise TypeError(f"an array of type {array.dtype}")
-        return array.astype(np.float64, copy=False)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{name} is {reprlib.repr(values)}, expected real numbers") from error
+        if array.dtype.kind in "biuf":
+            if shape is None or len(shape) == array.ndim and all(n in (None, m) for n, m in zip(shape, array.shape)):
+                return array.astype(np.float64, copy=False)
+            found = f"has shape {array.shape}"
+    if shape is not None:
+        expected += f" of shape {shape}".replace("None", "n")
+    raise InputError(f"{name} {found}, expected {expected}")
