@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame, read_grey16, read_image, read_mask
-from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.data.cameras import MIN_FOCAL_LENGTH, Camera
+from zsp_lite.data.frames import Frame, check_pixels, read_grey16, read_image, read_mask
+from zsp_lite.errors import MAX_LENGTH, InputError, check_magnitude, check_number, real_array
 from zsp_lite.io.files import path_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
@@ -42,8 +42,8 @@ class CaptureFrame:
             depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
         mask = None if self.mask is None else read_mask(self.mask)
         for path, pixels in ((self.image, rgb), (self.depth, depth), (self.mask, mask)):
-            if pixels is not None and pixels.shape[:2] != (height, width):
-                raise InputError(f"{path} is {pixels.shape[:2]} pixels, expected the image's {(height, width)}")
+            if pixels is not None:
+                check_pixels(path, pixels, (height, width))
         if any(self.distortion):
             matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion)
             maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (width, height), cv2.CV_32FC1)
@@ -69,7 +69,8 @@ def camera_from_pose(
 ) -> Camera:
     """Create a camera, with the nearest exact rotation, from its camera-to-world pose in OpenCV's axes.
 
-    The intrinsics are fx, fy, cx, cy in pixels. InputError, which begins with `where`, if the pose is not rigid.
+    The intrinsics are fx, fy, cx, cy in pixels. InputError, which begins with `where`, if they are no such numbers or
+    the pose is not rigid.
     """
     rotation = pose[:3, :3]
     if (
@@ -81,8 +82,10 @@ def camera_from_pose(
         raise InputError(f"{where}: pose is {pose.tolist()}, expected a finite rigid camera-to-world matrix")
     left, _, right = np.linalg.svd(rotation)
     rotation = left @ right
-    fx, fy, cx, cy = intrinsics
-    return Camera(rotation.T, -rotation.T @ pose[:3, 3], np.array([fx, fy]), np.array([cx, cy]), size)
+    values = real_array(f"{where}: intrinsics", intrinsics, (4,))
+    check_magnitude(f"{where}: intrinsics", values)
+    check_number(f"{where}: focal_length", float(values[:2].min()), above=MIN_FOCAL_LENGTH)
+    return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
 
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
