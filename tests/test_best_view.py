@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from co3d_folders import random_camera
 
 from zsp_lite.best_view import (
     VIEW_SELECTORS,
@@ -12,6 +13,7 @@ from zsp_lite.best_view import (
     global_score,
     mask_iou,
 )
+from zsp_lite.data.frames import Frame
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
 from zsp_lite.views import View
@@ -79,7 +81,8 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
 
 def test_all_selectors_take_the_same_comparison():
     grid = torch.ones(2, 2, dtype=torch.bool)
-    view = View(None, feature_map([1.0, 0.0]), grid)
+    frame = Frame(np.zeros((2, 2, 3), np.uint8), None, None, random_camera(0, (2, 2)))
+    view = View(frame, feature_map([1.0, 0.0]), grid)
     comparison = ViewMatch(view, view, torch.eye(4), matches([1.0] * 4), 4)
     scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}
     assert scores == {"correspond": 0, "global": 1, "saliency": 1, "cyclical": 1}

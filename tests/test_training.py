@@ -37,7 +37,8 @@ def fourier(surface, seed=0):
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
     azimuths = []
-    monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", lambda *a: azimuths.append(a[0]) or orbit_pose(*a))
+    kept = lambda azimuth, **others: azimuths.append(azimuth) or orbit_pose(azimuth, **others)  # noqa: E731
+    monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", kept)
     render_object(3)
     turns = np.subtract.outer(azimuths, azimuths)
     apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
