@@ -125,8 +125,8 @@ def test_resizing_scales_pixels_and_keeps_depth(seed, height, width):
         ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
         ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
         ({"principal_point": [np.nan, 0]}, "principal_point holds nan"),
-        ({"size": (0, 5)}, "expected .height, width., integers from 1"),
-        ({"size": (np.inf, 5)}, "image size is .*inf"),
+        ({"size": (0, 5)}, "image size: a side is 0, expected an integer from 1"),
+        ({"size": (np.inf, 5)}, "image size: a side is inf"),
     ],
 )
 def test_invalid_cameras_are_refused(changes, message):
@@ -145,7 +145,7 @@ def test_the_span_of_views_is_that_around_the_object(roll):
             cameras.append(replace(random_camera(), R=R, t=np.array([0, 0, 3]) - R @ [1, 2, 3]).turn(roll))
         return view_span(cameras, np.array([1.0, 2, 3]))
 
-    assert span((40, 20)) == 0
+    assert span((40, 20)) == pytest.approx(0, abs=1e-5)
     assert span(*((az, 0) for az in range(0, 73, 18))) == pytest.approx(72)
     for height in (0, 30, 60):
         assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)

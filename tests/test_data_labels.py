@@ -75,7 +75,7 @@ def test_labels_and_pairs_come_from_a_clone_into_the_folder_that_is_there(clone,
         ("data/class_labels/chair/b.json", json.dumps({"trans": np.diag([2.0, 2, 2, 1]).tolist(), "seq": "b",
                                                        "reference_seq": "a"}).encode(), "expected a rigid transform"),
         ("data/class_labels/chair/c.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "b",
-                                                       "reference_seq": "a"}).encode(), "expected that of its name"),
+                                                       "reference_seq": "a"}).encode(), "seq as in its name"),
         ("data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
     ],
 )  # fmt: skip

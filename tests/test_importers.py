@@ -257,7 +257,7 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     frame = READERS["nerfstudio"](tmp_path)[0]
     np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2], 1)
-    with pytest.raises(InputError, match="expected the image's"):
+    with pytest.raises(InputError, match=r"expected .* = \(96, 128\)"):
         frame.load()
 
 

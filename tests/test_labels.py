@@ -33,11 +33,6 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     np.testing.assert_allclose(pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9)
 
 
-def test_labels_of_different_references_have_no_relative_pose():
-    with pytest.raises(InputError, match="expected the same reference sequence"):
-        relative_pose(random_label(0), random_camera(0), random_label(1, "b", "other"), random_camera(1))
-
-
 @pytest.mark.parametrize("folder", ["class_labels", "data/class_labels"])
 def test_labels_are_read_back_from_either_folder(tmp_path, folder):
     (tmp_path / folder / "chair").mkdir(parents=True)
@@ -64,7 +59,7 @@ def test_a_label_file_has_the_published_format(tmp_path):
         ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rigid transform"),
         ({"trans": np.diag([1.0, 1, 1, 2]).tolist()}, "expected a rigid transform"),
         ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
-        ({"seq": "b"}, "of sequence 'b', expected that of its name"),
+        ({"seq": "b"}, "has seq 'b' .* seq as in its name"),
         ({"seq": None}, r"got `null` - at `\$.seq`"),
     ],
 )

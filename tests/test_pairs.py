@@ -92,7 +92,7 @@ def test_sampling_depends_on_seed_and_category_alone(dataset):
 
 
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
-    with pytest.raises(InputError, match="has 12 frames, expected at least 13"):
+    with pytest.raises(InputError, match="of at least 12 frames, expected 2 or more of at least 13"):
         sample_pairs(dataset, "chair", 1, 13)
     write_co3d(tmp_path, "chair", [sequence_data("s1")])
     with pytest.raises(InputError, match="has 0 labelled sequences"):
@@ -155,7 +155,7 @@ def test_a_folders_own_pairs_are_found_in_both_layouts(tmp_path, place):
         ({"all_target_id": torch.tensor(3)}, "all_target_id"),
         ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
         ({"target_seq_name": "s3"}, "is not of s3"),
-        ({"class": "sofa"}, "category 'sofa'"),
+        ({"class": "sofa"}, "category is 'sofa'"),
     ],
 )
 def test_ids_of_other_data_are_refused(dataset, tmp_path, changes, message):

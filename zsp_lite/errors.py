@@ -68,7 +68,7 @@ def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError if a value is none of those allowed."""
     if value not in (allowed := list(allowed)):
-        raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
+        raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed)) or '(none)'}")
 
 
 def real_array(name: str, values: object, shape: tuple[int | None, ...] | None = None) -> "np.ndarray":

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 from tqdm import tqdm
 
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.download import RemoteFile, fetch, remote_size
 from zsp_lite.io.files import path_inside, read_json, write_atomic
 from zsp_lite.io.locks import writing
@@ -57,10 +57,7 @@ def list_archives(
     subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
     catalogue, origin = msgspec.json.decode(CATALOGUE.read_bytes())[dataset], f"{dataset} ({subset})"
     digests = catalogue.get(subset, {})
-    if category not in digests:
-        raise InputError(
-            f"category {category!r} is not in {origin}, which has {', '.join(digests) or 'no such subset'}"
-        )
+    check_choice(f"category of {origin}", category, digests)
     base = (os.environ.get(URL_VARIABLES[dataset]) or catalogue["url"]).rstrip("/")
     archives = []
     for number, sha256 in enumerate(digests[category][:chunks]):

@@ -4,14 +4,13 @@ A camera maps world points to camera coordinates by `x_cam = R @ x_world + t` (c
 +z forward). Pixel coordinates are (x, y) with pixel centres at half-integers: the image covers [0, W] x [0, H].
 """
 
-import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import InputError, check_magnitude, check_number, real_array
+from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 
@@ -26,7 +25,7 @@ _AXES = np.array([-1.0, -1.0, 1.0])
 # decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
 _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
-_MIN_FOCAL_LENGTH = 1e-3  # pixels
+MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
 _STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
 
@@ -43,9 +42,7 @@ class Camera:
 
     def __post_init__(self):
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal_length", (2,)), ("principal_point", (2,))):
-            array = np.array(real_array(f"camera {name}", getattr(self, name)))
-            if array.shape != shape:
-                raise InputError(f"camera {name} has shape {array.shape}, expected {shape}")
+            array = np.array(real_array(f"camera {name}", getattr(self, name), shape))
             check_magnitude(f"camera {name}", array)
             object.__setattr__(self, name, array)
         deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
@@ -54,11 +51,11 @@ class Camera:
         if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        check_number("camera focal_length", self.focal_length.min(), above=_MIN_FOCAL_LENGTH)
-        sides = tuple(self.size)
-        if len(sides) != 2 or not all(isinstance(x, numbers.Integral) and 0 < x <= MOST_PIXELS for x in sides):
-            raise InputError(f"image size is {sides}, expected (height, width), integers from 1 to {MOST_PIXELS}")
-        object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
+        check_number("camera focal_length", float(self.focal_length.min()), above=MIN_FOCAL_LENGTH)
+        real_array("image size", tuple(self.size), (2,))
+        for side in self.size:
+            check_integer("image size: a side", side, 1, MOST_PIXELS)
+        object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
 
     def __repr__(self) -> str:
         names = ("focal_length", "principal_point", "t", "R")

@@ -29,6 +29,7 @@ from zsp_lite.data.annotations import (
 from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
 from zsp_lite.data.frames import (
     Frame,
+    check_pixels,
     read_depth,
     read_image,
     read_mask,
@@ -37,7 +38,7 @@ from zsp_lite.data.frames import (
     write_image,
     write_mask,
 )
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
@@ -179,16 +180,12 @@ class Co3D:
     def _read(self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options) -> np.ndarray:
         path = path_inside(self.root, relative)
         image = reader(path, *options)
-        if image.shape[:2] != size:
-            raise InputError(f"{path} is {image.shape[:2]} pixels, expected the annotated (H, W) = {size}")
+        check_pixels(path, image, size)
         return image
 
     def _category_folder(self, category: str) -> Path:
-        folder = self.root / plain_name(category, "category")
-        if not (folder / FRAMES_FILE).is_file():
-            known = ", ".join(self.categories()) or "no category"
-            raise InputError(f"category {category!r} is not in {self.root}, which has {known}")
-        return folder
+        check_choice(f"data folder {self.root}: category", category, self.categories())
+        return self.root / category
 
     def _frame_index(self, category: str) -> FrameIndex:
         if self._index is None or self._index[0] != category:

@@ -146,6 +146,12 @@ def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     return bits
 
 
+def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> None:
+    """Raise InputError if the image of a file is not of this size (H, W)."""
+    if image.shape[:2] != size:
+        raise InputError(f"{path} is {image.shape[:2]} pixels, expected (H, W) = {size}")
+
+
 def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
     """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
     _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])

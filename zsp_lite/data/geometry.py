@@ -4,14 +4,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from zsp_lite.errors import InputError
-
 _TRIALS = 500  # samples of three points to fit a plane to
 _MOST_POINTS = 4000  # that a plane is fitted to
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"], threshold: float) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane `normal @ x = offset` to points with outliers; InputError if all points lie on a line.
+    """Fit a plane `normal @ x = offset` to points with outliers, or through a line on which all points lie.
 
     RANSAC is followed by least squares over the inliers of the best trial, the points nearer than `threshold`. Returns
     the unit normal, of arbitrary sign, and the offset.
@@ -22,10 +20,8 @@ def fit_plane(points: Float[np.ndarray, "n 3"], threshold: float) -> tuple[Float
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1)
     distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
-    distances[lengths[:, 0] == 0] = np.inf  # a sample of collinear points
-    inliers = points[distances[(distances < threshold).sum(axis=1).argmax()] < threshold]
-    if len(inliers) < 3:
-        raise InputError(f"no plane within {threshold} of three of the {len(points)} points")
+    counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)  # 0 for a sample of collinear points
+    inliers = points[distances[counts.argmax()] < threshold]
     centre = inliers.mean(axis=0)
     normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
     return normal, float(normal @ centre)

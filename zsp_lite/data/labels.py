@@ -66,10 +66,9 @@ def parse_label(data: bytes, path: PurePath) -> PoseLabel:
     check_magnitude(f"label {path}: trans", trans)
     rotation = trans[:3, :3]
     deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
-    if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise InputError(f"label {path} has trans {trans.tolist()}, expected a rigid transform")
-    if label.seq != path.stem:
-        raise InputError(f"label {path} is of sequence {label.seq!r}, expected that of its name")
+    if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or label.seq != path.stem:
+        found = f"seq {label.seq!r} and trans {trans.tolist()}"
+        raise InputError(f"label {path} has {found}, expected a rigid transform, and seq as in its name")
     return PoseLabel(trans, label.seq, label.reference_seq)
 
 
@@ -112,10 +111,6 @@ def relative_pose(
 
     This is the composition in "Labelling pose for evaluation" of the supplement, which writes it from left to right. It
     leads from the coordinates of the reference frame's camera a to those of the target's camera b, for column vectors.
+    Both labels have the same reference sequence.
     """
-    if label_a.reference_seq != label_b.reference_seq:
-        raise InputError(
-            f"labels of {label_a.seq} and {label_b.seq} refer to {label_a.reference_seq} and "
-            f"{label_b.reference_seq}, expected the same reference sequence"
-        )
     return camera_b.matrix @ label_b.trans @ np.linalg.inv(label_a.trans) @ np.linalg.inv(camera_a.matrix)

@@ -48,15 +48,14 @@ def sample_pairs(
     if not isinstance(seed, np.random.Generator):
         seed = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
-    if len(sequences) < 2:
-        raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
     frames = dataset.frame_list(category)
     numbers = {name: sorted(key.frame_number for key in frames if key.sequence_name == name) for name in sequences}
-    for name in sequences:
-        if len(numbers[name]) < n_targets:
-            raise InputError(
-                f"labelled sequence {category}/{name} has {len(numbers[name])} frames, expected at least {n_targets}"
-            )
+    fewest = min(map(len, numbers.values()), default=0)
+    if len(sequences) < 2 or fewest < n_targets:
+        raise InputError(
+            f"category {category} has {len(sequences)} labelled sequences of at least {fewest} frames, expected 2 or "
+            f"more of at least {n_targets}"
+        )
 
     pairs = []
     for index in range(n):
