@@ -18,10 +18,10 @@ from zsp_lite.backbones.backbone import prepare_images
 from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.load import verify
 from zsp_lite.backbones.pretrained import download
+from zsp_lite.backbones.vit import nearest_multiple
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.cli import main as cli
 from zsp_lite.errors import InputError
-from zsp_lite.features import nearest_multiple
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The package's public names, and the examples in its docstrings."""
 
-import ast
 import subprocess
 import sys
 import tomllib
@@ -32,14 +31,6 @@ def test_an_unknown_name_is_an_attribute_error():
 def test_the_bare_import_does_not_import_torch():
     code = "import sys, zsp_lite; assert 'torch' not in sys.modules and 'cv2' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_type_checkers_see_the_same_names_as_the_interpreter():
-    stub = ast.parse(Path(zsp_lite.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-    homes = {
-        alias.asname: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names
-    }
-    assert homes == {name: f"zsp_lite.{home}".rstrip(".") for name, home in zsp_lite._HOME_OF.items()}
 
 
 def test_every_data_file_of_the_package_is_installed():

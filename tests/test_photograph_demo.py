@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, render
 
-from zsp_lite import demo
 from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
-from zsp_lite.demo import run_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.photograph import (
@@ -20,6 +18,7 @@ from zsp_lite.viz.photograph import (
     photograph_by_backbone,
     photograph_figure,
     photograph_rows,
+    run_photograph,
 )
 from zsp_lite.viz.report import render_page
 
@@ -56,7 +55,7 @@ def photograph():
 @pytest.fixture(scope="module")
 def results(motorcycles, photograph):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "motorcycle_photograph", lambda: photograph)
+        patch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
         return list(run_photograph(motorcycles, CoordinateBackbone()))
 
 
@@ -97,14 +96,14 @@ def test_errors_are_angles_to_the_directions_judged_by_eye(results):
 
 
 def test_the_sequence_may_be_given_and_must_exist(motorcycles, photograph, monkeypatch):
-    monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
+    monkeypatch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
     assert next(run_photograph(motorcycles, CoordinateBackbone(), "second")).sequence == "second"
     with pytest.raises(InputError, match="third"):
         next(run_photograph(motorcycles, CoordinateBackbone(), "third"))
 
 
 def test_foregrounds_and_solvers_may_be_chosen_and_have_a_panel_each(motorcycles, photograph, monkeypatch):
-    monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
+    monkeypatch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
     (one,) = run_photograph(motorcycles, CoordinateBackbone(), foregrounds=["mask"], solvers=["paper"])
     assert (one.foreground, one.solver) == ("mask", "paper")
     figure = photograph_by_backbone({"first network": one, "second network": one})
@@ -144,8 +143,8 @@ def test_the_page_begins_with_the_photograph_and_credits_it(results):
 
 
 def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(demo, "motorcycle_photograph", lambda: photograph)
-    monkeypatch.setattr(demo, "run_demo", lambda dataset, backbone, solvers: iter(()))
+    monkeypatch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)

@@ -7,12 +7,12 @@ import torch
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, render
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.metrics import reliability
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.points import object_cloud
 from zsp_lite.verified.maps import Projection, ViewMaps
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import alignment_plots, feature_plots, plots, result_plots, scene3d, training_plots, verified
+from zsp_lite.viz.plots import object_cloud
+from zsp_lite.viz.reliability import draw_reliability, reliability
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
@@ -150,7 +150,7 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
 def test_reliability_points_lie_at_confidence_and_frequency_with_wilsons_interval():
     _, axis = plt.subplots()
     measured = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
-    verified.draw_reliability(axis, measured)
+    draw_reliability(axis, measured)
     np.testing.assert_allclose(axis.containers[0][0].get_xydata(), [[0.2, 0.3], [0.9, 0.3]])
     # For 3 of 10, from a table: 10.8 % to 60.3 %.
     low, high = axis.containers[0][2][0].get_segments()[0][:, 1]

@@ -15,8 +15,8 @@ from zsp_lite.choices import SOLVERS
 from zsp_lite.data.frames import read_image
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
-from zsp_lite.points import object_cloud
 from zsp_lite.samples import REPOSITORY
+from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.pose_picture import coverage, pose_picture
 from zsp_lite.viz.report import (
     _notebook_link,

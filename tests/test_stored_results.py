@@ -10,10 +10,10 @@ from tools.models import read_catalogue
 from zsp_lite.benchmark.formats import insert_tables
 from zsp_lite.benchmark.results import read_results
 from zsp_lite.benchmark.tables import every_table
-from zsp_lite.metrics import reliability
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import ScoreCoefficients
+from zsp_lite.viz.reliability import reliability
 
 RUNS = {
     name: REPOSITORY / "notebooks" / "results" / "paper_run" / f"{name}.json.gz" for name in ("procedural", "artists")

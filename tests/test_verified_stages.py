@@ -15,7 +15,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
-from zsp_lite.metrics import auroc, reliability, rotation_error
+from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import (
     Calibration,
     Evidence,
@@ -40,6 +40,7 @@ from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms, viewpoint_term
 from zsp_lite.views import View, extract_views, object_crop
+from zsp_lite.viz.reliability import auroc, reliability
 
 seeds = st.integers(0, 2**31)
 

@@ -38,12 +38,13 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import reliability, rotation_error
+from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, Evidence, different_poses, hidden_share, modes
 from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
+from zsp_lite.viz.reliability import reliability
 
 CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.

@@ -28,35 +28,16 @@ Read the files in this order:
     baselines, labelling, importers, synthetic, training, widgets, cli
 """
 
+import ast
 import importlib
+from pathlib import Path
 
 __version__ = "0.3.0"
 
-# Public names by the module that holds them, "" for modules; `__init__.pyi` has them for editors. They are imported on
-# first use: torch takes seconds to import, which `zsp-lite --help` does not need.
-_HOMES = {
-    "": "alignment best_view choices demo errors estimates features matchers matching metrics minimal own_objects "
-    "pipeline points samples views backbones baselines benchmark cli data importers io labelling synthetic training "
-    "verified viz widgets",
-    "alignment": "Sim3",
-    "backbones": "checkpoints facets huggingface vit",
-    "backbones.backbone": "Backbone",
-    "backbones.load": "load_backbone",
-    "data": "annotations cameras check co3d depth frames labels pairs",
-    "data.cameras": "Camera",
-    "data.co3d": "Co3D",
-    "data.frames": "Frame",
-    "errors": "InputError",
-    "estimates": "PoseEstimate",
-    "features": "FeatureMap",
-    "io": "download files ply",
-    "matching": "Matches",
-    "own_objects": "estimate_pose open_source",
-    "pipeline": "ZeroShotPose",
-    "viz": "plots report scene3d",
-}
-_FUNCTIONS = ("load_backbone", "estimate_pose", "open_source")
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
+# Public names, and the modules that hold them, stand in `__init__.pyi`, for editors too. They are imported on first
+# use: torch takes seconds to import, which `zsp-lite --help` does not need.
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_HOME_OF = {one.name: node.module for node in _STUB.body if isinstance(node, ast.ImportFrom) for one in node.names}
 
 __all__ = ["__version__", *_HOME_OF]
 
@@ -64,10 +45,8 @@ __all__ = ["__version__", *_HOME_OF]
 def __getattr__(name: str):
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = ".".join(filter(None, (__name__, _HOME_OF[name])))
-    if name[0].isupper() or name in _FUNCTIONS:
-        return getattr(importlib.import_module(home), name)
-    return importlib.import_module(f"{home}.{name}")
+    home = importlib.import_module(_HOME_OF[name])
+    return vars(home)[name] if name in vars(home) else importlib.import_module(f"{home.__name__}.{name}")
 
 
 def __dir__() -> list[str]:

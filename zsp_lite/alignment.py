@@ -14,14 +14,11 @@ from zsp_lite.errors import InputError, check_integer, check_magnitude, check_nu
 # Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
 # paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
 SCALE_RANGE = (0.2, 5.0)
-# Below this ratio of the second to the first singular value of the covariance, the points are treated as collinear: the
-# rotation about their line is undetermined. It is a ratio of squared widths: 1e-6 is a cloud 1000 times longer than
-# wide.
-_COLLINEAR_SAMPLE = 1e-6
-_COLLINEAR = 1e-10
-# The same for a single cloud, as a ratio of widths: the rounding of float32 coordinates on a line stays below it.
-_COLLINEAR_CLOUD = 1e-5
-_MOST_TRIALS = 10_000_000
+# Points are treated as collinear, which leaves the rotation about their line undetermined, below these ratios of the
+# second to the first singular value: of the covariance, a ratio of squared widths, for a sample and for all points; and
+# of a single cloud, a ratio of widths, above the rounding of float32 coordinates on a line.
+_COLLINEAR_SAMPLE, _COLLINEAR, _COLLINEAR_CLOUD = 1e-6, 1e-10, 1e-5
+MOST_TRIALS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +37,11 @@ class Sim3:
 
     def __post_init__(self):
         scale, rotation, translation = float(self.scale), real_array("Sim3: R", self.R), real_array("Sim3: t", self.t)
-        if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise InputError(f"Sim3: R and t have shapes {rotation.shape} and {translation.shape}, expected 3x3 and 3")
-        if not (np.isfinite(translation).all() and 0 < scale < np.inf):
-            raise InputError(f"Sim3: expected a finite t and a positive finite scale, scale is {scale}")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
-            raise InputError("Sim3: R is not a rotation (orthogonal, determinant +1)")
+        if translation.shape != (3,) or not np.isfinite(translation).all() or not 0 < scale < np.inf:
+            raise InputError(f"Sim3: scale is {scale} and t {translation}, expected a positive number and (3,) numbers")
+        orthogonal = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        if not orthogonal or np.linalg.det(rotation) < 0:
+            raise InputError(f"Sim3: R is {rotation.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
         object.__setattr__(self, "scale", scale)
         object.__setattr__(self, "R", rotation)
         object.__setattr__(self, "t", translation)
@@ -181,10 +177,12 @@ def ransac(
         InputError: Shapes are wrong, there are too few points, values are not finite, a setting is out of range, or
             every sample is collinear or has a scale out of range.
     """
-    check_integer("ransac: trials", trials, 1, _MOST_TRIALS)
+    check_integer("ransac: trials", trials, 1, MOST_TRIALS)
     check_integer("ransac: sample_size", sample_size, 3)
     check_number("ransac: threshold", threshold, above=0)
-    if not 0 <= scale_range[0] <= scale_range[1]:
+    if not isinstance(seed, np.random.Generator):
+        check_integer("ransac: seed", seed, 0)
+    if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
         raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))

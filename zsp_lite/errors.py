@@ -3,7 +3,6 @@
 import math
 import numbers
 import reprlib
-import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -31,12 +30,6 @@ class FatalError(InputError):
 
     Any other InputError of a row counts the pair as failed.
     """
-
-
-def describe_failure(error: BaseException) -> str:
-    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
-    *_, last = traceback.extract_tb(error.__traceback__)
-    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:

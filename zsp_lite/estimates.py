@@ -1,7 +1,7 @@
 """Pose estimates, of one solver and of a pair, and the protocol of the solvers that compute them from matched views."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -88,11 +88,6 @@ class PoseEstimate:
     def angle_to(self, pose: Hypothesis) -> float:
         """Return the angle in degrees between the rotation of the estimate and that of another pose."""
         return float(rotation_error(self.world_rotation(), self.world_rotation(pose)))
-
-    @property
-    def reliable(self) -> bool:
-        """Whether there are no flags. This says nothing about the accuracy of a fitted pose."""
-        return not self.flags
 
     @property
     def note(self) -> str:
@@ -194,13 +189,15 @@ class PairResult:
         }
 
 
-def label_error(
-    estimate: PoseEstimate, reference_label: PoseLabel, reference: Frame, target_label: PoseLabel,
-    targets: Sequence[Frame],
-) -> float:  # fmt: skip
-    """Return the rotation error of an estimate in degrees, by the labels of both sequences."""
-    truth = relative_pose(reference_label, reference.camera, target_label, targets[estimate.view].camera)
-    return float(rotation_error(estimate.sim3.R, truth[:3, :3]))
+def label_errors(
+    estimates: Mapping[str, PoseEstimate], labels: Sequence[PoseLabel], reference: Frame, targets: Sequence[Frame]
+) -> dict[str, float]:
+    """Compute the rotation errors of estimates in degrees, by the labels of the reference's and target's sequences."""
+    errors = {}
+    for name, estimate in estimates.items():
+        truth = relative_pose(labels[0], reference.camera, labels[1], targets[estimate.view].camera)
+        errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
+    return errors
 
 
 @runtime_checkable

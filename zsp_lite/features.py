@@ -15,12 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zsp_lite.errors import FatalError, InputError, check_integer
+from zsp_lite.errors import FatalError, InputError
 
 Grid = tuple[int, int]  # (rows, columns) of patches
 # A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
 SALIENCY_THRESHOLD = 0.05
-MOST_PIXELS = 2048  # of an image's side; the time of attention grows with the fourth power of the side
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +92,6 @@ class FeatureExtractor(Protocol):
     def __call__(self, images: Sequence[np.ndarray]) -> list[FeatureMap]:
         """Extract the feature maps, all on one grid, of images (H, W, 3), uint8 or float in [0, 1]."""
         ...
-
-
-def nearest_multiple(size: int, patch_size: int) -> int:
-    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_PIXELS`."""
-    check_integer("image_size", size, 1, MOST_PIXELS)
-    return max(1, round(size / patch_size)) * patch_size
 
 
 @lru_cache(maxsize=32)

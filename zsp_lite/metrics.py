@@ -1,14 +1,12 @@
-"""Pose errors, the paper's figures of them, and the reliability of confidences.
+"""Pose errors, and the paper's figures of them.
 
 Source: sec. 5.1; supplement, "Choice of evaluation metrics".
 
 `benchmark.statistics` has their intervals and tests. A bootstrap replicate is a row of weights, one per pair.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError, check_magnitude, real_array
@@ -107,58 +105,3 @@ def _rotations(name: str, values: ArrayLike) -> Float[np.ndarray, "*batch 3 3"]:
     if deviation > _ROTATION_TOLERANCE or (np.linalg.det(matrices) < 0).any():
         raise InputError(f"rotation_error: {name} is no rotation, expected R @ R.T = identity, det R = 1")
     return matrices
-
-
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table.
-
-    Bins hold equal numbers of estimates, in order of confidence.
-    """
-
-    auroc: float  # area under the ROC curve (see `auroc`)
-    calibration_error: float  # expected calibration error, in [0, 1]
-    top_half_accuracy: float  # fraction of correct estimates among the more confident half
-    count: np.ndarray  # (bins,) number of estimates
-    confidence: Float[np.ndarray, " bins"]  # (bins,) mean confidence
-    accuracy: Float[np.ndarray, " bins"]  # (bins,) fraction of correct estimates
-
-    def __str__(self) -> str:
-        lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]
-        lines += [
-            f"{n:5d} {100 * c:10.1f}% {100 * a:7.1f}%" for n, c, a in zip(self.count, self.confidence, self.accuracy)
-        ]
-        lines.append(
-            f"AUROC {self.auroc:.3f}, expected calibration error {100 * self.calibration_error:.1f} points, "
-            f"accuracy of the more confident half {100 * self.top_half_accuracy:.1f} %"
-        )
-        return "\n".join(lines)
-
-
-def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
-    """Measure the reliability of confidences.
-
-    Args:
-        confidence: Confidences of n estimates, in [0, 1].
-        correct: Which of the estimates were correct.
-        bins: Number of bins of equal count.
-    """
-    confidence, correct = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
-    order = np.argsort(confidence, kind="stable")
-    parts = np.array_split(order, bins)
-    mean = np.array([confidence[part].mean() for part in parts])
-    accuracy = np.array([correct[part].mean() for part in parts])
-    count = np.array([len(part) for part in parts])
-    upper_half = order[len(order) // 2 :]
-    error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
-    return Reliability(auroc(confidence, correct), error, float(correct[upper_half].mean()), count, mean, accuracy)
-
-
-def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
-    """Estimate the probability that a correct estimate has a higher confidence than a wrong one, ties counting half."""
-    correct = np.asarray(correct, dtype=bool)
-    positive, negative = np.asarray(confidence)[correct], np.asarray(confidence)[~correct]
-    if not len(positive) or not len(negative):
-        return float("nan")
-    difference = positive[:, None] - negative
-    return float(((difference > 0) + 0.5 * (difference == 0)).mean())

@@ -22,7 +22,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.estimates import PairResult, PoseEstimate, label_error
+from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
 from zsp_lite.importers.convert import READERS, SIGNS, scale_frame
@@ -31,7 +31,7 @@ from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
-from zsp_lite.points import object_pixels, unit_scale, world_cloud
+from zsp_lite.points import axis_deviation, object_pixels, world_cloud
 from zsp_lite.views import has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
@@ -164,9 +164,12 @@ def estimate_pose(
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
+        for source, cloud in zip((first, second), clouds):
+            if len(cloud) < 2:
+                raise InputError(f"{source.path}: no depth is known on the object, expected some")
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        pairs = zip((first, second), clouds)
-        scales = [1.0 if one.format == "sequence" or len(cloud) < 2 else unit_scale(cloud) for one, cloud in pairs]
+        units = [one.format == "sequence" for one in (first, second)]
+        scales = [1.0 if known else 1 / axis_deviation(cloud) for known, cloud in zip(units, clouds)]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
         solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
@@ -326,14 +329,13 @@ def _errors(
     labels = read_labels(one.parent.parent, one.parent.name)
     if not {one.name, other.name} <= set(labels):
         return {}
-    ends = labels[one.name], reference, labels[other.name], targets
-    return {solver: label_error(estimate, *ends) for solver, estimate in estimates.items()}
+    return label_errors(estimates, [labels[one.name], labels[other.name]], reference, targets)
 
 
 def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
-    """Say where the usable target views do not show all sides of the object, of which some points are known."""
+    """Say where the usable target views do not show all sides of the object, which has these world points."""
     cameras = [frame.camera for frame in targets if not frame_defect(frame)]
-    span = view_span(cameras, np.median(points, axis=0)) if len(points) else 0.0
+    span = view_span(cameras, np.median(points, axis=0))
     if len(cameras) > 2 and span >= _ALL_SIDES:
         return ()
     seen = f"{'two sides' if span >= _ALL_SIDES else 'one side'} only ({span:.0f} degrees)"

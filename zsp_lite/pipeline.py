@@ -1,6 +1,6 @@
 """Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
-import importlib
+import pkgutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
+from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, check_integer, check_number
@@ -24,7 +24,7 @@ from zsp_lite.points import standard_deviation
 from zsp_lite.views import View, crop_size, extract_views, has_saliency, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
-SOLVERS = {"verified": "zsp_lite.verified:VerifiedSolver"}
+SOLVER_CLASSES = {"verified": "zsp_lite.verified:VerifiedSolver"}
 _FEW = 10  # fewer points do not give a standard deviation
 
 
@@ -48,8 +48,8 @@ class ZeroShotPose:
             published code (see `matching.match`; docs/published_code.md lists all its differences).
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
-        solver: "paper" selects the best view and aligns with it by RANSAC; a name in `SOLVERS`, such as "verified",
-            or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
+        solver: "paper" selects the best view and aligns with it by RANSAC; or a name in `SOLVER_CLASSES`, such as
+            "verified", or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
         upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
             degrees, because the features of a turned image are others and phones may store images turned. The estimate
@@ -80,17 +80,20 @@ class ZeroShotPose:
         names = {
             "matcher": ("cyclical", *MATCHERS),
             "view_selector": tuple(VIEW_SELECTORS),
-            "solver": ("paper", *SOLVERS),
+            "solver": ("paper", *SOLVER_CLASSES),
             "foreground": ("saliency", "mask"),
             "cycle_from": ("reference", "target"),
+            "kmeans": (None, True, False),
         }
         for name, allowed in names.items():
             value = getattr(self, name)
             plugged_in = name in ("matcher", "view_selector", "solver") and callable(value)
             if not plugged_in and value not in allowed:
-                raise InputError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
-        for name, minimum in (("k", 1), ("trials", 1), ("sample_size", 3), ("seed", 0)):
-            check_integer(name, getattr(self, name), minimum)
+                raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
+        for name, *limits in (("k", 1), ("trials", 1, MOST_TRIALS), ("sample_size", 3), ("seed", 0)):
+            check_integer(name, getattr(self, name), *limits)
+        if not callable(self.backbone):
+            raise InputError(f"backbone is {self.backbone!r}, expected what `load_backbone` returns")
         if self.foreground == "saliency" and not has_saliency(self.backbone):
             name = getattr(self.backbone, "name", type(self.backbone).__name__)
             raise InputError(f"foreground is 'saliency', which {name} does not have; expected 'mask'")
@@ -218,8 +221,7 @@ class ZeroShotPose:
             settings = {"view_selector": self.view_selector, "trials": self.trials, "sample_size": self.sample_size}
             return partial(align_best_view, **settings)
         if isinstance(self.solver, str):
-            module, name = SOLVERS[self.solver].split(":")
-            return getattr(importlib.import_module(module), name)()
+            return pkgutil.resolve_name(SOLVER_CLASSES[self.solver])()
         return self.solver
 
 

@@ -10,11 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
-from zsp_lite.errors import InputError
-from zsp_lite.views import View
 
 _FAR = 4.0  # points of a frame farther from their median than this multiple of the median distance are outliers
-_INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
 def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
@@ -51,45 +48,11 @@ def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
     return float(points.std(axis=0).mean())
 
 
-def unit_scale(points: Float[np.ndarray, "n 3"]) -> float:
-    """Compute the factor that gives points (n, 3) unit standard deviation, averaged over the axes, as in CO3D."""
-    deviation = axis_deviation(points)
-    if not deviation > 0:
-        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object")
-    return 1 / deviation
-
-
-def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
-    """Gather a view's object points for display, without outliers.
-
-    The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
-    """
-    return coloured_cloud(view, most, seed)[0]
-
-
-def coloured_cloud(
-    view: View, most: int = 2000, seed: int = 0
-) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Gather the points of `object_cloud` with their RGB colours in the image."""
-    frame = view.frame
-    pixels = object_pixels(frame, _INTERIOR)
-    if frame.mask is None:
-        rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
-        pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
-    points, colours = unproject_depth(frame.depth, frame.camera)[pixels], frame.rgb[pixels]
-    if len(points) == 0:
-        raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
-    kept = np.flatnonzero(near_median(points, 2.5))
-    if len(kept) > most:
-        kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), most, replace=False))]
-    return points[kept], colours[kept]
-
-
 def world_cloud(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Gather the world points and colours of the object in the usable frames, without each frame's outliers."""
     clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for frame in frames:
-        if not frame_defect(frame) and (inside := (frame.depth > 0) & (frame.mask > ON_OBJECT)).any():
+        if not frame_defect(frame) and (inside := object_pixels(frame)).any():
             points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[inside])
             kept = near_median(points, _FAR)
             clouds.append(points[kept])

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from zsp_lite.backbones.facets import FACETS, Facet, block_index
 from zsp_lite.backbones.huggingface import HuggingFaceViT
-from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.backbones.vit import VisionTransformer, nearest_multiple
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureMap, nearest_multiple
+from zsp_lite.features import FeatureMap
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
 

@@ -15,9 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zsp_lite.backbones.facets import Facet
-from zsp_lite.backbones.vit import Tokens
+from zsp_lite.backbones.vit import Tokens, nearest_multiple
 from zsp_lite.errors import InputError
-from zsp_lite.features import nearest_multiple
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's

@@ -15,7 +15,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zsp_lite.backbones.facets import Facet
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
+
+MOST_PIXELS = 2048  # of an image's side; the time of attention grows with the fourth power of the side
+
+
+def nearest_multiple(size: int, patch_size: int) -> int:
+    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_PIXELS`."""
+    check_integer("image_size", size, 1, MOST_PIXELS)
+    return max(1, round(size / patch_size)) * patch_size
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.benchmark.methods import Method
+from zsp_lite.benchmark.methods import Method, describe_failure
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.best_view import mask_iou
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.labels import PoseLabel, relative_pose
-from zsp_lite.errors import FatalError, InputError, describe_failure
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.metrics import rotation_error, translation_error
 from zsp_lite.pipeline import view_alignment
 from zsp_lite.views import has_saliency, patch_mask

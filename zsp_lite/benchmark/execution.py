@@ -25,11 +25,11 @@ from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import Method, import_object
+from zsp_lite.benchmark.methods import Method, describe_failure, import_object
 from zsp_lite.benchmark.store import FrameStore, torch_threads
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, check_integer, describe_failure
+from zsp_lite.errors import InputError, check_integer
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from zsp_lite.benchmark.published import ACCURACIES, TARGETS, VIEWS_FIGURES
 from zsp_lite.benchmark.results import Results
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import reliability
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
+from zsp_lite.viz.reliability import reliability
 
 _VIEWS = (1, 3, 5, 10, 20)
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")

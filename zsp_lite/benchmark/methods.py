@@ -8,13 +8,14 @@ import importlib
 import operator
 import os
 import sys
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
-from zsp_lite.errors import InputError, describe_failure
+from zsp_lite.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,12 @@ class Method:
     targets: int | None = None  # number of target views per pair; None for that of the run
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     solve: Callable[[Any], Any] | None = None
+
+
+def describe_failure(error: BaseException) -> str:
+    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
 
 
 _MASK = {"foreground": "mask"}

@@ -72,12 +72,28 @@ class _Figures(msgspec.Struct):
     acc15_ci: _Interval
 
 
+class _BestTwo(msgspec.Struct):
+    acc30: float
+    acc30_ci: _Interval
+    one_of_two: int
+    one_of_two_acc30: float | None
+    one_of_two_first_acc30: float | None
+
+
+class _Test(msgspec.Struct):
+    accuracy_gain: float
+    accuracy_gain_ci: _Interval
+    accuracy_gain_p: float
+    sign_test_p: float
+
+
 class _RowFigures(_Figures):
     mean_category_median: float
     mean_category_median_ci: _Interval
     failed: int
     flagged: int
     per_category: dict[str, _Figures]
+    best_two: _BestTwo | None = None
 
 
 class _Data(msgspec.Struct):
@@ -91,6 +107,7 @@ class _Summary(msgspec.Struct):
     data: _Data
     backbone: str
     methods: dict[str, _RowFigures]
+    against_ours: dict[str, _Test] = {}
 
 
 class _File(msgspec.Struct):

@@ -71,6 +71,8 @@ def evaluate(
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
     """
+    check_integer("pairs", pairs, 1)
+    check_integer("targets", targets, 1)
     rows = resolve(methods)
     row_pairs = pairs_of_rows(root, rows, pairs, targets, seed, categories)
     work = rows_of_pairs(row_pairs)

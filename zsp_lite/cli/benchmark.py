@@ -13,11 +13,17 @@ _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 @click.command(
     epilog=examples(
         "benchmark",
-        "benchmark --data outputs/eval --pairs 30 --methods ours,rootsift --out outputs/compared",
+        "benchmark --data outputs/paper17 --pairs 15 --methods ours,rootsift --out outputs/compared",
         "benchmark --list",
     )
 )
-@click.option("--data", type=PATH, show_default="$ZSP_LITE_DATA, else data_samples", help="Folder in CO3D's layout.")
+@click.option(
+    "--data",
+    type=PATH,
+    envvar="ZSP_LITE_DATA",
+    show_default="$ZSP_LITE_DATA, else data_samples",
+    help="Folder in CO3D's layout.",
+)
 @backbone_options
 @click.option("--categories", type=NAMES, show_default="all with pose labels", help="Categories.")
 @click.option("--pairs", type=COUNT, default=30, help="Pairs per category.")
@@ -42,9 +48,9 @@ def benchmark(data, backbone, categories, pairs, targets, methods, list_only, se
 
     from zsp_lite.benchmark.reports import write_reports
     from zsp_lite.benchmark.run import evaluate
-    from zsp_lite.samples import default_data
+    from zsp_lite.samples import sample_data
 
-    root = data or default_data()
+    root = data or sample_data()
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
     # `delay` keeps the terminal empty where the input is refused; `disable=None` hides the bar outside a terminal.

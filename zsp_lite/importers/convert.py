@@ -19,7 +19,7 @@ from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.points import object_pixels, object_points, unit_scale
+from zsp_lite.points import axis_deviation, object_pixels, object_points
 
 READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
 SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
@@ -89,7 +89,7 @@ def import_capture(
     empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
     flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
-    scale = unit_scale(points)
+    scale = 1 / axis_deviation(points)
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
     data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):

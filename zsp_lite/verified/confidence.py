@@ -10,7 +10,7 @@ x is what is known about the estimate beside the scores (see `Evidence`), above 
 its views go. Where they show one side only, the best pose turns that side to the reference, and whether the reference
 shows a hidden side that looks alike cannot be known. h is the share of the circle around the target from where no view
 is within 60 degrees, relative to that of a single view, and \lambda the chance of such a side. What the p_k leave of 1
-is the probability of none of these. The confidence of an estimate is p_1. `metrics.reliability` measures how well such
+is the probability of none of these. The confidence of an estimate is p_1. `viz.reliability` measures how well such
 probabilities are calibrated.
 """
 

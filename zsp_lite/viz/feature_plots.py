@@ -17,7 +17,6 @@ from matplotlib.patheffects import Normal, Stroke
 
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
-from zsp_lite.points import object_cloud
 from zsp_lite.viz import plots
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -32,7 +31,7 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4) -> Fi
     The colour of a point is its position along the reference object.
     """
     reference = next(iter(estimates.values())).reference_view
-    cloud = object_cloud(reference, most=_POINTS)
+    cloud = plots.object_cloud(reference, most=_POINTS)
     colours = plots.coordinate_colours(cloud)
     chosen = [estimate.target_views[estimate.view].frame for estimate in estimates.values()]
     pictures = [reference.frame.rgb, *(frame.rgb for frame in chosen)]

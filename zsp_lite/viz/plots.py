@@ -10,7 +10,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Bool, Float, Integer, Real
+from jaxtyping import Bool, Float, Integer, Real, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -21,7 +21,10 @@ from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
-from zsp_lite.points import axis_deviation
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.errors import InputError
+from zsp_lite.points import axis_deviation, near_median, object_pixels
+from zsp_lite.views import View
 
 # The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -34,6 +37,7 @@ _AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
 _MARKED = 20  # points of a curve; more have no markers
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+_INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
 def plain_text(text: str) -> str:
@@ -325,6 +329,32 @@ def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     centred = points - points.mean(axis=0)
     along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]
     return plt.get_cmap("viridis")((along - along.min()) / max(np.ptp(along), 1e-12))[:, :3]
+
+
+def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Gather a view's object points for display, without outliers.
+
+    The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
+    """
+    return coloured_cloud(view, most, seed)[0]
+
+
+def coloured_cloud(
+    view: View, most: int = 2000, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Gather the points of `object_cloud` with their RGB colours in the image."""
+    frame = view.frame
+    pixels = object_pixels(frame, _INTERIOR)
+    if frame.mask is None:
+        rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
+        pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
+    points, colours = unproject_depth(frame.depth, frame.camera)[pixels], frame.rgb[pixels]
+    if len(points) == 0:
+        raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
+    kept = np.flatnonzero(near_median(points, 2.5))
+    if len(kept) > most:
+        kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), most, replace=False))]
+    return points[kept], colours[kept]
 
 
 def _draw_image(axis: Axes, image: np.ndarray) -> None:

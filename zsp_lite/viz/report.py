@@ -22,16 +22,20 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from plotly.offline import get_plotlyjs
 
-from zsp_lite.demo import PhotographResult
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.points import coloured_cloud, object_cloud
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.viz.feature_plots import matches_of_estimate
-from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PHOTOGRAPH_CREDIT, photograph_figure, photograph_rows
+from zsp_lite.viz.photograph import (
+    PHOTOGRAPH_COLUMNS,
+    PHOTOGRAPH_CREDIT,
+    PhotographResult,
+    photograph_figure,
+    photograph_rows,
+)
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
 
@@ -224,7 +228,7 @@ def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     for index, (result, frames) in enumerate(zip(results, others)):
         first, _, *row = axes[index * columns : (index + 1) * columns]
         reference, cameras = result.estimate.reference_view, [frame.camera for frame in frames]
-        cloud = object_cloud(reference, most=_OVERVIEW_POINTS)
+        cloud = plots.object_cloud(reference, most=_OVERVIEW_POINTS)
         plots.draw_points(first, reference.frame.camera, cloud, plots.coordinate_colours(cloud), size=3)
         plots.draw_moved_cloud(row, cameras, cloud, result.estimate.propagate(cameras), names=None)
     write_atomic(path, _encode(figure, format="jpeg", facecolor="white", pil_kwargs={"quality": 88}))
@@ -334,7 +338,7 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     """Draw both clouds, with a menu of all poses and a choice of the colours; the page's script serves both."""
     first, second = _chosen_views(result)
     camera = second.frame.camera
-    (cloud, colours), (target, target_colours) = coloured_cloud(first), coloured_cloud(second)
+    (cloud, colours), (target, target_colours) = map(plots.coloured_cloud, (first, second))
     poses = []
     for solver, estimate in result.estimates.items():
         poses.append((f"{solver} solver", estimate.propagate([camera])[0]))
@@ -381,7 +385,7 @@ def _two_poses_figure(estimate: PoseEstimate) -> Figure:
     titles = [title if row == 0 else "" for row in range(len(views)) for title in poses]
     images = [view.frame.rgb for view in views for _ in poses]
     figure, axes = plots.show_images(images, titles, columns=2, size=4.2)
-    cloud = object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
+    cloud = plots.object_cloud(estimate.reference_view, most=_OVERVIEW_POINTS)
     for place, one in enumerate(poses.values()):
         plots.draw_moved_cloud(axes[place::2], cameras, cloud, one.propagate(cameras), ("x", "y", "z"))
     return figure

@@ -14,7 +14,6 @@ from matplotlib.patches import Rectangle
 
 from zsp_lite.data.frames import Frame, mask_to_bbox
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.points import object_cloud
 from zsp_lite.views import View
 from zsp_lite.viz import plots
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
@@ -74,7 +73,7 @@ def matched_points(views: Sequence[View], points: Sequence[Float[np.ndarray, "k 
     Both points of a match have the same colour, by their height on the first object. Points far off the object are
     outside the panels.
     """
-    clouds = [object_cloud(view)[:, :2] for view in views]
+    clouds = [plots.object_cloud(view)[:, :2] for view in views]
     middles = [(cloud.min(axis=0) + cloud.max(axis=0)) / 2 for cloud in clouds]
     half = 1.2 * np.max([np.ptp(cloud, axis=0) for cloud in clouds], axis=0) / 2
     half = np.maximum(half, 0.75 * half.max())  # panels at least three quarters as high as wide, and the reverse
@@ -136,7 +135,7 @@ def pose_over_sequence(
 ) -> Figure:
     """Draw the reference's points in frames of the target sequence after the estimated pose."""
     figure, axes = plots.show_images([frame.rgb for frame in frames], titles, columns=columns, size=size)
-    cloud, cameras = object_cloud(estimate.reference_view, most=1400), [frame.camera for frame in frames]
+    cloud, cameras = plots.object_cloud(estimate.reference_view, most=1400), [frame.camera for frame in frames]
     names = ("", "", "") if show_axes else None
     plots.draw_moved_cloud(axes, cameras, cloud, estimate.propagate(cameras), names)
     return figure

@@ -1,25 +1,22 @@
-"""Plots for the verified solver: the point terms of a pose in every view, its score, and the reliability diagram."""
+"""Plots for the verified solver: the point terms of a pose in every view, and its score."""
 
 from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binomtest
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.metrics import Reliability, reliability
-from zsp_lite.points import object_cloud
 from zsp_lite.verified.confidence import MODE_ANGLE
 from zsp_lite.verified.maps import ViewMaps
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreCoefficients
 from zsp_lite.views import View
-from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_axes, draw_points, mark, show_images
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_axes, draw_points, mark, object_cloud, show_images
 
 # Classes of a projected point, each with its colour and marker.
 POINT_CLASSES: dict[str, tuple[str, str]] = {
@@ -139,31 +136,6 @@ def draw_score_contributions(
     axis.legend(title="score", fontsize=9)
 
 
-def draw_reliability(axis: Axes, reliability: Reliability) -> None:
-    """Draw a reliability diagram: accuracy against mean confidence of each bin, with 95 % Wilson intervals.
-
-    Counts stand beside the points, or in the title if they are equal.
-    On the dashed diagonal confidences are calibrated; below it they are too high.
-    """
-    accuracy, count = reliability.accuracy, reliability.count
-    right = np.rint(accuracy * count).astype(int)
-    ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(right.tolist(), count.tolist())]
-    bars = np.maximum([accuracy - [end.low for end in ends], [end.high for end in ends] - accuracy], 0)
-    axis.plot([0, 1], [0, 1], color="0.4", linestyle="--", label="calibrated")
-    axis.errorbar(
-        reliability.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
-        label="measured",
-    )  # fmt: skip
-    if len(set(count.tolist())) == 1:
-        axis.set_title(f"{count[0]} answers for each point", fontsize=10)
-    else:
-        for x, y, n in zip(reliability.confidence, accuracy, count):
-            axis.annotate(str(n), (x, y), (5, -10), textcoords="offset points", fontsize=8, color="0.3")
-    axis.set(xlabel="mean confidence", ylabel="fraction within 30 degrees", xlim=(0, 1.03), ylim=(0, 1.03))
-    axis.set_aspect("equal")
-    axis.legend(loc="upper left", fontsize=9)
-
-
 def show_moved_reference(
     reference: View,
     targets: Sequence[View],
@@ -249,21 +221,6 @@ def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.nda
         axis.set(xlim=(-8, 188), xticks=range(0, 181, 60))
     axes[0, 0].set_ylabel("score (nats)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
-    return figure
-
-
-def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> Figure:
-    """Show a reliability diagram, and the accuracy among the most confident answers against their share."""
-    measured = reliability(confidence, correct, bins=max(2, min(10, len(correct) // 20)))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 4.2), layout="constrained")
-    draw_reliability(left, measured)
-    order = np.argsort(-confidence, kind="stable")
-    number = np.arange(1, len(order) + 1)
-    right.plot(100 * number / len(order), 100 * np.cumsum(correct[order]) / number, color=BLUE, label="surest first")
-    right.axhline(100 * correct.mean(), color="0.4", linestyle="--", label="all answers")
-    right.set(xlabel="share of pairs that are answered (per cent)", ylabel="of these within 30 degrees (per cent)")
-    right.set(xlim=(0, 100), ylim=(0, 103))
-    right.legend(loc="lower left")
     return figure
 
 
