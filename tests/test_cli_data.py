@@ -122,6 +122,8 @@ def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
         (["data", "import", "lists", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
         (["data", "import", "nerfstudio", "x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit=2"],
          "--depth-unit does not go with the format nerfstudio"),
+        (["data", "import", "lists", "x", "--root=x", "--category=c", "--sequence=s", "--box=1,1,9,9", "--masks=m"],
+         "--masks does not go with --box"),
     ],
 )  # fmt: skip
 def test_bad_input_gives_one_line_and_exit_code_2(arguments, message, capsys):

@@ -138,6 +138,7 @@ def import_(layout, folder, root, category, sequence, box, masks, frames, depth_
     from zsp_lite.importers import READERS, import_capture
 
     given = {} if depth_unit is None else {"depth_unit": depth_unit}
+    refuse_options({"masks": box and masks}, (), "--box")
     refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
     capture = READERS[layout](folder, **given)
     done = import_capture(capture, root, category, sequence, box, masks, frames)

@@ -69,8 +69,7 @@ def camera_from_pose(
 ) -> Camera:
     """Create a camera, with the nearest exact rotation, from its camera-to-world pose in OpenCV's axes.
 
-    The intrinsics are fx, fy, cx, cy in pixels. InputError, which begins with `where`, if they are no such numbers or
-    the pose is not rigid.
+    The intrinsics are fx, fy, cx, cy in pixels. InputError, which begins with `where`, if they or the pose are wrong.
     """
     rotation = pose[:3, :3]
     if (

@@ -59,7 +59,7 @@ def import_capture(
         category: Name of the category.
         sequence: Name of the new sequence.
         box: Bounding box (top, left, height, width) of the object in the first frame, pixels (see `masks_from_box`).
-        masks: Folder of mask files, named like the images. Without it and a box, the masks of the capture are used.
+        masks: Folder of mask files, named like the images, if there is no box. Without both, those of the capture.
         max_frames: Maximum number of frames, evenly spaced; CO3D's sequences have about 100.
 
     Raises:
@@ -69,8 +69,6 @@ def import_capture(
     unfinished = folder / ".unfinished"
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
-    if box is not None and masks is not None:
-        raise InputError("both a box and a folder of masks are given, expected one of them")
     capture = evenly_spaced(capture, max_frames)
     if masks is not None:
         files = files_by_stem(masks)

@@ -41,12 +41,11 @@ def fetch(
         path.parent.mkdir(parents=True, exist_ok=True)
         complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
         received = part.stat().st_size
+        problem = "" if complete else f"was interrupted {ATTEMPTS} times at {received} bytes; call again to resume"
     except NETWORK_ERRORS as error:
-        raise InputError(f"download of {url} failed: {error}") from error
-    if not complete:
-        raise InputError(
-            f"download of {url} was interrupted {ATTEMPTS} times at {received} bytes; call again to resume"
-        )
+        problem = f"failed: {error}"
+    if problem:
+        raise InputError(f"download of {url} {problem}")
     matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
     if received > most or not matches:
         part.unlink()  # resuming from wrong data would never succeed
@@ -67,8 +66,7 @@ def remote_size(url: str) -> int | None:
     """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT) as response:
-            length = response.headers.get("Content-Length")
-        return None if length is None else int(length)
+            return None if (length := response.headers.get("Content-Length")) is None else int(length)
     except NETWORK_ERRORS as error:
         raise InputError(f"{url} cannot be reached: {error}") from error
 
@@ -87,8 +85,7 @@ class RemoteFile(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Set the position, as for every file."""
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
-        self._position = max(0, start + offset)
+        self._position = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence])
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview) -> int:

@@ -37,8 +37,9 @@ def make_folder(path: str | Path, what: str) -> Path:
     """Make a folder unless it exists, with those above it; InputError if that is not possible."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{what} {_shown(path)} cannot be made: {_reason(error)}, expected a folder") from error
+    except (OSError, ValueError) as error:  # ValueError: a null byte
+        reason = str(getattr(error, "strerror", error)).lower()
+        raise InputError(f"{what} {_shown(path)} cannot be made: {reason}, expected a folder") from error
     return Path(path)
 
 
@@ -74,7 +75,7 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
         else:
             problem = "permission denied"
     except (OSError, ValueError) as error:
-        problem = _reason(error)
+        problem = str(getattr(error, "strerror", error)).lower()
     raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
 
 
@@ -125,11 +126,6 @@ def plain_name(name: str, what: str) -> str:
             f"{what} name is {_shown(name)!r}, expected a plain folder name of at most {_LONGEST_NAME} bytes"
         )
     return name
-
-
-def _reason(error: Exception) -> str:
-    """Describe an error of the file system, or a ValueError, which Python raises for a null byte in a path."""
-    return (getattr(error, "strerror", None) or str(error)).lower()
 
 
 def _shown(path: str | Path) -> str:

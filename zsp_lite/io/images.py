@@ -1,6 +1,7 @@
 """Decoding of JPEG and PNG files, with a limit on their size in pixels."""
 
 import io
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -20,14 +21,12 @@ def decode_image(data: bytes, flags: int, what: str) -> UInt8[np.ndarray, "..."]
     # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
     start, end = (b"\xff\xda", b"\xff\xd9") if is_jpeg else (b"IDAT", b"IEND")
     image, expected = None, "a complete JPEG or PNG"
-    try:
+    with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
         width, height = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data)).size  # reads the header only
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         elif data.rfind(end) > data.rfind(start):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except (OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
-        image = None
     if image is None:
         raise InputError(f"{what} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image

@@ -10,8 +10,6 @@ from filelock import FileLock, Timeout
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import make_folder
 
-LOCK = ".writing.lock"
-
 
 @contextmanager
 def writing(folder: str | Path) -> Iterator[None]:
@@ -21,7 +19,7 @@ def writing(folder: str | Path) -> Iterator[None]:
     made, and into which nothing was written, is removed.
     """
     made = [one for one in (Path(folder), *Path(folder).parents) if not os.path.exists(one)]
-    path = make_folder(folder, "folder") / LOCK
+    path = make_folder(folder, "folder") / ".writing.lock"
     lock = FileLock(path, timeout=0)
     try:
         lock.acquire()

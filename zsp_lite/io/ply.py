@@ -10,8 +10,7 @@ from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
-_PROPERTIES = [f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
-_PROPERTIES += [f"uchar {name}" for name in ("red", "green", "blue")]
+_PROPERTIES = [*(f"float {one}" for one in "x y z nx ny nz".split()), "uchar red", "uchar green", "uchar blue"]
 
 
 def write_ply(
@@ -43,14 +42,11 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
     try:
         loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
         points, colours = loaded["vertices"].astype(np.float64), loaded["vertex_colors"]
-        colours = None if colours is None else _to_8_bit(colours[:, :3])
+        if colours is not None:
+            is_unit = colours.dtype.kind == "f" and colours[:, :3].max() <= 1
+            white = 1 if is_unit else 255 if colours[:, :3].max() <= 255 else 65535
+            colours = np.rint(colours[:, :3] * (255 / white)).clip(0, 255).astype(np.uint8)
     except Exception as error:  # trimesh raises IndexError, KeyError and others for malformed files
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
     check_magnitude(f"point cloud {path}", points)
     return points, colours
-
-
-def _to_8_bit(colours: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
-    is_unit = colours.dtype.kind == "f" and colours.max() <= 1
-    white = 1 if is_unit else 255 if colours.max() <= 255 else 65535
-    return np.rint(colours * (255 / white)).clip(0, 255).astype(np.uint8)
