@@ -175,7 +175,7 @@ def test_the_labels_and_pairs_of_the_paper_come_with_version_1(server, source, t
     assert "2 labels, 1 files of pairs" in text and "No problems" in text
     assert list(read_labels(tmp_path / "v1", "toaster")) == list(SEQUENCES)
     assert download(tmp_path / "v2", "--labels", str(source)) == 2
-    assert "--labels goes with co3d-v1" in capsys.readouterr().err
+    assert "--labels does not go with co3d: labels are of v1" in capsys.readouterr().err
     assert not (tmp_path / "v2").exists()
 
 

@@ -80,7 +80,7 @@ def test_the_questions_are_in_the_output_itself(number):
 
 
 def test_an_unknown_self_check_is_named():
-    with pytest.raises(InputError, match="notebook is '99', expected one with self-checks: 00"):
+    with pytest.raises(InputError, match="notebook is '99', expected one of 00"):
         self_check("99", 1)
     with pytest.raises(InputError, match="number is 3, expected an integer from 1 to 2"):
         self_check("00", 3)

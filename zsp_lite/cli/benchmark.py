@@ -4,8 +4,7 @@ import logging
 
 import click
 
-from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, seed_option
-from zsp_lite.errors import InputError
+from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, refuse_options, seed_option
 
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 
@@ -114,9 +113,8 @@ def tables(runs, out, into) -> None:
     from zsp_lite.benchmark.results import read_runs
     from zsp_lite.benchmark.tables import every_table
 
-    if into and out:
-        raise InputError("tables: --into writes no folder; expected it without --out")
     if into:
+        refuse_options({"out": out}, (), "--into")
         summary = read_runs(runs).summary
         update_document(into, every_table(summary), max(row["n"] for row in summary["methods"].values()))
         print(f"Written: {into}")

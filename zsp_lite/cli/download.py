@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
-from zsp_lite.cli.common import COUNT, PATH, examples
+from zsp_lite.cli.common import COUNT, PATH, examples, refuse_options
 from zsp_lite.cli.data import print_checks
 from zsp_lite.errors import InputError
 
@@ -41,10 +42,12 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     from zsp_lite.data.published import import_labels, published_sequences
     from zsp_lite.io.download import remote_size
 
-    if labels and dataset != "co3d-v1":
-        raise InputError("--labels goes with co3d-v1: labels are of v1; `zsp-lite data transfer` copies them to v2")
+    if dataset != "co3d-v1":
+        refuse_options(
+            {"labels": labels}, (), f"{dataset}: labels are of v1; `zsp-lite data transfer` copies them to v2"
+        )
     if labelled_only and not labels:
-        raise InputError("--labelled-only goes with --labels")
+        raise click.UsageError("--labelled-only goes with --labels")
 
     root = root or Path(dataset)
     categories = tuple(dict.fromkeys(categories))
@@ -87,9 +90,7 @@ def _confirmed(names: Sequence[str], sizes: Sequence[int | None], needed: int, r
     print(f"Needed on the disk of {root}: {needed / 1e9:.2f} GB. {LICENCE}")
     if yes:
         return True
-    if not sys.stdin.isatty():
-        raise InputError("nobody can confirm the download: standard input is not a terminal, expected --yes")
-    try:
-        return input("Download? [y/N] ").strip().lower() in ("y", "yes")
-    except EOFError as error:
-        raise InputError("standard input is closed, expected --yes") from error
+    with suppress(EOFError):
+        if sys.stdin.isatty():
+            return input("Download? [y/N] ").strip().lower() in ("y", "yes")
+    raise InputError("nobody can confirm the download: standard input is not an open terminal, expected --yes")

@@ -178,6 +178,4 @@ def _normalisation(
     for chosen, part in zip(kept, np.split(near, np.cumsum([chosen.sum() for chosen in valid])[:-1])):
         chosen[chosen] = part
     mean, spread = points.mean(axis=0), standard_deviation(points)
-    if not spread > 0:
-        raise InputError(f"{name}: all {len(points)} foreground points are equal, expected an object with extent")
     return Sim3(1 / spread, np.eye(3), -mean / spread), kept

@@ -37,12 +37,10 @@ class ViewBox:
     @classmethod
     def around(cls, points: Real[np.ndarray, "n 3"]) -> "ViewBox":
         """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers."""
-        if len(points) == 0 or not np.isfinite(points).all():
-            raise InputError(f"point cloud of shape {points.shape} is empty or not finite, expected finite points")
-        low, high = np.percentile(points, [1, 99], axis=0)
+        low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
         radius = float(np.linalg.norm(high - low)) / 2
-        if radius < 1e-12:
-            raise InputError(f"point cloud of {len(points)} equal points has no extent, expected an object")
+        if not radius >= 1e-12:  # not, because of NaN
+            raise InputError(f"point cloud of {len(points)} points has no extent, expected an object of finite points")
         return cls((low + high) / 2, radius)
 
     def to_view(self, points: Real[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

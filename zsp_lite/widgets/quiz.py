@@ -7,7 +7,7 @@ types "multiple_choice", "many_choice" and "numeric"). Texts are HTML: `<i>K</i>
 import json
 from pathlib import Path
 
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.viz.plots import BLUE
 from zsp_lite.widgets.common import load_package
 
@@ -25,8 +25,7 @@ _COLOURS = {
 def read_questions(notebook: str) -> list[list[dict]]:
     """Return the self-checks of a notebook ("00"), in their order."""
     known = {path.stem: path for path in sorted(QUESTIONS.glob("*.json"))}
-    if notebook not in known:
-        raise InputError(f"notebook is {notebook!r}, expected one with self-checks: {', '.join(known)}")
+    check_choice("notebook", notebook, known)
     return json.loads(known[notebook].read_text(encoding="utf-8"))
 
 
