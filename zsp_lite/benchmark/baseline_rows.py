@@ -13,16 +13,16 @@ from zsp_lite.best_view import score_from_cosines
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 
-_K = 50
+_K = 50  # number of matches, as in "Ours"
 
 
 def icp(problem: Problem) -> Answer:
-    """Run "ICP": the reference and the first target view start with equal camera poses."""
+    """Run "ICP" in the first target view; the worlds start where the first cameras of both sequences coincide."""
     return _icp(problem, 0)
 
 
 def icp_best_view(problem: Problem) -> Answer:
-    """Run "ICP + BV": the reference and the best view of the paper's method start with equal camera poses."""
+    """Run "ICP + BV", the same in the best view of the paper's method."""
     return _icp(problem, problem.estimate().view)
 
 

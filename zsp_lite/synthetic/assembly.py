@@ -48,7 +48,10 @@ class Assembly:
         return int(self.rng.integers(n))
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part of one of the materials 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
+        """Add a part; with `mirror`, also its mirror image in the plane y = 0.
+
+        Parts of one number, 0 .. 7, share a material, whose look is random (see `materials`); it means nothing else.
+        """
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:

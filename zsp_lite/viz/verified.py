@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -42,7 +41,8 @@ _AXIS_LENGTH = 1.2  # of the reference camera, in its units
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     """Classify each point in each view under one of the poses, as indices into `POINT_CLASSES`.
 
-    A point is on the surface if its surface weight is at least half of what it would be exactly on the surface.
+    A point is on the surface if its surface weight is at least half of what it would be exactly on the surface. The
+    points that are left are behind it: occluded.
     """
     projection = terms.projection
     distance, weight = projection.silhouette_distance[pose].numpy(), projection.weight[pose].numpy()
@@ -235,8 +235,7 @@ def _show_poses(
 
 def _image_pixels(terms: PointTerms, maps: ViewMaps, pose: int) -> Float[np.ndarray, "v n 2"]:
     """Pixels (x, y) of the points in the images of the views."""
-    with torch.no_grad():
-        return (terms.projection.pixels[pose] * maps.pixel_scale[:, None]).double().numpy()
+    return (terms.projection.pixels[pose] * maps.pixel_scale[:, None]).double().numpy()
 
 
 def _clip_to_image(axis: Axes, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

@@ -49,7 +49,10 @@ class ViewBox:
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points along the Morton (Z-order) curve, neighbours after each other."""
+    """Return the indices of at most `most` points, neighbours after each other.
+
+    The slider of the labelling widget goes through them in this order, along the Morton (Z-order) curve.
+    """
     kept = np.arange(len(points))
     if len(points) > most:
         kept = np.random.default_rng(0).choice(len(points), most, replace=False)

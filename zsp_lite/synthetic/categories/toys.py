@@ -180,6 +180,7 @@ def toytrain(a: Assembly) -> None:
         a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), 0)
         a.add(rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), 6)
         chimney, mouth = a.u(0.2, 0.45), a.u(0.08, 0.18)
+        # Its ends are closed; the radius 0 would give triangles without an area.
         profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
         a.add(lathe(profile).translated((front - 0.2, 0, top)), 3)
         a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)), 7)
@@ -189,7 +190,7 @@ def toytrain(a: Assembly) -> None:
         middle = (rear + front) / 2
         a.add(rounded_box((front - rear, hood_width, hood_height), (middle, 0, floor + hood_height / 2), 9), 0)
         a.add(ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8)), 5, mirror=True)
-        a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)
+        a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)  # exhaust
     cowcatcher = [[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]]
     a.add(extrusion(cowcatcher, width * 0.75), 7)
     axles = np.linspace(tail + wheel * 1.3, nose - wheel * 1.6, 2 + a.choice(3))
