@@ -109,7 +109,7 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     pick_all(labelling, "b", corners()[:4])
     labelling.accept("b")
     write_label(root, "chair", PoseLabel(np.eye(4), "a", "best"))
-    with pytest.raises(InputError, match="a has a label not made of picks; remove .*a.json"):
+    with pytest.raises(InputError, match="a cannot be skipped: it has a label not made of picks; remove .*a.json"):
         labelling.skip("a")
     labelling.skip("b")
     assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(root, "chair")
@@ -122,6 +122,8 @@ def test_a_change_that_is_refused_leaves_a_skipped_sequence_skipped(root):
     labelling = Labelling(root, "chair")
     labelling.skip("b")
     labelling.undo("b")
+    with pytest.raises(InputError, match="guess on a by 0 keypoints of best"):
+        labelling.guess("a", Sim3.identity())
     with pytest.raises(InputError, match="all 0 keypoints are picked"):
         labelling.pick("b", (0, 0, 0))
     assert labelling.progress() == Labelling(root, "chair").progress()
@@ -146,12 +148,17 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
         (lambda: labelling.accept("a"), "a has 3 of 5 keypoints, expected all, at least 4"),
         (lambda: labelling.accept("best"), "is the reference"),
         (lambda: labelling.pick("none", (0, 0, 0)), "sequence is 'none', expected one of best, a, b"),
-        (lambda: labelling.skip("best"), "best is the reference, which cannot be skipped"),
-        (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a are .*expected finite points"),
-        (lambda: labelling.move("a", 0, (0, np.inf, 0)), "picks on a are .*expected finite points"),
+        (lambda: labelling.skip("best"), "best cannot be skipped: it is the reference"),
+        (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
+        (lambda: labelling.pick("a", (0, 1)), "picks on a is .*, expected real numbers of shape .n, 3."),
+        (lambda: labelling.move("a", 0, (0, np.inf, 0)), "picks on a holds inf, expected finite"),
+        (lambda: labelling.move("a", 0, (1, 2, 3, 4)), "picks on a is .*, expected real numbers"),
+        (lambda: labelling.move("a", -1, (0, 1, 2)), "index of a pick is -1, expected an integer from 0 to 2"),
+        (lambda: labelling.rename(5, "top"), "index of a keypoint is 5, expected an integer from 0 to 4"),
+        (lambda: labelling.guess("best", Sim3.identity()), "guess on best by 5 .* and another sequence"),
         (lambda: Labelling(root, "chair", reference="a"), "expected one reference sequence"),
         (lambda: Labelling(root, "chair", ["c"]), "has no point cloud"),
-        (lambda: Labelling(root, "stool"), "category 'stool' is not in"),
+        (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),
     ):
         with pytest.raises(InputError, match=message):
             call()

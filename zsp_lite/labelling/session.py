@@ -16,7 +16,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, rigid_label, write_label
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice, check_integer, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
@@ -154,7 +154,8 @@ class Labelling:
 
     def move(self, sequence: str, index: int, point: Point) -> None:
         """Move pick `index` (from 0) of a sequence to another point (3,)."""
-        picks = self.picks(sequence)
+        picks = list(self.picks(sequence))
+        check_integer("index of a pick", index, 0, len(picks) - 1)
         picks[index] = point
         self.put(sequence, picks, self.names)
 
@@ -164,6 +165,11 @@ class Labelling:
         Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken. `sim3` maps
         the world of the reference to that of the sequence.
         """
+        if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
+            raise InputError(
+                f"guess on {sequence} by {len(self.names)} keypoints of {self.reference}, expected at least "
+                f"{MIN_KEYPOINTS}, and another sequence than the reference"
+            )
         cloud, taken = self.cloud(sequence)[0], []
         for point in sim3.apply(self.picks(self.reference)):
             distance = np.square(cloud - point).sum(axis=1)
@@ -176,9 +182,8 @@ class Labelling:
 
         A sequence that was skipped is open again.
         """
-        points = np.array(points, dtype=np.float64).reshape(-1, 3)
-        if not np.isfinite(points).all():
-            raise InputError(f"picks on {sequence} are {points.tolist()}, expected finite points")
+        points = real_array(f"picks on {sequence}", points if len(points) else np.zeros((0, 3)), (None, 3))
+        check_magnitude(f"picks on {sequence}", points)
         if self._known(sequence) == self.reference:
             others = [name for name, picks in self._stored.picks.items() if name != sequence and picks]
             if others:
@@ -191,6 +196,7 @@ class Labelling:
 
     def rename(self, index: int, name: str) -> None:
         """Rename keypoint `index` (from 0)."""
+        check_integer("index of a keypoint", index, 0, len(self.names) - 1)
         self._stored.names[index] = name
         self._save()
 
@@ -255,11 +261,11 @@ class Labelling:
     def skip(self, sequence: str) -> None:
         """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of its picks."""
         path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
-        if sequence == self.reference:
-            raise InputError(f"sequence {sequence} is the reference, which cannot be skipped")
         # Labels do not say where they come from: one with all its picks was made of them.
-        if path.is_file() and not 0 < len(self.names) == len(self.picks(sequence)):
-            raise InputError(f"sequence {sequence} has a label not made of picks; remove {path} to leave it out")
+        imported = path.is_file() and not 0 < len(self.names) == len(self.picks(sequence))
+        if imported or sequence == self.reference:
+            reason = f"has a label not made of picks; remove {path}" if imported else "is the reference"
+            raise InputError(f"sequence {sequence} cannot be skipped: it {reason}")
         path.unlink(missing_ok=True)
         if sequence not in self._stored.skipped:
             self._stored.skipped.append(sequence)
@@ -281,8 +287,7 @@ class Labelling:
         return rows
 
     def _known(self, sequence: str) -> str:
-        if sequence not in self.sequences:
-            raise InputError(f"sequence is {sequence!r}, expected one of {', '.join(self.sequences)}")
+        check_choice("sequence", sequence, self.sequences)
         return sequence
 
     def _save(self, changed: str | None = None) -> None:

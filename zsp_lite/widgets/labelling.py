@@ -102,8 +102,6 @@ class _LabellingWidget:
 
     def guess(self) -> str:
         labelling, sequence = self.labelling, self.current
-        if self.on_reference or len(labelling.names) < MIN_KEYPOINTS:
-            raise InputError(f"a guess needs {MIN_KEYPOINTS} keypoints on the reference, and another sequence chosen")
         self.panel.show_message("Estimating the alignment. This takes some seconds.")
         from zsp_lite.backbones.load import load_backbone
         from zsp_lite.labelling.guess import guess_alignment
