@@ -149,7 +149,7 @@ BAD_IMAGES = [
 
 @pytest.mark.parametrize("image", BAD_IMAGES)
 def test_bad_images_are_refused_by_number(vit, image):
-    with pytest.raises(InputError, match="^image 1: expected [^\n]+$"):
+    with pytest.raises(InputError, match="^image 1 is .*, expected [^\n]+$"):
         Backbone(vit, "small", device="cpu", batch_size=1)([np.zeros((8, 8, 3), np.uint8), image])
 
 
@@ -240,7 +240,7 @@ def test_the_embedded_backbone_is_found_by_its_name_and_checked(vit, tmp_path, m
         (lambda w: w | {"extra": torch.zeros(1)}, "extra: expected none"),
         (lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)}, "blocks.100000000.norm1.bias: expected none"),
         (lambda w: w | {"norm.weight": torch.zeros(3)}, "norm.weight"),
-        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight contains"),
+        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight: .* not finite floats"),
         (lambda w: {"fc.weight": torch.zeros(2, 2)}, "DINO layout"),
         (lambda w: [1, 2], "state dict"),
         (lambda w: {"epoch": 3}, "state dict"),

@@ -97,7 +97,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no visible face with an area"),
         ("lost.obj", f"mtllib gone.mtl\n{TRIANGLE}f 1 2 3\n", "lacks its material file 'gone.mtl'"),
         ("damaged.glb", "glTF" + 50 * " ", "damaged.glb cannot be read"),
-        ("cube.dae", "<COLLADA/>", "needs the package pycollada"),
+        ("cube.dae", "<COLLADA/>", "lacks the package pycollada"),
         ("absent.obj", None, "absent.obj cannot be read"),
         ("clear.obj", "quad", "no visible face with an area"),
         ("bare.obj", "quad", "lacks its texture 'bare.png'"),

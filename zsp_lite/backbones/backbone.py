@@ -11,7 +11,7 @@ from torch import Tensor
 from zsp_lite.backbones.facets import FACETS, Facet, block_index
 from zsp_lite.backbones.huggingface import HuggingFaceViT
 from zsp_lite.backbones.vit import VisionTransformer, nearest_multiple
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.features import FeatureMap
 
 Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
@@ -66,8 +66,7 @@ class Backbone:
             saliency_heads = (0, 2, 4, 5) if dino_small else heads
         if not saliency_heads or not set(saliency_heads) <= set(heads):
             raise InputError(f"{name}: saliency_heads are {tuple(saliency_heads)}, expected some of 0 to {heads[-1]}")
-        if facet not in FACETS:
-            raise InputError(f"{name}: facet is {facet!r}, expected one of {', '.join(FACETS)}")
+        check_choice(f"{name}: facet", facet, FACETS)
         self.name, self.facet, self.saliency_heads = name, facet, tuple(saliency_heads)
         self.layer = block_index(min(9, model.depth - 1) if layer is None else layer, model.depth, name)
         self.mean, self.std, self.batch_size = tuple(mean), tuple(std), batch_size
@@ -120,14 +119,12 @@ def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> 
     for index, image in enumerate(images, first):
         # Copied, because torch does not accept read-only arrays and negative strides.
         image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
-        if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-            raise InputError(f"image {index}: expected shape (H, W, 3), got {tuple(image.shape)}")
-        is_bytes, is_float = image.dtype == torch.uint8, image.is_floating_point()
-        if not is_bytes and not (is_float and bool(((image >= 0) & (image <= 1)).all())):  # false for NaN too
-            low, high = image.min().item(), image.max().item()
-            raise InputError(
-                f"image {index}: expected uint8 or floats in [0, 1], got {image.dtype} from {low:g} to {high:g}"
-            )
+        is_bytes, has_pixels = image.dtype == torch.uint8, image.numel() > 0
+        is_unit = image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all())  # false for NaN too
+        if image.shape[2:] != (3,) or not has_pixels or not (is_bytes or is_unit):
+            found = f"{image.dtype} of shape {tuple(image.shape)}"
+            found += f" from {image.min().item():g} to {image.max().item():g}" if has_pixels else ""
+            raise InputError(f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)")
         image = image.to(torch.float32) / (255 if is_bytes else 1)
         image = image.permute(2, 0, 1)[None]
         if image.shape[2:] != (size, size):

@@ -58,13 +58,17 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
-            num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads by a ValueError
+            num_heads = dim // 64 if dim % 64 == 0 else 0
+        if min(side, patch_size, dim, depth, num_heads) < 1 or dim % num_heads:
+            raise ValueError(
+                f"num_heads is {num_heads} for {dim} channels, {depth} blocks and {side} patches along a side"
+            )
         with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
-            f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads is read from the metadata, "
-            "by default one per 64 channels"
+            f"{path.name}: not a vision transformer in the DINO layout ({error}), expected num_heads in the metadata, "
+            "or one per 64 channels"
         ) from error
     load_weights(model, weights, path.name)
     return model
@@ -77,10 +81,12 @@ def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ign
     """
     state = model.state_dict()
     weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
-    expected, found = (
-        {key: tuple(x.shape) if torch.is_tensor(x) else f"a {type(x).__name__}" for key, x in tensors.items()}
-        for tensors in (state, weights)
-    )
+    expected = {key: tuple(x.shape) for key, x in state.items()}
+    found = {key: tuple(x.shape) if torch.is_tensor(x) else f"a {type(x).__name__}" for key, x in weights.items()}
+    for key in expected.keys() & found.keys():
+        x = weights[key]
+        if state[key].is_floating_point() and torch.is_tensor(x) and not (x.is_floating_point() and x.isfinite().all()):
+            found[key] = "values that are not finite floats"
     # Older checkpoints have no counter of the batches in batch normalisation, which inference does not use.
     counters = {key for key in expected.keys() - found.keys() if key.endswith("num_batches_tracked")}
     wrong = sorted(key for key in (expected.keys() | found.keys()) - counters if expected.get(key) != found.get(key))
@@ -90,7 +96,4 @@ def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ign
             f"{name}: {len(wrong)} weights do not fit the architecture, first {key}: "
             f"expected {expected.get(key, 'none')}, got {found.get(key, 'none')}"
         )
-    for key, x in weights.items():
-        if state[key].is_floating_point() and not (x.is_floating_point() and bool(x.isfinite().all())):
-            raise InputError(f"{name}: {key} contains values that are not finite floats")
     model.load_state_dict({key: x.to(state[key].dtype) for key, x in weights.items()}, strict=False, assign=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsp_lite.backbones.huggingface import PREFIX, model_folder
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.io.files import read_bytes, sha256
 
@@ -65,8 +65,7 @@ def download(name: str) -> Path:
         return model_folder(name)
     if name == DEFAULT:
         return TINY
-    if name not in PRETRAINED:
-        raise InputError(f"backbone {name!r}: not one of {', '.join(available_backbones())}")
+    check_choice("backbone", name, available_backbones())
     weights = PRETRAINED[name]
     try:
         return fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=MOST_BYTES)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsp_lite.data.co3d import SequenceData
-from zsp_lite.errors import InputError
+from zsp_lite.errors import check_choice
 from zsp_lite.io.files import read_json, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
@@ -48,8 +48,7 @@ PRESETS = {
 
 def export_preset(preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] = iter) -> None:
     """Write a preset with its evaluation pairs to a folder; see `export_categories`."""
-    if preset not in PRESETS:
-        raise InputError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
+    check_choice("preset", preset, PRESETS)
     size = PRESETS[preset]
     export_categories(size.categories, out, size.sequences, size.frames, seed, size.image_size, progress)
     for category in size.categories:
@@ -76,8 +75,7 @@ def export_categories(
     written with other settings.
     """
     for category in categories:
-        if category not in builders:
-            raise InputError(f"category is {category!r}, expected one of {', '.join(builders)}")
+        check_choice("category", category, builders)
     out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
         check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)

@@ -53,10 +53,8 @@ def read_mesh(path: str | Path) -> TexturedMesh:
 
     path = Path(path)
     file_size(path, "model", MAX_BYTES)
-    if path.suffix.lower() == ".dae" and not find_spec("collada"):
-        raise InputError(f"model {path} needs the package pycollada: pip install pycollada")
-    if path.suffix.lower() == ".obj" and (missing := _missing_file(path)):
-        raise InputError(f"model {path} lacks its {missing}")
+    if missing := _missing(path):
+        raise InputError(f"model {path} lacks {missing}")
     try:
         scene = trimesh.load_scene(path, process=False)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]  # transforms and names of geometries
@@ -91,15 +89,17 @@ def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> Te
     return replace(mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32))
 
 
-def _missing_file(path: Path) -> str:
-    """Return the first material file or texture of an OBJ file that is missing; trimesh does not report it."""
-    for name in _values(path, b"mtllib"):
+def _missing(path: Path) -> str:
+    """Name what a file of this type needs and trimesh would not report: a package, or a file that it refers to."""
+    if path.suffix.lower() == ".dae" and not find_spec("collada"):
+        return "the package pycollada: pip install pycollada"
+    for name in _values(path, b"mtllib") if path.suffix.lower() == ".obj" else ():
         library = path.parent / name
         if not library.is_file():
-            return f"material file {name!r}"
+            return f"its material file {name!r}"
         for texture in [*_values(library, b"map_kd"), *_values(library, b"map_d")]:
             if not (library.parent / texture).is_file():
-                return f"texture {texture!r}"
+                return f"its texture {texture!r}"
     return ""
 
 
