@@ -131,12 +131,12 @@ def load_huggingface(
                 dtype=torch.float32, **local,
             )  # fmt: skip
         normalisation = _normalisation(folder)
+        # transformers initialises missing weights randomly. Only weights that the method does not use may be missing.
+        missing = sorted(key for key in report["missing_keys"] if "pooler" not in key and "mask_token" not in key)
+        if missing:
+            raise ValueError(f"{len(missing)} weights are not in the file, first {missing[0]}")
     except Exception as error:  # damaged JSON, unknown types, wrong fields or shapes: no common base class
         raise InputError(f"{name}: cannot be loaded by the package transformers ({_one_line(error)})") from error
-    # transformers initialises missing weights randomly. Only weights that the method does not use may be missing.
-    missing = sorted(key for key in report["missing_keys"] if "pooler" not in key and "mask_token" not in key)
-    if missing:
-        raise InputError(f"{name}: {len(missing)} weights are not in the file, first {missing[0]}")
     for key, weight in model.named_parameters():
         if key in report["missing_keys"]:
             weight.data.zero_()  # random values would give the backbone another identity at every start

@@ -82,8 +82,6 @@ def import_capture(
     if box is not None:
         frames = masks_from_box(frames, box)
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
-    if not seen:
-        raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
     empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
     flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
@@ -139,8 +137,9 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
-    points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
+    clouds = [frame.camera.to_world(object_points(frame))[::7] for frame in frames]
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
     if len(points) < 4:
-        raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
+        raise InputError(f"{len(frames)} frames with a mask have no known depth on the object, expected some inside")
     deviation = np.abs(points - np.median(points, axis=0))
     return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise

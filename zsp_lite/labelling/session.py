@@ -166,10 +166,8 @@ class Labelling:
         the world of the reference to that of the sequence.
         """
         if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
-            raise InputError(
-                f"guess on {sequence} by {len(self.names)} keypoints of {self.reference}, expected at least "
-                f"{MIN_KEYPOINTS}, and another sequence than the reference"
-            )
+            found = f"{len(self.names)} keypoints of the reference {self.reference}"
+            raise InputError(f"guess on {sequence} by {found}, expected {MIN_KEYPOINTS} or more, and another sequence")
         cloud, taken = self.cloud(sequence)[0], []
         for point in sim3.apply(self.picks(self.reference)):
             distance = np.square(cloud - point).sum(axis=1)
@@ -212,8 +210,7 @@ class Labelling:
 
         The residuals of an `Alignment` are relative to the spread of the picks, which is several times smaller.
         """
-        alignment = self.alignment(sequence)
-        if alignment is None:
+        if (alignment := self.alignment(sequence)) is None:
             return None
         low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
         distance = alignment.residuals * np.sqrt(self.picks(sequence).var(axis=0).mean())
