@@ -83,7 +83,7 @@ def environment() -> dict[str, Any]:
         "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
         "versions": versions,
         "git": {"commit": _git_commit()},
-        "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
     }
 
 
