@@ -358,7 +358,7 @@ def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path,
     ("words", "message"),
     [
         (["co3d", "--category", "spaceship"], "co3d (full) is 'spaceship', expected one of toaster"),
-        (["co3d-v1", "--category", "toaster", "--single-sequence"], "'toaster', expected one of (none)"),
+        (["co3d-v1", "--category", "toaster", "--single-sequence"], "--single-sequence does not go with co3d-v1"),
         (["co3d"], "--category"),
         (["co4d", "--category", "toaster"], "co4d"),
     ],

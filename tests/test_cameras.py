@@ -125,8 +125,8 @@ def test_resizing_scales_pixels_and_keeps_depth(seed, height, width):
         ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
         ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
         ({"principal_point": [np.nan, 0]}, "principal_point holds nan"),
-        ({"size": (0, 5)}, "image size: a side is 0, expected an integer from 1"),
-        ({"size": (np.inf, 5)}, "image size: a side is inf"),
+        ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
+        ({"size": (np.inf, 5)}, "image size .* is inf"),
     ],
 )
 def test_invalid_cameras_are_refused(changes, message):

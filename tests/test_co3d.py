@@ -186,7 +186,7 @@ def test_unknown_folders_categories_sequences_and_frames_are_named(root):
     for use in (dataset.frame_list, lambda name: write_co3d(root, name, [])):
         with pytest.raises(InputError, match="category .*is .*, expected"):
             use("../chair")
-    with pytest.raises(InputError, match="sequence is 'c_3'"):
+    with pytest.raises(InputError, match="no frames of 'c_3'"):
         dataset.frames("chair", "c_3")
     with pytest.raises(InputError, match="chair/c_3 has no point cloud"):
         dataset.point_cloud("chair", "c_3")

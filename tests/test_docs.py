@@ -196,9 +196,10 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     import cv2
 
     for name, frame in (("my_cup", names["reference"]), ("other_cup", names["targets"][names["estimate"].view])):
-        write_image(tmp_path / f"{name}.jpg", frame.rgb)
-        write_mask(tmp_path / f"{name}_mask.png", frame.mask)
-        cv2.imwrite(str(tmp_path / f"{name}_depth.png"), np.rint(1000 * frame.depth).astype(np.uint16))
+        rgb, mask, depth = (part.repeat(2, 0).repeat(2, 1) for part in (frame.rgb, frame.mask, frame.depth))
+        write_image(tmp_path / f"{name}.jpg", rgb)
+        write_mask(tmp_path / f"{name}_mask.png", mask)
+        cv2.imwrite(str(tmp_path / f"{name}_depth.png"), np.rint(1000 * depth).astype(np.uint16))
     monkeypatch.chdir(tmp_path)
     exec(second, names)
     assert names["pose"].confidence is not None and len(names["pose"].matches) > 10

@@ -70,9 +70,8 @@ def imports(source: str, modules: set[str], module_level: bool = False) -> Itera
             package, _, name = name.partition(".")
             if package != "zsp_lite":
                 continue
-            name = f"{_HOME_OF.get(name, package)}.{name}".partition(".")[
-                2
-            ]  # where a public name of the package is defined
+            # Where a public name of the package is defined.
+            name = f"{_HOME_OF.get(name, package)}.{name}".removeprefix("zsp_lite.")
             while name and name not in modules:  # a function or a class: the module that holds it
                 name = name.rpartition(".")[0]
             if name:

@@ -122,7 +122,8 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
             "mask is 'auto' and box is .*, expected --mask given, --mask auto, or --mask box with",
         ),
         ({"intrinsics": INTRINSICS, "mask": "sam"}, "mask is 'sam' and box is None, expected --mask given"),
-        ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: focal_length is 0.0, expected"),
+        ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: camera focal_length is 0.0, expected"),
+        ({"intrinsics": (190.0, 190.0, 900.0, 1.0)}, r"image .*.jpg: CX,CY is \(900.0, 1.0\), expected a point inside"),
         ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
     ],
 )

@@ -92,7 +92,7 @@ def test_sampling_depends_on_seed_and_category_alone(dataset):
 
 
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
-    with pytest.raises(InputError, match="of at least 12 frames, expected 2 or more of at least 13"):
+    with pytest.raises(InputError, match="labelled sequence chair/.* has 12 frames, expected at least 13"):
         sample_pairs(dataset, "chair", 1, 13)
     write_co3d(tmp_path, "chair", [sequence_data("s1")])
     with pytest.raises(InputError, match="has 0 labelled sequences"):

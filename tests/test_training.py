@@ -37,7 +37,11 @@ def fourier(surface, seed=0):
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
     azimuths = []
-    kept = lambda azimuth, **others: azimuths.append(azimuth) or orbit_pose(azimuth, **others)  # noqa: E731
+
+    def kept(azimuth, **others):
+        azimuths.append(azimuth)
+        return orbit_pose(azimuth, **others)
+
     monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", kept)
     render_object(3)
     turns = np.subtract.outer(azimuths, azimuths)

@@ -15,7 +15,7 @@ Read the files in this order:
     alignment    Umeyama's method in RANSAC
     points       points of the object
     estimates    the results, and the protocol of solvers
-    metrics      rotation errors and their statistics
+    metrics      rotation errors, medians and accuracies
     demo         one pair of each category, from data folder to pose error
     own_objects  one pair of your own, from files to files
 

@@ -21,7 +21,7 @@ from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
@@ -152,8 +152,7 @@ def estimate_pose(
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
-    if solver not in SOLVERS:
-        raise InputError(f"solver is {solver!r}, expected one of {', '.join(SOLVERS)}")
+    check_choice("solver", solver, SOLVERS)
     check_integer("targets", targets, 1)
     given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
@@ -164,12 +163,10 @@ def estimate_pose(
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
-        for source, cloud in zip((first, second), clouds):
-            if len(cloud) < 2:
-                raise InputError(f"{source.path}: no depth is known on the object, expected some")
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        units = [one.format == "sequence" for one in (first, second)]
-        scales = [1.0 if known else 1 / axis_deviation(cloud) for known, cloud in zip(units, clouds)]
+        spreads = [axis_deviation(cloud) if len(cloud) > 1 else 0.0 for cloud in clouds]
+        unscaled = [one.format == "sequence" for one in (first, second)]
+        scales = [1.0 if known else 1 / (spread or 1) for known, spread in zip(unscaled, spreads)]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
         solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
@@ -315,6 +312,10 @@ def _open_image(
         names = " or ".join(file.name for file in beside)
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
     camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}")
+    if not all(0 < place < side for place, side in zip(camera.principal_point, camera.size[::-1])):
+        raise InputError(
+            f"image {path}: CX,CY is {intrinsics[2:]}, expected a point inside its {camera.size[::-1]} pixels"
+        )
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 
@@ -333,9 +334,9 @@ def _errors(
 
 
 def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
-    """Say where the usable target views do not show all sides of the object, which has these world points."""
+    """Say where the usable target views do not show all sides of the object, of which some points are known."""
     cameras = [frame.camera for frame in targets if not frame_defect(frame)]
-    span = view_span(cameras, np.median(points, axis=0))
+    span = view_span(cameras, np.median(points, axis=0)) if len(points) else 0.0
     if len(cameras) > 2 and span >= _ALL_SIDES:
         return ()
     seen = f"{'two sides' if span >= _ALL_SIDES else 'one side'} only ({span:.0f} degrees)"

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
-from zsp_lite.errors import InputError, check_integer, check_number
+from zsp_lite.errors import InputError, check_choice, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
@@ -88,8 +88,8 @@ class ZeroShotPose:
         for name, allowed in names.items():
             value = getattr(self, name)
             plugged_in = name in ("matcher", "view_selector", "solver") and callable(value)
-            if not plugged_in and value not in allowed:
-                raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed))}")
+            if not plugged_in:
+                check_choice(name, value, allowed)
         for name, *limits in (("k", 1), ("trials", 1, MOST_TRIALS), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), *limits)
         if not callable(self.backbone):

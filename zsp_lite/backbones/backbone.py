@@ -119,11 +119,10 @@ def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> 
     for index, image in enumerate(images, first):
         # Copied, because torch does not accept read-only arrays and negative strides.
         image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
-        is_bytes, has_pixels = image.dtype == torch.uint8, image.numel() > 0
+        is_bytes = image.dtype == torch.uint8
         is_unit = image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all())  # false for NaN too
-        if image.shape[2:] != (3,) or not has_pixels or not (is_bytes or is_unit):
+        if image.shape[2:] != (3,) or not image.numel() or not (is_bytes or is_unit):
             found = f"{image.dtype} of shape {tuple(image.shape)}"
-            found += f" from {image.min().item():g} to {image.max().item():g}" if has_pixels else ""
             raise InputError(f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)")
         image = image.to(torch.float32) / (255 if is_bytes else 1)
         image = image.permute(2, 0, 1)[None]

@@ -58,17 +58,13 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
-            num_heads = dim // 64 if dim % 64 == 0 else 0
-        if min(side, patch_size, dim, depth, num_heads) < 1 or dim % num_heads:
-            raise ValueError(
-                f"num_heads is {num_heads} for {dim} channels, {depth} blocks and {side} patches along a side"
-            )
+            num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads
         with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
-            f"{path.name}: not a vision transformer in the DINO layout ({error}), expected num_heads in the metadata, "
-            "or one per 64 channels"
+            f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads is read from the metadata, "
+            "by default one per 64 channels"
         ) from error
     load_weights(model, weights, path.name)
     return model

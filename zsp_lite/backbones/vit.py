@@ -15,14 +15,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zsp_lite.backbones.facets import Facet
-from zsp_lite.errors import check_integer
+from zsp_lite.errors import InputError, check_integer
 
-MOST_PIXELS = 2048  # of an image's side; the time of attention grows with the fourth power of the side
+MOST_INPUT = 2048  # pixels of an image's side; the time of attention grows with the fourth power of the side
 
 
 def nearest_multiple(size: int, patch_size: int) -> int:
-    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_PIXELS`."""
-    check_integer("image_size", size, 1, MOST_PIXELS)
+    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_INPUT`."""
+    check_integer("image_size", size, 1, MOST_INPUT)
     return max(1, round(size / patch_size)) * patch_size
 
 
@@ -167,7 +167,6 @@ class PatchEmbed(nn.Module):
 class VisionTransformer(nn.Module):
     """ViT with the state-dict keys and shapes of a DINO checkpoint (loads one with strict=True).
 
-    `image_size` is a multiple of `patch_size`, and `embed_dim` one of `num_heads`.
     The position embedding is stored for square images of `image_size` pixels and interpolated for other sizes.
     """
 
@@ -175,6 +174,12 @@ class VisionTransformer(nn.Module):
         self, image_size: int = 224, patch_size: int = 8, embed_dim: int = 384, depth: int = 12, num_heads: int = 6
     ):
         super().__init__()
+        sizes = image_size, patch_size, embed_dim, depth, num_heads
+        if min(sizes) < 1 or image_size % patch_size or embed_dim % num_heads:
+            raise InputError(
+                f"VisionTransformer: image_size, patch_size, embed_dim, depth and num_heads are {sizes}, expected "
+                "positive numbers, image_size a multiple of patch_size and embed_dim one of num_heads"
+            )
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))

@@ -32,9 +32,11 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
         registration.ICPConvergenceCriteria(_TOLERANCE, _TOLERANCE, _ITERATIONS),
     )  # fmt: skip
     matrix = np.asarray(result.transformation)
-    scale = float(np.linalg.norm(matrix[:3, :3]) / np.sqrt(3))  # a rotation has norm sqrt(3)
-    # Sim3 refuses a scale that has converged to 0.
-    return Sim3(scale, matrix[:3, :3] / max(scale, 1e-12), matrix[:3, 3])
+    determinant = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
+    if not determinant > 1e-12:
+        raise InputError("icp: the result is not a similarity, because the scale converged to 0")
+    scale = float(np.cbrt(determinant))
+    return Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
 def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int) -> Sim3:

@@ -42,7 +42,9 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     from zsp_lite.data.published import import_labels, published_sequences
     from zsp_lite.io.download import remote_size
 
-    if dataset != "co3d-v1":
+    if dataset == "co3d-v1":
+        refuse_options({"single_sequence": single_sequence, "chunks": chunks}, (), dataset)
+    else:
         refuse_options(
             {"labels": labels}, (), f"{dataset}: labels are of v1; `zsp-lite data transfer` copies them to v2"
         )

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
-from zsp_lite.errors import MAX_LENGTH, InputError, check_choice
+from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
@@ -93,7 +93,9 @@ class FrameIndex:
 
     def positions(self, sequence: str) -> list[int]:
         """Return the positions of a sequence's frames in `entries`; InputError if the sequence is unknown."""
-        check_choice(f"frame annotations {self.path}: sequence", sequence, self.by_sequence)
+        if sequence not in self.by_sequence:
+            known = f"{len(self.by_sequence)} sequences"
+            raise InputError(f"frame annotations {self.path} have {known}, and no frames of {sequence!r}")
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:

@@ -25,7 +25,7 @@ _AXES = np.array([-1.0, -1.0, 1.0])
 # decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
 _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
-MIN_FOCAL_LENGTH = 1e-3  # pixels
+_MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
 _STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
 
@@ -51,10 +51,10 @@ class Camera:
         if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        check_number("camera focal_length", float(self.focal_length.min()), above=MIN_FOCAL_LENGTH)
-        real_array("image size", tuple(self.size), (2,))
+        check_number("camera focal_length", float(self.focal_length.min()), above=_MIN_FOCAL_LENGTH)
+        real_array("image size (height, width)", tuple(self.size), (2,))
         for side in self.size:
-            check_integer("image size: a side", side, 1, MOST_PIXELS)
+            check_integer("image size (height, width)", side, 1, MOST_PIXELS)
         object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
 
     def __repr__(self) -> str:

@@ -16,7 +16,7 @@ import torch
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import plain_name, read_bytes, stable_hash, write_atomic
 from zsp_lite.io.tensors import load_torch
 
@@ -46,16 +46,16 @@ def sample_pairs(
             a smaller `n` are the first ones of a larger `n`.
     """
     if not isinstance(seed, np.random.Generator):
+        check_integer("seed", seed, 0)
         seed = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
     frames = dataset.frame_list(category)
     numbers = {name: sorted(key.frame_number for key in frames if key.sequence_name == name) for name in sequences}
-    fewest = min(map(len, numbers.values()), default=0)
-    if len(sequences) < 2 or fewest < n_targets:
-        raise InputError(
-            f"category {category} has {len(sequences)} labelled sequences of at least {fewest} frames, expected 2 or "
-            f"more of at least {n_targets}"
-        )
+    if len(sequences) < 2:
+        raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
+    shortest = min(sequences, key=lambda name: len(numbers[name]))
+    if (found := len(numbers[shortest])) < n_targets:
+        raise InputError(f"labelled sequence {category}/{shortest} has {found} frames, expected at least {n_targets}")
 
     pairs = []
     for index in range(n):

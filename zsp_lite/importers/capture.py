@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.cameras import MIN_FOCAL_LENGTH, Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, check_pixels, read_grey16, read_image, read_mask
-from zsp_lite.errors import MAX_LENGTH, InputError, check_magnitude, check_number, real_array
+from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import path_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
@@ -79,12 +79,12 @@ def camera_from_pose(
         or np.abs(pose[3] - (0, 0, 0, 1)).max() > _RIGID_TOLERANCE  # for instance a transposed matrix
     ):
         raise InputError(f"{where}: pose is {pose.tolist()}, expected a finite rigid camera-to-world matrix")
-    left, _, right = np.linalg.svd(rotation)
-    rotation = left @ right
+    rotation = np.linalg.multi_dot(np.linalg.svd(rotation)[::2])
     values = real_array(f"{where}: intrinsics", intrinsics, (4,))
-    check_magnitude(f"{where}: intrinsics", values)
-    check_number(f"{where}: focal_length", float(values[:2].min()), above=MIN_FOCAL_LENGTH)
-    return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
+    try:
+        return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:

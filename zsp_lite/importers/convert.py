@@ -70,7 +70,7 @@ def import_capture(
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     capture = evenly_spaced(capture, max_frames)
-    if masks is not None:
+    if masks is not None and box is None:
         files = files_by_stem(masks)
         capture = [replace(frame, mask=files.get(frame.image.stem)) for frame in capture]
     if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
@@ -82,6 +82,8 @@ def import_capture(
     if box is not None:
         frames = masks_from_box(frames, box)
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
+    if not seen:
+        raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
     empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
     flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
@@ -137,9 +139,8 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
-    clouds = [frame.camera.to_world(object_points(frame))[::7] for frame in frames]
-    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
     if len(points) < 4:
-        raise InputError(f"{len(frames)} frames with a mask have no known depth on the object, expected some inside")
+        raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))
     return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise

@@ -50,7 +50,7 @@ class Assembly:
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
         """Add a part; with `mirror`, also its mirror image in the plane y = 0.
 
-        Parts of one number, 0 .. 7, share a material, whose look is random (see `materials`); it means nothing else.
+        Parts of one number, 0 .. 7, share a material of random look (`materials.random_materials`), and nothing else.
         """
         self.meshes.append(mesh)
         self.materials.append(material)

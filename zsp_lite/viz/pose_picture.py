@@ -12,6 +12,7 @@ from matplotlib.patches import Arc, Wedge
 
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes, view_span
 from zsp_lite.data.frames import ON_OBJECT
+from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz.plots import BLUE, CHOSEN, VERMILLION, coordinate_colours, draw_points
@@ -70,7 +71,9 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     estimate = result.estimates[solver]
     views, chosen = estimate.target_views, estimate.view
     used = np.flatnonzero(np.isfinite(estimate.view_scores))  # others were left out
-    target_cloud = world_cloud(result.targets)[0]
+    target_cloud, reference_cloud = world_cloud(result.targets)[0], world_cloud([result.reference])[0]
+    if not len(target_cloud) or not len(reference_cloud):
+        raise InputError("no depth is known on the object, expected some for a picture of the pose")
     # The reference camera is the origin of its own frame.
     reference_place = estimate.target_camera.to_world(estimate.sim3.t)
     cameras = {int(view) + 1: result.targets[view].camera for view in used}
@@ -92,7 +95,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         target.contour(columns, rows, frame.mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
     for view, axis in zip(others, small):
         _show(axis, views[view].frame.rgb, f"in {titles[view]}", 9)
-    cloud = _some(result.reference.camera.to_camera(world_cloud([result.reference])[0]))
+    cloud = _some(result.reference.camera.to_camera(reference_cloud))
     colours = coordinate_colours(cloud)
     _draw_points(reference, estimate.reference_view.frame.camera, cloud, colours, 5)
     crops = [views[view].frame.camera for view in (chosen, *others)]

@@ -67,25 +67,25 @@ def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) 
     return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
-def draw_reliability(axis: Axes, reliability: Reliability) -> None:
+def draw_reliability(axis: Axes, measured: Reliability) -> None:
     """Draw a reliability diagram: accuracy against mean confidence of each bin, with 95 % Wilson intervals.
 
     Counts stand beside the points, or in the title if they are equal.
     On the dashed diagonal confidences are calibrated; below it they are too high.
     """
-    accuracy, count = reliability.accuracy, reliability.count
+    accuracy, count = measured.accuracy, measured.count
     right = np.rint(accuracy * count).astype(int)
     ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(right.tolist(), count.tolist())]
     bars = np.maximum([accuracy - [end.low for end in ends], [end.high for end in ends] - accuracy], 0)
     axis.plot([0, 1], [0, 1], color="0.4", linestyle="--", label="calibrated")
     axis.errorbar(
-        reliability.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
+        measured.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
         label="measured",
     )  # fmt: skip
     if len(set(count.tolist())) == 1:
         axis.set_title(f"{count[0]} answers for each point", fontsize=10)
     else:
-        for x, y, n in zip(reliability.confidence, accuracy, count):
+        for x, y, n in zip(measured.confidence, accuracy, count):
             axis.annotate(str(n), (x, y), (5, -10), textcoords="offset points", fontsize=8, color="0.3")
     axis.set(xlabel="mean confidence", ylabel="fraction within 30 degrees", xlim=(0, 1.03), ylim=(0, 1.03))
     axis.set_aspect("equal")

@@ -4,6 +4,7 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Real, UInt8
 
+from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 4000  # of both clouds together; more points slow down browsers and enlarge notebooks
@@ -27,6 +28,8 @@ def aligned_clouds(
     traces, drawn = [], []
     for index, (cloud, name, (colour, symbol, size)) in enumerate(zip((reference, target), names, STYLES)):
         cloud = np.asarray(cloud, dtype=np.float64)
+        if len(cloud) == 0 or not np.isfinite(cloud).all():
+            raise InputError(f"point cloud {name!r} of shape {cloud.shape} is empty or not finite")
         own = None if colours is None else colours[index]
         if len(cloud) > MAX_POINTS // 2:
             kept = np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))

@@ -7,7 +7,7 @@ types "multiple_choice", "many_choice" and "numeric"). Texts are HTML: `<i>K</i>
 import json
 from pathlib import Path
 
-from zsp_lite.errors import check_choice, check_integer
+from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.viz.plots import BLUE
 from zsp_lite.widgets.common import load_package
 
@@ -36,7 +36,7 @@ def self_check(notebook: str, number: int) -> None:
     jupyterquiz = load_package("jupyterquiz")
     ipython = load_package("IPython")
     if ipython.get_ipython() is None:
-        return  # nothing can show the questions
+        raise InputError("self_check was called outside IPython, expected a notebook, which can show the questions")
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
     form, script = (output.data for output in captured.outputs)
