@@ -1,20 +1,24 @@
-"""A small CO3D folder for the tests of the benchmark, made once; and what separate processes run on it."""
+"""A small CO3D folder for the tests of the benchmark, made once, what runs on it, and runs that are made up."""
 
 import atexit
 import functools
+import re
 import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from synthetic_views import CoordinateBackbone, look_at, render
+from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.co3d import SequenceData, write_co3d
-from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.benchmark.run import evaluate
+from zsp_lite.benchmark.runs import add_lines, open_run, read_run
+from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 
 SEQUENCES = ("100_a", "200_b", "300_c")
 FRAMES = 8
@@ -56,16 +60,122 @@ class SlowBackbone(CoordinateBackbone):
         return super().__call__(images)
 
 
+@dataclass(frozen=True)
+class Sociable(CoordinateBackbone):
+    """Its features depend on how many images come together, as those of a real network do in their last bits."""
+
+    name: str = "sociable"
+
+    def __call__(self, images):
+        found = super().__call__(images)
+        return [replace(one, keys=one.keys * (1 + 0.3 * len(images))) for one in found]
+
+
+BACKBONE = CoordinateBackbone(grid=8)
+
+
+def run_rows(rows, out, pairs: int = 1, targets: int = 2, category: str = "lump", backbone=BACKBONE):
+    """Run the benchmark on one category; returns the figures by row."""
+    return evaluate(small_folder(), backbone, rows, {category: pairs}, targets, out)["methods"]
+
+
 def own_method(problem):
     """A user's row: the first target view as it is."""
     return np.eye(3), 0
 
 
-if __name__ == "__main__":
-    from zsp_lite.benchmark.run import evaluate
+class OwnEstimator:
+    """A user's estimator: turns the reference by 90 degrees."""
 
-    def report(done: int, total: int) -> None:
-        print(done, flush=True)
+    def estimate(self, reference, targets):
+        return look_at((0, 1, 0)).R.T @ look_at((1, 0, 0)).R, len(targets) - 1
+
+
+own_estimator = OwnEstimator()
+
+
+def own_matcher(similarity, on_reference, on_target):
+    """A user's matcher of patches: each one's nearest neighbour."""
+    score, partner = similarity.max(dim=1)
+    return partner, score.double()
+
+
+def own_keypoints(first, second):
+    """A user's matcher of pixels: every tenth one, where it is."""
+    grid = np.stack(np.mgrid[: len(first) : 10, : len(first) : 10], -1).reshape(-1, 2) + 0.5
+    return grid, grid, np.ones(len(grid))
+
+
+def placement(category, sequence) -> Sim3:
+    """From the world of the first sequence to that of another one, by the label."""
+    trans = read_labels(small_folder(), category)[sequence].trans
+    return Sim3(1.0, trans[:3, :3], trans[:3, 3])
+
+
+def exact_keypoints(store):
+    """Return a matcher of the frames of a store that knows the geometry: every visible pixel and its place."""
+    crops = {}
+    for name in SEQUENCES:
+        for frame in (store.frame((name, number)) for number in range(FRAMES)):
+            crops[frame.rgb.tobytes()] = frame, placement(store.category, name)
+
+    def exact(first, second):
+        (reference, here), (target, there) = crops[first.tobytes()], crops[second.tobytes()]
+        rows, columns = np.nonzero((reference.depth > 0) & (reference.mask > 0.5))
+        pixels = np.stack([columns, rows], axis=1) + 0.5
+        points = reference.camera.unproject_camera(pixels, reference.depth[rows, columns])
+        points = true_pose(reference.camera, here, target.camera, there).apply(points)
+        places, depth = target.camera.project(target.camera.to_world(points))
+        x, y = np.floor(places).astype(int).T
+        inside = (np.minimum(x, y) >= 0) & (np.maximum(x, y) < len(second))
+        seen = inside & (np.abs(target.depth[y * inside, x * inside] - depth) < 0.002)
+        return pixels[seen], places[seen], np.ones(seen.sum())
+
+    return exact
+
+
+CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
+PAIRS = 8
+
+
+def write_run(out, rows, categories=CATEGORIES, **settings):
+    """Write a run's folder with results by row and pair."""
+    settings = {"data": "made up", "targets": 5, "backbone": "none 0", "labels": {}, "library": {}} | settings
+    with open_run(out, {"methods": dict.fromkeys(rows, "x")} | settings):
+        add_lines(out, [{"call": {"rows": list(rows), "categories": list(categories)}}])
+        cost = {"seconds": 1.0, "timings": {}, "saliency_iou": {}}
+        for name, results in rows.items():
+            add_lines(out, ({"pair": key, "results": {name: found}} | cost for key, found in results.items()))
+    return read_run(out)
+
+
+def made_up_run(out, rows, seed=0, **settings):
+    """A run with random errors of pairs that share a few objects, other ones for each seed."""
+    rng, found, names = np.random.default_rng(seed), {}, [f"{seed}_{i}" for i in range(PAIRS)]
+    for name in dict.fromkeys(rows):
+        targets = tuple(range(int((re.findall(r"-n(\d+)$", name) or [5])[0])))
+        pairs = [Pair(category, names[i % PAIRS], i, names[(i * i + 1) % PAIRS], targets)
+                 for category in CATEGORIES for i in range(PAIRS)]  # fmt: skip
+        found[name] = {pair.key: {"error": round(rng.uniform(0, 180), 4), "view": 0, "inliers": 9} for pair in pairs}
+        for one in found[name].values():
+            one |= {"confidence": round(rng.random(), 4)} if name in ("verified", "mine") else {}
+    return write_run(out, found, **settings)
+
+
+def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
+    """Return a substitute of `run.add_lines` that calls `act` after it has added pairs."""
+
+    def add_and_act(out, lines):
+        add_lines(out, lines)
+        if any("pair" in line for line in lines):
+            act()
+
+    return add_and_act
+
+
+if __name__ == "__main__":
+    from zsp_lite.benchmark import run
 
     data, out, workers = sys.argv[1:]
-    evaluate(data, SlowBackbone(grid=8), ("ours", "ours-bv"), 6, 3, out=out, progress=report, workers=int(workers))
+    run.add_lines = after_each_save(lambda: print(flush=True))
+    run.evaluate(data, SlowBackbone(grid=8), ("ours", "ours-bv"), 6, 3, out, int(workers))

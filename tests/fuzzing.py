@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from safetensors.numpy import save
 
 from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.benchmark.results import read_results
-from zsp_lite.benchmark.summary import summarise_rows
+from zsp_lite.benchmark.own import read_poses
+from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.annotations import SEQUENCES_FILE, read_frame_index, read_sequences
 from zsp_lite.data.frames import read_depth, read_image
 from zsp_lite.data.labels import parse_label
@@ -54,6 +54,14 @@ def _file(name: str, read: Callable[[Path], object], pack: Callable[[bytes], byt
 
 def _gzip(data: bytes) -> bytes:
     return gzip.compress(data, 1)
+
+
+def _lines(text: bytes) -> bytes:
+    """A gzipped file with a line for each member of a list."""
+    try:
+        return _gzip(b"\n".join(_text(line) for line in json.loads(text)))
+    except (ValueError, TypeError):
+        return _gzip(text)
 
 
 def _frames(path: Path) -> None:
@@ -102,13 +110,16 @@ _NERF = {
     "fl_x": 30, "cx": 16, "cy": 12, "w": 32, "h": 24, "k1": 0.1,
     "frames": [{"file_path": "rgb/0.png", "depth_file_path": "depth/0.png", "transform_matrix": _EYE}],
 }  # fmt: skip
-_KEYS = [f"cup/a:{i}/b:0,1" for i in range(4)]
-_SUMMARY = summarise_rows({"ours": {key: {"error": float(i)} for i, key in enumerate(_KEYS)}})
-_RESULTS = {
-    "summary": {"data": {"root": "d", "categories": ["cup"], "pairs": 4, "targets": 2}, "backbone": "n", **_SUMMARY},
-    "settings": {"data": "d", "backbone": "n 0", "targets": 2, "seed": 0, "methods": {}}, "invocations": [],
-    "pairs": _KEYS, "rows": {"ours": {"pair": [0, 1, 2, 3], "error": [0.0, 1.0, 2.0, 3.0]}},
-}  # fmt: skip
+_PAIR = {"timings": {"reading": [0.1]}, "saliency_iou": {"a/1": 0.5}}
+_RESULTS = [
+    {"data": "d", "backbone": "n 0", "targets": 2, "library": [{"version": "0"}], "methods": {"ours": "x"}},
+    {"call": {"rows": ["ours"], "categories": ["cup"]}},
+    *({"pair": f"cup/a:{i}/b:0,1", "results": {"ours": {"error": 1.0, "second_error": 9.0}}} | _PAIR for i in range(4)),
+    {"seconds": 1.0},
+]  # fmt: skip
+_POSES = b"""category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale
+cup,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
+"""
 _PLY = "ply\nformat {} 1.0\nelement vertex 3\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
 _TENSORS = save({"a": np.zeros(2, np.float32)})
 
@@ -148,7 +159,8 @@ TARGETS: dict[str, Target] = {
         b"# camera to world\n1 0 0 0 0 1 0 0 0 0 1 0\n",
     ),
     "nerfstudio": Target(_capture("nerfstudio", "transforms.json", {}), _text(_NERF), True),
-    "results": Target(_file("r.json.gz", read_results, _gzip), _text(_RESULTS), True),
+    "results": Target(_file("r.jsonl.gz", lambda path: read_run(path).summary, _lines), _text(_RESULTS), True),
+    "poses": Target(_file("poses.csv", read_poses), _POSES),
 }  # fmt: skip
 
 

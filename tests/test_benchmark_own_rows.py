@@ -1,81 +1,221 @@
-"""Rows of one's own: what they may be and may return, and how a row, a backbone or a function is told from another."""
+"""Methods of one's own: what they may be and may return, poses from a file, and how a row is told from another."""
 
+import csv
 import json
+import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
+import benchmark_folder
 import numpy as np
 import pytest
 import torch
-from benchmark_folder import own_method, small_folder
-from synthetic_views import CoordinateBackbone
+from benchmark_folder import BACKBONE, exact_keypoints, own_matcher, own_method, placement, run_rows, small_folder
+from synthetic_views import CoordinateBackbone, true_pose
 
 from zsp_lite.benchmark import identity
+from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.extractors import EXTRACTORS
-from zsp_lite.benchmark.identity import fingerprint as extractor_fingerprint
+from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, resolve
-from zsp_lite.benchmark.problem import Answer, as_answer
-from zsp_lite.benchmark.records import read_records
-from zsp_lite.benchmark.run import evaluate
+from zsp_lite.benchmark.own import kind_of, write_questions
+from zsp_lite.benchmark.problem import Answer, Problem, as_answer
+from zsp_lite.benchmark.run import category_pairs
+from zsp_lite.benchmark.runs import read_lines, read_run
+from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
 
-BACKBONE = CoordinateBackbone(grid=8)
+OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints")
 
 
-def test_your_own_method_is_a_row_like_any_other(tmp_path):
-    settings = {"pairs": 3, "targets": 2, "categories": ["lump"]}
+def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
+    by_object = {name: getattr(benchmark_folder, name) for name in OWN}
+    assert [kind_of(own) for own in by_object.values()] == ["problem", "estimator", "matcher", "keypoints"]
+    more = {"pipeline": ZeroShotPose(BACKBONE), "row": Method(settings={"matcher": own_matcher}), "ours": "ours"}
+    methods, found = run_rows(by_object | more, tmp_path / "a", 3), read_run(tmp_path / "a")
+    assert list(methods) == [*OWN, *more] and all(row["failed"] == 0 for row in methods.values())
+    assert set(found.row("own_method")["view"]) == {0} and set(found.row("own_estimator")["view"]) == {1}
+    assert found.row("own_matcher")["error"].equals(found.row("row")["error"])
+    # The pixels of two views are no matches: what they fit is far from the truth, but is fitted.
+    assert (found.row("own_keypoints")["inliers"] > 3).all()
+    run_rows([f"{name}=benchmark_folder:{name}" for name in OWN], tmp_path / "b", 3)
+    named = read_run(tmp_path / "b")
+    assert all(named.row(name)["error"].equals(found.row(name)["error"]) for name in OWN)
+    assert list(run_rows(["benchmark_folder:own_method"], tmp_path / "c")) == ["benchmark_folder:own_method"]
 
-    def last_patch(sim, on1, on2):
-        return torch.zeros(len(on1), dtype=torch.long), torch.where(on1, 1.0, -torch.inf).double()
 
-    mine = {
-        "function": lambda problem: problem.estimate().sim3,
-        "object": ZeroShotPose(BACKBONE),
-        "matcher": Method(settings={"matcher": last_patch}),
-        "imported": "benchmark_folder:own_method",
-        "ours": "ours",
-    }
-    rows = evaluate(small_folder(), BACKBONE, mine, out=tmp_path, **settings)["methods"]
-    assert list(rows) == list(mine) and all(row["n"] == 3 for row in rows.values())
-    assert all(found["view"] == 0 for found in read_records(tmp_path).rows["imported"].values())
-    again = evaluate(small_folder(), BACKBONE, ["benchmark_folder:own_method"], out=tmp_path / "b", **settings)
-    named = again["methods"]["benchmark_folder:own_method"]
-    assert named == {key: rows["imported"][key] for key in named}
+@pytest.mark.parametrize(
+    ("thing", "told"),
+    [
+        (3, "a int, which is no function"), (lambda: 0, r"a function of \(\)"), (lambda a, b, c, d: 0, "a, b, c, d"),
+        (lambda one, *, other: 0, r"a function of \(one, \*, other\)"), (ZeroShotPose, "a type, which is no function"),
+        (lambda *all: 0, r"a function of \(\*all\)"), ("benchmark_folder:FRAMES", "a int, which is no function"),
+        ("benchmark_folder:nothing", "has no attribute 'nothing'"), ("nowhere:nothing", "No module named 'nowhere'"),
+        ("./here.py:x", "cannot be imported"), ("nonesuch", "'nonesuch' is unknown"), ("no/such.csv", "no/such.csv"),
+        ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"), ("", "''|no methods"),
+    ],
+)  # fmt: skip
+def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(thing, told, tmp_path):
+    with pytest.raises(InputError, match=told) as caught:
+        run_rows({"mine": thing}, tmp_path / "out")
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+    if not isinstance(thing, str):
+        assert "'mine'" in str(caught.value) and "estimate(reference, targets)" in str(caught.value)
+
+
+def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_what_a_function_is():
+    class Network(torch.nn.Module):
+        def forward(self, first, second):
+            return first
+
+    problem = Network()
+    problem.kind = "problem"  # comes before the two arguments
+    found = lambda one, other=None, *, third=3: 0, lambda one, two, three=3, **options: 0, Network(), problem
+    assert [kind_of(one) for one in found] == ["problem", "keypoints", "keypoints", "problem"]
+    with pytest.raises(InputError, match="no methods, expected some"):
+        resolve([])
+    views = resolve(["ours-n4", "near=ours-bv-n2", "far=benchmark_folder:own_method"])
+    assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("near", 2), ("far", None)]
 
 
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
-    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
-    evaluate(small_folder(), BACKBONE, {"mine": own_method}, **settings)
-    evaluate(small_folder(), BACKBONE, {"mine": own_method, "ours": "ours"}, **settings)
-    with pytest.raises(InputError, match="mine.*changed"):
-        evaluate(small_folder(), BACKBONE, {"mine": lambda problem: np.eye(3)}, **settings)
+    run_rows({"mine": own_method}, tmp_path)
+    run_rows({"mine": own_method, "ours": "ours"}, tmp_path)
+    with pytest.raises(InputError, match="mine: the method has changed"):
+        run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
-def one_way(similarity, on_reference, on_target):
-    score, partner = similarity.max(dim=1)
-    return partner, score.double()
+def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
+    dataset = Co3D(small_folder())
+    store = FrameStore(dataset, "lump", {"backbone": BACKBONE})
+    exact = exact_keypoints(store)
+    rows = resolve({"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)})
+    for pair in category_pairs(dataset, "lump", 4, 3):
+        problem = Problem(pair, store)
+        found = evaluate_pair(pair, rows, store, read_labels(small_folder(), "lump"))["results"]
+        counts = [len(exact(problem.frames()[0].rgb, target.rgb)[0]) for target in problem.frames()[1:]]
+        one = found["exact"]
+        assert one["view"] == np.argmax(counts) and one["matches"] == one["inliers"] == max(counts) > 20
+        assert one["error"] < 0.1 and one["scale"] == pytest.approx(1, abs=1e-3) and one["translation"] < 1e-3
+        assert found["one score"]["view"] == 0 and found["one score"]["matches"] == counts[0]
 
 
-def test_the_library_is_known_by_its_source(tmp_path, monkeypatch):
+def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_path):
+    none, ones = np.zeros((0, 2)), np.ones((9, 2))
+    rows = {
+        "none": lambda first, second: (none, none, none[:, 0]), "words": lambda first, second: ("a", "b", [1]),
+        "uneven": lambda first, second: (ones, ones[1:], ones[:, 0]),
+    }  # fmt: skip
+    found = run_rows(rows, tmp_path)
+    assert [(row["failed"], row["flagged"]) for row in found.values()] == [(0, 1), (1, 0), (0, 1)]
+    assert read_run(tmp_path).row("none")["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
+
+
+COLUMNS = "category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale"
+
+
+def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
+    """As another program would: it reads the questions, and answers in any of the target views."""
+    dataset, lines = Co3D(small_folder()), [COLUMNS]
+    pairs = category_pairs(dataset, "lump", 4, 3)
+    for pair in pairs[:3]:
+        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
+        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
+        pose = true_pose(*(part for one in known for part in one))
+        numbers = (" ".join(map(repr, part.ravel().tolist())) for part in (pose.R, pose.t))
+        lines.append(",".join(map(str, ("lump", *ends[0], *ends[1], *numbers, "1.0"))))
+    (tmp_path / "exact.csv").write_text("\n".join(lines))
+    (tmp_path / "rotations.csv").write_text("\r\n".join(line.rsplit(",", 2)[0] for line in lines))
+    rows = {"exact": str(tmp_path / "exact.csv"), "rotations": str(tmp_path / "rotations.csv")}
+    run_rows([f"{name}={path}" for name, path in rows.items()], tmp_path / "run", 4, 3)
+    for name in rows:
+        found = read_run(tmp_path / "run").row(name)
+        answered = found.loc[[pair.key for pair in pairs[:3]]]
+        assert (answered["error"] < 1e-5).all() and (answered["view"] == 1).all()
+        known = answered[["translation", "scale"]].to_numpy(float)
+        assert np.isnan(known).all() if name == "rotations" else np.allclose(known, (0, 1), atol=1e-9)
+        assert found.loc[pairs[3].key, "error"] == 180
+        assert found.loc[pairs[3].key, "failed"] == f"{rows[name]} has no pose"
+    (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
+    with pytest.raises(InputError, match="exact: the method has changed"):
+        run_rows([f"exact={rows['exact']}"], tmp_path / "run", 4, 3)
+
+
+RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no column category, .*rotation, or no line"), (COLUMNS, "no line"), ("\xff", "codec.* a CSV file"),
+        (f"{COLUMNS.replace('rotation', 'R')}\n{RIGHT}", "no column rotation"),
+        (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation is .*, expected 9"),
+        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',nan 0')}", "line 2: rotation is 'nan"),
+        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
+        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',2 0')}", "line 2: "),
+        (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,first,')}", "line 2: .*first"),
+        (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation is '0 0', expected 3"),
+        (f"{COLUMNS}\nlump,a,0", "line 2: "),
+    ],
+)  # fmt: skip
+def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=f"poses {path}.*{told}"):
+        resolve([f"theirs={path}"])
+    path.write_text(f"{COLUMNS}\n{RIGHT}\n")
+    assert resolve([f"theirs={path}"])["theirs"].features == "none"
+
+
+def test_the_questions_have_a_line_for_each_frame_with_its_files_and_camera(tmp_path):
+    dataset = Co3D(small_folder())
+    pairs = [*category_pairs(dataset, "lump", 2, 3), *category_pairs(dataset, "pebble", 1, 3)]
+    with open(write_questions(tmp_path / "pairs.csv", dataset, pairs), newline="") as file:
+        lines = list(csv.DictReader(file))
+    asked = []
+    for number, pair in enumerate(pairs):
+        asked += [(f"{number}", "reference", pair.category, pair.reference_sequence, f"{pair.reference_frame}")]
+        asked += [(f"{number}", "target", pair.category, pair.target_sequence, f"{n}") for n in pair.target_frames]
+    assert [tuple(line.values())[:5] for line in lines] == asked
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    for line in lines:
+        assert all((dataset.root / line[name]).is_file() for name in ("image", "depth", "mask"))
+        assert float(line["depth_scale"]) > 0
+        numbers = {name: np.array(line[name].split(), float) for name in ("fx", "fy", "cx", "cy", "R", "t")}
+        focal, middle = np.array([*numbers["fx"], *numbers["fy"]]), np.array([*numbers["cx"], *numbers["cy"]])
+        frame = dataset.load(dataset.frame(line["category"], line["sequence"], int(line["frame"])))
+        camera = Camera(numbers["R"].reshape(3, 3), numbers["t"], focal, middle, frame.camera.size)
+        np.testing.assert_allclose(camera.project(points)[0], frame.camera.project(points)[0], atol=1e-9)
+
+
+def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
     monkeypatch.setattr(identity, "_PACKAGE", tmp_path)
-    found = []
-    for name, text in (("a.py", "x = 1"), ("a.py", "x = 2"), ("b/c.py", ""), ("notes.md", "no source")):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-        found.append(identity.library_version.__wrapped__()["source"])
-    assert len(set(found)) == 3 and found[2] == found[3]
+    version, found = identity.library_version.__wrapped__, []
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=b"]
+    (tmp_path / "__init__.py").touch()
+    for step in (["init"], ["add", "."], ["commit", "-m", "x"]):
+        found.append(version()["commit"])
+        subprocess.run([*git, *step], check=True, capture_output=True)
+    assert found[:2] == [None, None]
+    commit = version()["commit"]
+    assert len(commit) == 40
+    (tmp_path / "__init__.py").write_text("x = 1")
+    assert version()["commit"] == f"{commit}-dirty"
 
 
 def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
     assert description(METHODS["ours-k30"]) == "backbone; pose; k=30"
-    assert description(METHODS["verified-mask-n3"]) == "backbone; pose; foreground=mask, solver=verified; 3 views"
-    rows = resolve(
-        {"own": own_method, "matcher": Method(settings={"matcher": one_way}), "object": ZeroShotPose(BACKBONE, k=7)}
-    )
+    (views,) = resolve(["verified-mask-n3"]).values()
+    assert description(views) == "backbone; pose; foreground=mask, solver=verified; 3 views"
+    rows = resolve({"own": own_method, "matcher": own_matcher, "object": ZeroShotPose(BACKBONE, k=7)})
     own, matcher, estimator = map(description, rows.values())
     assert own == "backbone; pose; benchmark_folder:own_method"
-    assert matcher == f"backbone; pose; matcher={__name__}:one_way"
+    assert matcher == "backbone; pose; matcher=benchmark_folder:own_matcher"
     assert "zsp_lite.pipeline:ZeroShotPose" in estimator and "k=7" in estimator
     assert len(set(map(description, METHODS.values()))) == len(METHODS)
 
@@ -84,19 +224,11 @@ def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
     def grey(images):
         return BACKBONE([image // 2 for image in images])
 
-    class Weighed:
-        name = "weighed"
+    def weighed(value):
+        return SimpleNamespace(name="weighed", state_dict=lambda: {"value": torch.tensor(value)})
 
-        def __init__(self, value):
-            self.value = value
-
-        def state_dict(self):
-            return {"value": torch.tensor(self.value)}
-
-    assert extractor_fingerprint(grey).endswith(
-        ":test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights.<locals>.grey"
-    )
-    first, again, other = (extractor_fingerprint(Weighed(value)) for value in (1.0, 1.0, 2.0))
+    assert fingerprint(grey).endswith(":test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights.<locals>.grey")
+    first, again, other = (fingerprint(weighed(value)) for value in (1.0, 1.0, 2.0))
     assert first == again != other and first.startswith("weighed ")
 
 
@@ -110,29 +242,19 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 
-def test_an_answers_details_are_numbers_and_texts_under_names_of_their_own():
+def test_an_answer_is_a_rotation_with_details_under_names_of_their_own_or_the_pair_fails(tmp_path):
     assert json.dumps(dict(as_answer(Answer(np.eye(3), details={"inliers": np.int64(3)})).details)) == '{"inliers": 3}'
     for details, told in (
-        ({"error": 1.0}, "detail error .* another name"),
+        ({"error": 1.0}, "detail error .* another"),
         ({"matches": np.arange(3)}, "matches .* ndarray"),
     ):
         with pytest.raises(InputError, match=told):
             as_answer(Answer(np.eye(3), details=details))
-
-
-def test_answers_that_are_none_are_refused_or_fail(tmp_path):
-    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     rows = {
-        "large": lambda problem: Answer(2 * np.eye(3)),
-        "words": lambda problem: "north",
-        "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]),
-        "far view": lambda problem: (np.eye(3), 2),
-    }
-    summary = evaluate(small_folder(), BACKBONE, rows, **settings)
-    assert all(row["failed"] == 1 and row["median"] == 180 for row in summary["methods"].values())
-    for methods in ([], {"a": 3}, ["nowhere:nothing"], ["./here.py:nothing"], "nonesuch"):
-        with pytest.raises(InputError):
-            resolve(methods)
+        "large": lambda problem: Answer(2 * np.eye(3)), "words": lambda problem: "north",
+        "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]), "far view": lambda problem: (np.eye(3), 2),
+    }  # fmt: skip
+    assert all(row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values())
 
 
 def fails(problem):
@@ -140,17 +262,17 @@ def fails(problem):
 
 
 def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
-    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     where = r"failed: .*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"
     rows = {
         "function": (fails, where),
-        "object": (type("Estimator", (), {"estimate": lambda self, reference, targets: fails(None)})(), where),
+        "object": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), where),
+        "keypoints": (lambda first, second: fails(None), where),
         "view": (lambda problem: (np.eye(3), "first"), "ValueError: invalid literal"),
     }
     for name, (row, told) in rows.items():
         with pytest.raises(InputError, match=told):
-            evaluate(small_folder(), BACKBONE, {name: row}, **settings)
-    assert read_records(tmp_path).rows == {}
+            run_rows({name: row}, tmp_path)
+    assert not [line for line in read_lines(tmp_path) if "pair" in line]
 
 
 def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_failed(tmp_path):
@@ -158,14 +280,14 @@ def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_f
         def __call__(self, images):
             return [replace(one, keys=one.keys * float("nan")) for one in super().__call__(images)]
 
-    settings = {"pairs": 1, "targets": 2, "categories": ["lump"], "out": tmp_path}
     with pytest.raises(InputError, match="keys, .* hold values that are not finite"):
-        evaluate(small_folder(), NotANumber(grid=8), ["ours"], **settings)
-    assert read_records(tmp_path).rows == {}
+        run_rows(["ours"], tmp_path, backbone=NotANumber(grid=8))
+    with pytest.raises(InputError, match="the run has no finished pair yet"):
+        read_run(tmp_path)
 
 
 def test_groups_are_made_of_rows_and_rows_of_known_features():
-    assert all(name in METHODS for names in GROUPS.values() for name in names)
+    assert all(resolve(names).keys() == set(names) for names in GROUPS.values())
     assert all(method.features in EXTRACTORS for method in METHODS.values())
     assert not GROUPS.keys() & METHODS.keys()  # a name is a row or a group, never both
     assert not {"swav", "posecontrast"} & {name for names in GROUPS.values() for name in names}  # need a checkpoint

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmark_folder import small_folder
-from synthetic_views import CoordinateBackbone
+from benchmark_folder import BACKBONE, run_rows, small_folder
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
@@ -13,10 +12,10 @@ from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import extractors
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
+from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.benchmark.problem import Problem
-from zsp_lite.benchmark.records import read_records
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows
+from zsp_lite.benchmark.run import category_pairs
+from zsp_lite.benchmark.runs import read_run
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
@@ -26,117 +25,96 @@ from zsp_lite.pipeline import ZeroShotPose
 
 pytestmark = pytest.mark.slow
 
-BACKBONE = CoordinateBackbone(grid=8)
 ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("rows")
-    summary = evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out=out, categories=["pebble"])
-    return summary["methods"], read_records(out).rows
+    return run_rows(ROWS, out, 6, 5, "pebble"), read_run(out).row
 
 
 def test_every_row_answers_every_pair_and_with_perfect_features_every_way_to_match_and_fit_is_right(run):
-    rows, _ = run
+    rows, row = run
     assert set(rows) == set(ROWS)
-    assert all(row["n"] == 6 and row["failed"] == 0 for row in rows.values())
+    assert all(one["n"] == 6 and one["failed"] == 0 for one in rows.values())
     exact = [*GROUPS["correspondences"], *GROUPS["matchers"], *GROUPS["trials"], *GROUPS["published"]]
     assert all(rows[name]["acc30"] >= 80 for name in exact)
     assert rows["ours-n1"]["acc30"] <= rows["ours-n3"]["acc30"] <= rows["ours-n5"]["acc30"]
-
-
-def test_a_row_with_the_runs_number_of_views_is_the_row_without_a_number(run):
-    rows, records = run
-    assert len(records["ours"]) == 6 and rows["ours-n5"] == rows["ours"]
-    assert all(records["ours-n5"][key]["error"] == found["error"] for key, found in records["ours"].items())
-    assert len(records["ours-n3"]) == 6 and all(key.count(",") == 2 for key in records["ours-n3"])
+    assert rows["ours-n5"] == rows["ours"] and row("ours-n5")["error"].equals(row("ours")["error"])
+    assert len(row("ours-n3")) == 6 and all(key.count(",") == 2 for key in row("ours-n3").index)
 
 
 def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
-    _, records = run
+    _, row = run
     dataset, labels = Co3D(small_folder()), read_labels(small_folder(), "pebble")
-    (pair, *_) = pairs_of_rows(small_folder(), resolve(["ours"]), 6, 5, categories=["pebble"])["ours"]
+    (pair, *_) = category_pairs(dataset, "pebble", 6, 5)
     reference, targets = dataset.load_pair(pair)
     for name in ("ours", "ours-published", "ours-k70-nokmeans", "ours-transport", "ours-saliencyiou"):
         estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(reference, targets)
         camera = estimate.target_camera
         truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
         truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ reference.camera.R.T
-        found = records[name][pair.key]
+        found = row(name).loc[pair.key]
         assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-9)
         assert found["view"] == estimate.view and found["inliers"] == estimate.inliers.sum()
 
 
 def test_rows_differ_as_their_names_say(run):
-    _, records = run
-    fitted = [one for one in records["ours-nodepth"].values() if one["note"] == ""]
-    assert len(fitted) >= 4 and all("translation_error" not in one and one["inliers"] >= 5 for one in fitted)
-    for key, found in records["ours"].items():
-        assert records["icp"][key]["view"] == 0 and records["icp-bv"][key]["view"] == found["view"]
+    _, row = run
+    fitted = row("ours-nodepth")[row("ours-nodepth")["note"] == ""]
+    assert len(fitted) >= 4 and fitted["translation"].isna().all() and (fitted["inliers"] >= 5).all()
+    assert row("ours")["translation"].median() < 0.2 and row("ours")["scale"].median() == pytest.approx(1, abs=0.1)
+    assert (row("icp")["view"] == 0).all() and row("icp-bv")["view"].equals(row("ours")["view"])
 
 
 @pytest.mark.parametrize("row", ["icp", "sift"])
 def test_a_pair_without_depth_fails(row, monkeypatch):
-    (pair,) = pairs_of_rows(small_folder(), resolve([row]), 1, 2, categories=["pebble"])[row]
-    problem = Problem(pair, FrameStore(Co3D(small_folder()), "pebble", {"sift": Sift()}))
+    dataset = Co3D(small_folder())
+    problem = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
     frames = [replace(frame, depth=None) for frame in problem.frames()]
     monkeypatch.setattr(problem, "frames", lambda: frames)
     with pytest.raises(InputError, match="no depth map: 100_a"):
         METHODS[row].solve(problem)
 
 
-def test_stages_that_rows_have_in_common_are_done_once(tmp_path, monkeypatch):
-    calls = []
-    match_views = ZeroShotPose.match_views
-    monkeypatch.setattr(ZeroShotPose, "match_views", lambda *args: (calls.append(1), match_views(*args))[1])
-    rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
-    evaluate(small_folder(), BACKBONE, rows, 2, 3, out=tmp_path, categories=["pebble"])
-    assert len(calls) == 2 * 3
-
-
-def test_rows_whose_matches_differ_do_not_share_them(tmp_path, monkeypatch):
-    """The verified solver takes the best matches, the paper's those that k-means selects."""
+def test_stages_that_rows_have_in_common_are_done_once_and_others_are_not_shared(tmp_path, monkeypatch):
     calls, match_views = [], ZeroShotPose.match_views
-
-    def record(method, *args):
-        calls.append(method.clusters)
-        return match_views(method, *args)
-
-    monkeypatch.setattr(ZeroShotPose, "match_views", record)
-    evaluate(small_folder(), BACKBONE, ["ours", "verified"], 1, 2, out=tmp_path, categories=["pebble"])
+    monkeypatch.setattr(
+        ZeroShotPose, "match_views", lambda *args: (calls.append(args[0].clusters), match_views(*args))[1]
+    )
+    rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
+    run_rows(rows, tmp_path / "a", 2, 3)
+    assert len(calls) == 2 * 3
+    calls.clear()
+    run_rows(["ours", "verified"], tmp_path / "b")  # the paper's takes matches that k-means selects, the other the best
     assert sorted(calls) == [False, False, True, True]
 
 
 class TrueViewpoints:
-    """Says of each frame the pose that its label says."""
-
     name = "true viewpoints"
 
     def describe(self, frames):
-        return [self.viewpoint(frame) for frame in frames]
-
-    def viewpoint(self, frame):
-        label = read_labels(small_folder(), "pebble")[frame.name.split("/")[0]]
-        return Viewpoint(frame.camera.R @ label.trans[:3, :3], torch.from_numpy(frame.camera.R[2].copy()))
+        """The pose of each frame's label, and its viewing direction as its feature."""
+        labels = read_labels(small_folder(), "pebble")
+        found = ((frame.camera.R, labels[frame.name.split("/")[0]].trans[:3, :3]) for frame in frames)
+        return [Viewpoint(camera @ turn, torch.from_numpy(camera[2].copy())) for camera, turn in found]
 
 
 def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):
     monkeypatch.setitem(extractors.EXTRACTORS, "posecontrast", lambda backbone: TrueViewpoints())
-    summary = evaluate(small_folder(), BACKBONE, ["posecontrast"], 4, 3, out=tmp_path, categories=["pebble"])
-    assert summary["methods"]["posecontrast"]["median"] < 1e-5
+    assert run_rows(["posecontrast"], tmp_path, 4, 3, "pebble")["posecontrast"]["median"] < 1e-5
 
 
 def test_swav_is_matched_as_mutual_neighbours(tmp_path, monkeypatch):
     monkeypatch.setitem(extractors.EXTRACTORS, "swav", lambda backbone: BACKBONE)
-    summary = evaluate(small_folder(), BACKBONE, ["swav"], 4, 5, out=tmp_path, categories=["pebble"])
-    assert summary["methods"]["swav"]["acc30"] >= 75
+    assert run_rows(["swav"], tmp_path, 4, 5, "pebble")["swav"]["acc30"] >= 75
 
 
 def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     with pytest.raises(InputError, match="posecontrast"):
-        evaluate(small_folder(), BACKBONE, ["posecontrast"], 1, 2, out=tmp_path / "run")
+        run_rows(["posecontrast"], tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -154,5 +132,3 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features():
     with torch.no_grad():
         vit.cls_token += 1
     assert of() != plain
-    facet = extractors.random_backbone(Backbone(vit, "same name", device="cpu", facet="value", image_size=64))
-    assert (facet.facet, facet.image_size) == ("value", 64)

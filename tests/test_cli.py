@@ -69,6 +69,8 @@ def test_help_imports_no_large_library():
         (["demo", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
         (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
         (["benchmark", "--methods", ","], "expected names separated by commas"),
+        (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed', expected mean_category_median, acc30"),
+        (["tables", "x", "--metrics", ""], "got '', expected mean_category_median"),
         (["synth", "--preset", "demo"], "Missing option '--out'"),
         (["synth", "--out", "x"], "expected either --preset or --category"),
         (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
@@ -222,12 +224,20 @@ def assert_one_line(capsys) -> str:
     return captured.err
 
 
-def test_benchmark_list_has_every_method_and_group(capsys):
+def test_benchmark_list_has_every_method_and_group_in_100_columns(capsys):
     from zsp_lite.benchmark.methods import GROUPS, METHODS
 
     assert cli.main(["benchmark", "--list"]) == 0
-    lines = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.strip()}
-    assert lines == {*METHODS, *GROUPS, "Groups:"}
+    lines = capsys.readouterr().out.splitlines()
+    assert {*METHODS, *(f"{name}:" for name in GROUPS)} <= {line.split()[0] for line in lines if line.strip()}
+    assert max(map(len, lines)) <= 100
+
+
+def test_a_reader_that_ends_early_ends_the_output_without_an_error():
+    for command, reader in (("benchmark --list", "head -1"), ("weights list", "true"), ("--help", "true")):
+        pipe = f"{sys.executable} -u -m zsp_lite {command} | {reader}; exit ${{PIPESTATUS[0]}}"
+        done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, ""), command
 
 
 @pytest.mark.slow
@@ -238,9 +248,9 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, caps
     for name in "ab":
         assert cli.main([*rows, "--out", str(tmp_path / name), "--quiet"]) == 0
         assert capsys.readouterr().out == ""
-    assert cli.main(["tables", str(tmp_path / "a" / "results.json.gz"), "--out", str(tmp_path / "c")]) == 0
+    assert cli.main(["tables", str(tmp_path / "a" / "results.jsonl.gz"), "--out", str(tmp_path / "c")]) == 0
     assert "GlobalSim" in capsys.readouterr().out
-    tables = [(tmp_path / name / "tables" / "table_3.csv").read_bytes() for name in "abc"]
+    tables = [(tmp_path / name / "tables" / "table_3.md").read_bytes() for name in "abc"]
     assert tables[0] == tables[1] == tables[2]
     assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
@@ -253,25 +263,33 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
     class Reached(Exception):
         pass
 
-    given = {}
+    given = []
 
-    def record(*arguments, **options):
-        given.update(options, arguments=arguments)
+    def record(*arguments):
+        given.append(arguments)
         raise Reached
 
     monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
     words = "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair --pairs 7 --targets 3"
-    words = ["benchmark", "--data", str(tmp_path), *words.split(), "--methods", "ours,sift", "--seed", "4"]
-    words += ["--out", "there", "--allow-other-version"]
-    config = BackboneConfig("small", "3", "value", 64)
-    common = (tmp_path, config, ["ours", "sift"], 7, 3, 4, Path("there"), ["lump", "chair"])
-    words += "--workers 5 --executor dask://host:1 --threads 6 --keep-hypotheses".split()
-    with pytest.raises(Reached):
-        cli.main(words)
-    assert given.pop("arguments")[:-1] == common  # the last one draws the progress bar
-    assert given == {
-        "executor": "dask://host:1", "workers": 5, "threads": 6, "keep_hypotheses": True, "allow_other_version": True,
-    }  # fmt: skip
+    words = [
+        "benchmark",
+        "--data",
+        str(tmp_path),
+        *words.split(),
+        "--methods",
+        "ours,x=a:b",
+        "--out",
+        "there",
+        "--quiet",
+    ]
+    config, numbers = BackboneConfig("small", "3", "value", 64), {"lump": 7, "chair": 7}
+    common = (tmp_path, config, ["ours", "x=a:b"], numbers, 3, Path("there"))
+    for more, last in ((["--workers", "5"], (5, False)), (["--executor", "dask://h:1"], ("dask://h:1", False)),
+                       (["--allow-other-version"], (1, True))):  # fmt: skip
+        with pytest.raises(Reached):
+            cli.main([*words, *more])
+        assert given == [common + last]
+        given.clear()
 
 
 def test_every_option_of_the_tables_reaches_the_library(monkeypatch, tmp_path):
@@ -281,18 +299,18 @@ def test_every_option_of_the_tables_reaches_the_library(monkeypatch, tmp_path):
     def recorded(name, found):
         return lambda *arguments: calls.append((name, *arguments)) or found
 
-    monkeypatch.setattr("zsp_lite.benchmark.results.read_runs", recorded("read", run))
-    monkeypatch.setattr("zsp_lite.benchmark.reports.write_reports", recorded("write", run))
-    monkeypatch.setattr("zsp_lite.benchmark.tables.every_table", lambda summary: ["every table"])
-    monkeypatch.setattr("zsp_lite.benchmark.formats.update_document", recorded("update", None))
-    monkeypatch.setattr("zsp_lite.cli.benchmark._print_summary", lambda summary, with_paper: calls.append(summary))
-    a, b, there = tmp_path / "a", tmp_path / "b", tmp_path / "there"
+    monkeypatch.setattr("zsp_lite.benchmark.runs.read_runs", recorded("read", run))
+    monkeypatch.setattr("zsp_lite.benchmark.compare.write_reports", recorded("write", run))
+    monkeypatch.setattr("zsp_lite.benchmark.tables.every_table", lambda summary, metrics: metrics)
+    monkeypatch.setattr("zsp_lite.benchmark.tables.update_document", recorded("update", None))
+    monkeypatch.setattr("zsp_lite.cli.benchmark._print_summary", lambda *arguments, with_paper: calls.append(arguments))
+    a, b, there, shown = tmp_path / "a", tmp_path / "b", tmp_path / "there", ["scale", "acc30"]
     for words, expected in (
-        ([a, b, "--into", there], [("read", (a, b)), ("update", there, ["every table"], 5)]),
-        ([a, b], [("read", (a, b)), run.summary]),
-        ([a, b, "--out", there], [("write", (a, b), there), run.summary]),
-        ([a], [("write", (a,), None), run.summary]),
+        ([a, b, "--into", there], [("read", (a, b)), ("update", there, shown, 5)]),
+        ([a, b], [("read", (a, b)), (run.summary, shown)]),
+        ([a, b, "--out", there], [("write", (a, b), there, shown), (run.summary, shown)]),
+        ([a], [("write", (a,), None, shown), (run.summary, shown)]),
     ):
         calls.clear()
-        assert cli.main(["tables", *map(str, words)]) == 0 and calls == expected
+        assert cli.main(["tables", *map(str, words), "--metrics", "scale,acc30"]) == 0 and calls == expected
     assert cli.main(["tables", str(a), "--into", str(there), "--out", str(there)]) == 2

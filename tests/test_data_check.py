@@ -55,7 +55,7 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
     assert len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
 
 
-def test_black_and_empty_frames_are_counted_by_a_deep_check(root):
+def test_black_and_empty_frames_are_counted_by_a_deep_check(root, capsys):
     for part, count in (("images", 3), ("masks", 2)):
         for path in sorted((root / "chair" / "a" / part).iterdir())[-count:]:
             cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
@@ -63,6 +63,22 @@ def test_black_and_empty_frames_are_counted_by_a_deep_check(root):
     (check,) = check_folder(root, deep=True)
     assert check.defects == {"black image": 3} and not check.problems and check.usable == 1
     assert main(["data", "check", str(root), "--deep"]) == 0
+    text = capsys.readouterr().out
+    assert "0 sequences without a point cloud; 3 black frames." in text
+    assert main(["data", "check", str(root)]) == 0
+    assert "3 black frames" not in capsys.readouterr().out
+
+
+def test_sequences_without_a_point_cloud_are_counted(root, capsys):
+    """A cloud that the annotations lack is no problem, a file that is missing is one."""
+    edit_json(root / "chair" / "sequence_annotations.jgz", lambda found: found[0].update(point_cloud=None))
+    write_co3d(root, "stool", [sequence_data("c")])
+    check, stool = check_folder(root)
+    assert (check.cloudless, check.problems, check.complete, stool.cloudless) == (1, [], 2, 0)
+    (root / "chair" / "b" / "pointcloud.ply").unlink()
+    assert main(["data", "check", str(root)]) == 1
+    text = capsys.readouterr().out
+    assert "2 sequences without a point cloud; " in text and "chair: 2 of 2 sequences have no point cloud" in text
 
 
 def test_an_invalid_camera_is_named(root):

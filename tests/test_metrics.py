@@ -17,7 +17,7 @@ from zsp_lite.benchmark.statistics import (
     summarise,
 )
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import accuracy, median, rotation_error, translation_error
+from zsp_lite.metrics import accuracy, median, rotation_error
 
 
 def about(axis, degrees: float) -> np.ndarray:
@@ -64,7 +64,6 @@ def test_batches_broadcast_and_tensors_are_taken():
     np.testing.assert_allclose(rotation_error(np.eye(3), batch), [0, 10, 90], atol=1e-12)
     np.testing.assert_allclose(rotation_error(torch.as_tensor(batch), torch.eye(3)), [0, 10, 90], atol=1e-6)
     assert rotation_error(batch[:, None], batch[None]).shape == (3, 3)
-    assert translation_error([[0, 0, 0], [1, 0, 0]], [3, 0, 4]) == pytest.approx([5, np.sqrt(20)])
 
 
 @pytest.mark.parametrize("bad", [np.eye(4), np.zeros(3), np.full((3, 3), np.nan)])
@@ -106,8 +105,10 @@ def test_equal_errors_have_no_spread():
     summary = summarise([20.0] * 5)
     assert summary == {
         "n": 5, "median": 20, "acc30": 100, "acc15": 0,
-        "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0,
+        "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0, "auc30": 100 * (1 - 20 / 30),
     }  # fmt: skip
+    # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30 counts nowhere.
+    assert summarise([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)
     assert summarise([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
 
 

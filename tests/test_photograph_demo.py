@@ -13,11 +13,9 @@ from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.photograph import (
-    PHOTOGRAPH_COLUMNS,
     PHOTOGRAPH_CREDIT,
     photograph_by_backbone,
     photograph_figure,
-    photograph_rows,
     run_photograph,
 )
 from zsp_lite.viz.report import render_page
@@ -57,14 +55,6 @@ def results(motorcycles, photograph):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
         return list(run_photograph(motorcycles, CoordinateBackbone()))
-
-
-def test_each_foreground_and_solver_gives_a_result_with_the_first_sequence(results):
-    assert [(result.foreground, result.solver) for result in results] == [
-        ("mask", "paper"), ("mask", "verified"), ("saliency", "paper"), ("saliency", "verified"),
-    ]  # fmt: skip
-    assert {result.sequence for result in results} == {"first"}
-    assert [result.estimate.confidence is None for result in results] == [True, False, True, False]
 
 
 def test_with_perfect_features_the_directions_are_those_of_the_object(results, photograph):
@@ -127,12 +117,6 @@ def test_the_figure_has_a_panel_per_result_beside_the_object_and_the_directions_
         assert result.solver in title and f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off" in title
     arrows = [[text.get_text() for text in axis.texts if text.get_text()] for axis in figure.axes]
     assert arrows == [[], *[["front", "left", "up"]] * 5]
-
-
-def test_the_table_has_a_row_per_result(results):
-    rows = photograph_rows(results)
-    assert len(rows) == 4 and all(len(row) == len(PHOTOGRAPH_COLUMNS) for row in rows)
-    assert [row[-1] == "–" for row in rows] == [True, False, True, False]
 
 
 def test_the_page_begins_with_the_photograph_and_credits_it(results):

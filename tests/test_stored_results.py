@@ -3,27 +3,24 @@
 import re
 from dataclasses import asdict
 
-import numpy as np
 import pytest
 
 from tools.models import read_catalogue
-from zsp_lite.benchmark.formats import insert_tables
-from zsp_lite.benchmark.results import read_results
-from zsp_lite.benchmark.tables import every_table
+from zsp_lite.benchmark.runs import read_run
+from zsp_lite.benchmark.tables import every_table, update_document
 from zsp_lite.samples import REPOSITORY
-from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import ScoreCoefficients
 from zsp_lite.viz.reliability import reliability
 
 RUNS = {
-    name: REPOSITORY / "notebooks" / "results" / "paper_run" / f"{name}.json.gz" for name in ("procedural", "artists")
+    name: REPOSITORY / "notebooks" / "results" / "paper_run" / f"{name}.jsonl.gz" for name in ("procedural", "artists")
 }
 README_ROWS = ("ours", "ours-bv", "rootsift", "oracle-view", "verified")
 
 
 @pytest.fixture(scope="module")
 def runs():
-    return {name: read_results(path) for name, path in RUNS.items()}
+    return {name: read_run(path) for name, path in RUNS.items()}
 
 
 def page(name: str) -> str:
@@ -50,7 +47,7 @@ def test_the_table_of_artist_made_models_has_the_figures(runs):
     methods = runs["artists"].summary["methods"]
     lines = rows(page("docs/results.md"), "| row | median error")
     names = [re.match(r"\| `([\w-]+)`", line)[1] for line in lines]
-    assert len(names) == 10
+    assert len(names) == 7
     for name, line in zip(names, lines):
         one = methods[name]
         figures = ("median", "acc30", "acc15")
@@ -58,10 +55,11 @@ def test_the_table_of_artist_made_models_has_the_figures(runs):
         assert numbers(line.split("|", 2)[2]) == pytest.approx([*expected, one["above150"]], abs=0.051), name
 
 
-def test_the_marked_tables_are_those_of_the_procedural_run(runs):
-    text = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
-    summary = runs["procedural"].summary
-    assert insert_tables(text, every_table(summary), max(row["n"] for row in summary["methods"].values())) == text
+def test_the_marked_tables_are_those_of_the_procedural_run(runs, tmp_path):
+    text, summary = (REPOSITORY / "docs" / "results.md").read_bytes(), runs["procedural"].summary
+    (tmp_path / "copy.md").write_bytes(text)
+    update_document(tmp_path / "copy.md", every_table(summary), max(row["n"] for row in summary["methods"].values()))
+    assert (tmp_path / "copy.md").read_bytes() == text
 
 
 def test_the_artists_run_has_30_pairs_of_each_category_of_the_catalogue(runs):
@@ -72,8 +70,8 @@ def test_the_artists_run_has_30_pairs_of_each_category_of_the_catalogue(runs):
 
 def test_the_page_on_solvers_has_the_confidences(runs):
     for line, run in zip(rows(page("docs/solvers.md"), "| objects | mean confidence"), runs.values(), strict=True):
-        confidence = np.array(list(run.confidences("verified").values()))
-        right = np.array(list(run.errors("verified").values())) < 30
+        row = run.row("verified")
+        confidence, right = row["confidence"].to_numpy(), row["error"].to_numpy() < 30
         measured = reliability(confidence, right)
         expected = [100 * confidence.mean(), 100 * right.mean(), 100 * measured.calibration_error]
         assert numbers(line)[:3] == pytest.approx(expected, abs=0.051)
@@ -81,14 +79,10 @@ def test_the_page_on_solvers_has_the_confidences(runs):
         assert numbers(line)[4] == pytest.approx(run.summary["methods"]["verified"]["best_two"]["acc30"], abs=0.051)
 
 
-def test_the_page_on_solvers_has_the_weights_and_the_calibration_of_the_code():
+def test_the_page_on_solvers_has_the_weights_of_the_code():
     text, weights = page("docs/solvers.md"), asdict(ScoreCoefficients())
     stated = {}
     for line in rows(text, "| term |"):
         term, forward, reverse = re.match(r"\| `(\w+)` \|[^|]*\| (\S+) \| (\S*) ?\|", line).groups()
         stated |= {term: forward} if not reverse else {f"forward_{term}": forward, f"reverse_{term}": reverse}
     assert {name: float(value) for name, value in stated.items()} == weights
-    stated = [numbers(line)[-2:] for line in rows(text, "| evidence |")]
-    calibration = Calibration()
-    assert [tuple(column) for column in zip(*stated)] == [calibration.scale, calibration.none]
-    assert f"λ = {calibration.unseen} is its chance" in text

@@ -17,6 +17,7 @@ from zsp_lite.synthetic.assembly import make_shape, surface_spread
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.export import PRESETS, export_categories, make_sequence
 from zsp_lite.synthetic.materials import random_materials
+from zsp_lite.synthetic.recording import shape_turns
 from zsp_lite.synthetic.sensor import soft_mask
 from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep
 
@@ -222,3 +223,10 @@ def test_bad_arguments_and_folders_with_other_settings_are_input_errors(folder, 
     (tmp_path / "synthetic.json").write_text('{"seed": ')
     with pytest.raises(InputError, match="synthetic.json"):
         export_categories(["chair"], tmp_path, 1, 2, SEED, 48)
+
+
+def test_turns_after_which_a_shape_is_the_same_are_known():
+    square = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 1)], float)
+    assert shape_turns(square) == (90, 180, 270)
+    assert shape_turns(square * (2, 1, 1)) == (180,)
+    assert shape_turns(np.vstack([square, [[3, 1, 0]]])) == ()

@@ -170,11 +170,6 @@ def test_cameras_on_a_circle_are_on_a_circle_from_above():
     assert np.isclose((from_first + 180) % 360 - 180, 20)
 
 
-def test_views_are_evenly_spaced_on_a_ring():
-    assert views.evenly_spaced(24, 5, 0).tolist() == [0, 4, 9, 14, 19]
-    assert views.evenly_spaced(6, 3, 5).tolist() == [5, 1, 3]
-
-
 def test_lines_end_in_the_second_image_and_outliers_have_their_own_lines():
     canvas = views.MatchCanvas(plt.figure().add_subplot(), *np.zeros((2, 10, 20, 3)), ("a", "b"))
     canvas.draw(np.array([[1, 2], [3, 4]]), np.array([[5, 6], [7, 8]]), np.array([True, False]))

@@ -25,14 +25,12 @@ def commands(group: click.Group, name: str = "zsp-lite") -> Iterator[tuple[str, 
 
 
 def page() -> str:
-    """Return the page: of each command the arguments, the first paragraph of its help, and the names of its options."""
+    """Return the page: of each command the arguments and the first paragraph of its help."""
     text = HEAD
     for name, command in commands(cli):
         usage = " ".join([name, *command.collect_usage_pieces(click.Context(command, info_name=name))[1:]])
-        options = ", ".join(f"`{one.opts[-1]}`" for one in command.params if isinstance(one, click.Option))
         summary = " ".join(command.help.partition("\n\n")[0].split())
         text += f"\n## {usage}\n\n{summary}\n"
-        text += f"\nOptions: {options}.\n" if options else ""
     return text
 
 

@@ -4,3 +4,16 @@
 SOLVERS = {"paper": ("paper",), "verified": ("verified",), "both": ("paper", "verified")}
 # Where object masks come from: with the frames, GrabCut from a box, or depth.
 MASKS = ("given", "box", "auto")
+# Figures of a benchmark row by their names in a summary, with their titles.
+METRICS = {
+    "mean_category_median": "Med. err. (°)",
+    "acc30": "Acc30 (%)",
+    "acc15": "Acc15 (%)",
+    "auc30": "AUC@30 (%)",
+    "above150": "above 150° (%)",
+    "median": "pooled med. err. (°)",
+    "symmetric_acc30": "Acc30 up to symmetries (%)",
+    "translation": "transl. err. (diameters)",
+    "scale": "scale ratio",
+}
+METRICS_SHOWN = ("mean_category_median", "acc30", "acc15", "auc30")  # by default: the paper's, and one more

@@ -45,11 +45,6 @@ def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray,
     return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
-def translation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
-    """Compute the Euclidean distance between translations (..., 3), in their unit."""
-    return np.linalg.norm(np.asarray(first, np.float64) - np.asarray(second, np.float64), axis=-1)[()]
-
-
 def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = None) -> np.ndarray | float:
     """Compute the percentage of errors strictly below the threshold; Acc30 is threshold=30.
 

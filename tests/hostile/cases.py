@@ -29,6 +29,7 @@ from tests.hostile.harness import (
     written,
 )
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.benchmark.own import read_poses
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import read_labels
@@ -48,7 +49,7 @@ def _capture(layout):
 
 
 FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
-PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/results.json.gz"
+PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/results.jsonl.gz"
 # Every reader, with the file that it reads.
 READERS_OF = {
     "image": ("x.png", lambda folder: read_image(folder / "x.png")),
@@ -67,6 +68,7 @@ READERS_OF = {
     "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
     "lists": ("capture/rgb.txt", _capture("lists")),
     "nerfstudio": ("capture/transforms.json", _capture("nerfstudio")),
+    "poses": ("poses.csv", lambda folder: read_poses(folder / "poses.csv")),
 }
 COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
@@ -173,9 +175,9 @@ for path in ("../../../etc/passwd", "/etc/passwd", "cup/a\0.jpg", "x/" * 50_000,
     case("malicious", f"image path {path[:30]!r}", _frames, edited(
         FRAMES, lambda content, path=path: [entry["image"].update(path=path) for entry in content]))  # fmt: skip
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
-for option, value in (("--executor", "json:loads"), ("--executor", "dask://\0"), ("--executor", "raises:now"),
-                      ("--methods", "os:_exit"), ("--methods", "raises:now"), ("--categories", "../.."),
-                      ("--backbone", "\0")):  # fmt: skip
+for option, value in (("--executor", "json:loads"), ("--executor", "dask://\0"), ("--metrics", "acc30,\0"),
+                      ("--methods", "os:_exit"), ("--methods", "raises:now"), ("--methods", "a=/dev/zero/x.csv"),
+                      ("--categories", "../.."), ("--backbone", "\0"), ("--list-pairs", "/dev/null/x")):  # fmt: skip
     command("malicious", f"benchmark {option} {value!r}", *ON_DATA, option, value, change=lambda folder: (
         sys.path.insert(0, str(folder)), written("raises.py", "raise SystemExit(3)")(folder)))  # fmt: skip
 
@@ -216,18 +218,21 @@ for values in ({"fl_x": 1e-300}, {"w": 1e300}, {"w": 10**9, "h": 10**9}, {"w": m
                {"depth_unit_scale_factor": 1e300}, {"camera_model": "[/1]"}):  # fmt: skip
     case("damaged", f"nerfstudio: {values}", _capture("nerfstudio"),
          edited("capture/transforms.json", lambda content, values=values: content.update(values)))  # fmt: skip
+for values in ({"error": -5.0}, {"error": "5"}, {"error": math.nan}, {"error": None}, {"second_error": 200.0},
+               {"one_of_two": "yes"}, {"confidence": 2.0}, {"symmetric_error": -1}):  # fmt: skip
+    command("damaged", f"results: {values}", "tables", f"ROOT/{RESULTS}", change=edited(RESULTS, lambda lines, v=values: [
+        line["results"]["icp"].update(v) for line in lines if "pair" in line]))  # fmt: skip
 for name, change in {
-    "error of -5": lambda content: content["rows"]["icp"]["error"].__setitem__(0, -5.0),
-    "error a text": lambda content: content["rows"]["icp"]["error"].__setitem__(0, "5"),
-    "error not a number": lambda content: content["rows"]["icp"]["error"].__setitem__(0, math.nan),
-    "no rows": lambda content: content.update(rows={}), "pair 99": lambda content: content["rows"]["icp"].update(pair=[99, 1]),
+    "no rows": lambda lines: [line["call"].update(rows=[]) for line in lines if "call" in line],
+    "no pair": lambda lines: [line.update(pair="cup") for line in lines if "pair" in line],
+    "no settings": lambda lines: lines.pop(0), "no library": lambda lines: lines[0].update(library=[]),
 }.items():  # fmt: skip
     command("damaged", f"results: {name}", "tables", f"ROOT/{RESULTS}", change=edited(RESULTS, change))
 
 # options of every command
 for argv in (
     (*ON_DATA, "--pairs", "100000000"), (*ON_DATA, "--targets", "1000000000"), (*ON_DATA, "--workers", "100000000000"),
-    (*ON_DATA, "--seed", "-1"), (*ON_DATA, "--layer", "block999999999"), (*ON_DATA, "--image-size", "1000000"),
+    (*ON_DATA, "--layer", "block999999999"), (*ON_DATA, "--image-size", "1000000"),
     (*BENCHMARK, "--data", "a\0b"), (*BENCHMARK, "--data", "ROOT/data", "--out", "/dev/null/x"), ("benchmark", "--pairs", "٣x"),
     ("synth", "--category", "chair", "--sequences", "1000000000", "--out", "ROOT/new"), ("synth", "--preset", "\0", "--out", "ROOT/new"),
     ("synth", "--models", "ROOT/nothing", "--out", "ROOT/new"), ("demo", "--data", "\udcff"), ("demo", "--data", "ROOT/data", "--out", "a\0b"),

@@ -117,14 +117,15 @@ NERFSTUDIO = {
 
 
 def edited(name: str, change: Callable[[object], object]) -> Callable[[Path], object]:
-    """Return a function that changes a JSON file of the folder, gzipped or not."""
+    """Return a function that changes a JSON file of the folder, gzipped or not, or the lines of one as a list."""
 
     def write(folder: Path):
         path = folder / name
         zipped = path.suffix in (".jgz", ".gz")
-        content = json.loads(gzip.decompress(path.read_bytes()) if zipped else path.read_bytes())
+        text, lines = gzip.decompress(path.read_bytes()) if zipped else path.read_bytes(), ".jsonl" in name
+        content = [json.loads(line) for line in text.splitlines()] if lines else json.loads(text)
         change(content)
-        data = json.dumps(content).encode()
+        data = "\n".join(map(json.dumps, content if lines else [content])).encode()
         path.write_bytes(gzip.compress(data) if zipped else data)
 
     return write

@@ -4,13 +4,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.posecontrast import Viewpoint
-from zsp_lite.baselines.sift import Keypoints, mutual_matches, unproject_pixels
+from zsp_lite.baselines.sift import Keypoints, mutual_matches
+from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 
 _K = 50  # number of matches, as in "Ours"
@@ -27,7 +26,7 @@ def icp_best_view(problem: Problem) -> Answer:
 
 
 def _icp(problem: Problem, view: int) -> Answer:
-    reference, *targets = _frames_with_depth(problem)
+    reference, *targets = problem.frames_with_depth()
     try:
         sim3 = align(reference, targets, view, problem.first_cameras(), problem.seed)
     except InputError as error:
@@ -37,28 +36,12 @@ def _icp(problem: Problem, view: int) -> Answer:
 
 def sift(problem: Problem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
-    reference, *targets = _frames_with_depth(problem)
     first: Keypoints
     first, *others = problem.descriptions("sift")
     found = [mutual_matches(first, other, _K) for other in others]
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
-    details = {"matches": len(one), "inliers": 0}
-    try:
-        source = unproject_pixels(reference, first.pixels[one])
-        target = unproject_pixels(targets[view], others[view].pixels[two])
-        sim3, inliers = ransac(source, target, seed=problem.seed, scale_range=SCALE_RANGE)
-    except InputError as error:
-        return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
-    return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})
-
-
-def _frames_with_depth(problem: Problem) -> list[Frame]:
-    """The crops of a problem; InputError, which fails the pair, if one has no depth map."""
-    frames = problem.frames()
-    if missing := [frame.name for frame in frames if frame.depth is None]:
-        raise InputError(f"no depth map: {', '.join(missing)}")
-    return frames
+    return fit_keypoints(problem, view, first.pixels[one], others[view].pixels[two])
 
 
 def posecontrast(problem: Problem) -> Answer:

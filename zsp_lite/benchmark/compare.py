@@ -1,31 +1,19 @@
-"""Comparison of two runs, or of two rows, on the same pairs, with intervals and significance tests."""
+"""Comparison of two runs, or of two rows, on the same pairs, and the reports of a run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from zsp_lite.benchmark.results import Results
-from zsp_lite.benchmark.statistics import paired_test
-from zsp_lite.benchmark.summary import draws_of_pairs
-from zsp_lite.benchmark.tables import Cell, PValue, Table, make_table
+from zsp_lite.benchmark.runs import Run, export_run, read_runs
+from zsp_lite.benchmark.statistics import paired_difference
+from zsp_lite.benchmark.summary import draws_of
+from zsp_lite.benchmark.tables import Cell, Table, every_table, make_table, write_tables
+from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Difference between row `first` of run A and row `second` of run B on their `n` common pairs."""
-
-    first: str
-    second: str
-    n: int
-    acc30: tuple[float, float]  # Acc30 of A and of B in percent
-    median: tuple[float, float]  # median error of A and of B in degrees
-    test: dict  # result of `benchmark.statistics.paired_test`, with bootstrap intervals and p values over objects
-
-
-def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | None = None) -> list[Difference]:
+def compare(first: Run, second: Run, rows: Sequence[tuple[str, str]] | None = None) -> dict[str, dict[str, Any]]:
     """Compare rows of two runs on the pairs that both have evaluated.
 
     Args:
@@ -33,53 +21,70 @@ def compare(first: Results, second: Results, rows: Sequence[tuple[str, str]] | N
         second: Run B.
         rows: (row of A, row of B); by default every row that both runs have, with itself.
 
+    Returns:
+        By "A:B", the number of pairs "n", "acc30" and "median" of A and of B, and `statistics.paired_difference`: B
+        minus A in Acc30, and by how much the mean error drops.
+
     Raises:
         InputError: If there is no common row or pair.
     """
-    found = []
-    for one, other in [(name, name) for name in first.rows if name in second.rows] if rows is None else rows:
-        a, b = first.errors(one), second.errors(other)
-        keys = sorted(key for key in a if key in b)
-        if not keys:
-            raise InputError(f"rows {one} and {other} have no pair in common: other data, seed or number of views")
-        errors = np.array([[run[key] for key in keys] for run in (a, b)])
-        test = paired_test(*errors, weights=draws_of_pairs(keys))
-        found.append(Difference(one, other, len(keys), tuple(accuracy(errors, 30)), tuple(median(errors)), test))
+    found = {}
+    known = [run.table["row"].unique() for run in (first, second)]
+    for one, other in [(name, name) for name in known[0] if name in known[1]] if rows is None else rows:
+        both = first.row(one).join(second.row(other)["error"].rename("other"), how="inner").sort_index()
+        if both.empty:
+            raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
+        errors = both[["error", "other"]].to_numpy().T
+        found[one if one == other else f"{one}:{other}"] = {
+            "n": len(both), "acc30": accuracy(errors, 30).tolist(), "median": median(errors).tolist(),
+            **paired_difference(*errors, weights=draws_of(both)),
+        }  # fmt: skip
     if not found:
-        raise InputError(f"runs have no row in common: {', '.join(first.rows)} and {', '.join(second.rows)}")
+        raise InputError(f"runs have no row in common: {', '.join(known[0])} and {', '.join(known[1])}")
     return found
 
 
-def split_rows(text: str, first: Results, second: Results) -> tuple[str, str]:
+def split_rows(text: str, first: Run, second: Run) -> tuple[str, str]:
     """Split "A:B" into a row of each run; "A" stands for the row A of both. Names of rows may hold colons."""
+    of_first, of_second = ([*run.table["row"].unique()] for run in (first, second))
     colons = [i for i, sign in enumerate(text) if sign == ":"]
     for one, other in ((text, text), *((text[:i], text[i + 1 :]) for i in colons)):
-        if one in first.rows and other in second.rows:
+        if one in of_first and other in of_second:
             return one, other
-    of_first, of_second = (", ".join(run.rows) for run in (first, second))
-    raise InputError(
-        f"rows {text!r}: not in the runs, expected A:B or A with A one of {of_first} and B one of {of_second}"
-    )
+    expected = f"A:B or A with A one of {', '.join(of_first)} and B one of {', '.join(of_second)}"
+    raise InputError(f"rows {text!r}: not in the runs, expected {expected}")
 
 
-def comparison_table(differences: Sequence[Difference], first: str, second: str) -> Table:
+def comparison_table(differences: dict[str, dict[str, Any]], first: str, second: str) -> Table:
     """Tabulate differences; `first` and `second` name the runs."""
-    groups = {"Acc30 (%)": ("B - A", "sign test"), "error (°)": ("mean of A - B", "permutation test")}
-    columns = [("", "pairs")]
-    for group, (gain, test) in groups.items():
-        columns += [(group, title) for title in ("A", "B", gain, "p", f"p, {test}")]
+    groups = "Acc30 (%)", "error (°)"
+    columns = [("", "pairs"), *((groups[0], title) for title in ("A", "B", "B − A", "p"))]
+    columns += [(groups[1], title) for title in ("median of A", "median of B", "mean of A − B", "p")]
     rows = {}
-    for one in differences:
-        cells: list[Cell] = [Cell(one.n, decimals=0)]
-        parts = (one.acc30, "accuracy_gain", "sign_test_p"), (one.median, "error_drop", "permutation_test_p")
-        for figures, gain, test in parts:
-            cells += [*map(Cell, figures), Cell(one.test[gain], *one.test[f"{gain}_ci"])]
-            cells += [PValue(one.test[f"{gain}_p"]), PValue(one.test[test])]
-        rows[one.first if one.first == one.second else f"{one.first}:{one.second}"] = cells
+    for name, one in differences.items():
+        cells = [Cell(one["n"], decimals=0)]
+        for figures, gain in (("acc30", "accuracy_gain"), ("median", "error_drop")):
+            cells += [*map(Cell, one[figures]), Cell(one[gain], *one[f"{gain}_ci"]), Cell(one[f"{gain}_p"], decimals=3)]
+        rows[name] = cells
     note = (
-        "On the common pairs; errors of A and B are medians. Intervals (95 %) and p: bootstrap over objects. The sign "
-        "test (pairs that only one of the two solves) and the permutation test (mean difference) treat pairs as "
-        "independent; pairs share objects, so their p values are too small. Of twenty rows without a difference, one "
+        "On the common pairs. Intervals (95 %) and p: bootstrap over objects. Of twenty rows without a difference, one "
         "has p < 0.05 by chance."
     )
-    return make_table("compare", f"A = {first}, B = {second}", columns, rows, note)
+    return make_table("compare", f"A = {first}, B = {second}", columns, rows, note, columns[1:4])
+
+
+def write_reports(
+    runs: str | Path | Sequence[str | Path], out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN
+) -> Run:
+    """Write tables and figures of a run, or of several that are pooled, by default to its folder, and its export."""
+    # Imported here, because matplotlib takes a second to import.
+    from zsp_lite.benchmark.figures import write_figures
+
+    paths = [Path(runs)] if isinstance(runs, str | Path) else list(map(Path, runs))
+    run, folder = read_runs(paths), paths[0] if paths[0].is_dir() else paths[0].parent
+    if len(paths) == 1 and paths[0].is_dir():
+        export_run(paths[0])
+    out = folder if out is None else Path(out)
+    write_tables(every_table(run.summary, metrics), out / "tables")
+    write_figures(run, out / "figures")
+    return run

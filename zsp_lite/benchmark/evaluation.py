@@ -7,17 +7,20 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.benchmark.methods import Method, describe_failure
+from zsp_lite.benchmark.methods import Method
+from zsp_lite.benchmark.own import describe_failure
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.best_view import mask_iou
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.labels import PoseLabel, relative_pose
 from zsp_lite.errors import FatalError, InputError
-from zsp_lite.metrics import rotation_error, translation_error
+from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
+from zsp_lite.synthetic.recording import read_poses
 from zsp_lite.views import has_saliency, patch_mask
 
 # Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
@@ -26,23 +29,21 @@ Poses = Float[np.ndarray, "n 4 4"]
 
 
 def evaluate_pair(
-    pair: Pair,
-    methods: Mapping[str, Method],
-    store: FrameStore,
-    labels: Mapping[str, PoseLabel],
-    keep_hypotheses: bool = False,
+    pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
 ) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results.
 
-    Its "results" are by row {"error": degrees, and where the row has them "translation_error", "scale", "view", "note",
-    "timings", "hypotheses" and its details, and of solvers with hypotheses "one_of_two" and the error of the second
-    pose, "second_error"}, or {"error": 180, "failed": the reason} for a row that raises InputError.
+    Its "results" are by row {"error": degrees, and where they are known "symmetric_error" (up to turns after which both
+    objects look the same), "translation" (error of the object's centre in diameters of the target),
+    "scale" (estimated over labelled, which is 1), "view", "note", "timings" and the row's details, and of solvers with
+    hypotheses "one_of_two" and the error of the second pose, "second_error"}, or {"error": 180, "failed": the reason}
+    for a row that raises InputError.
     """
     start = time.perf_counter()
     store.timings.clear()
     problem = Problem(pair, store)
-    truths = _true_poses(problem, labels)
-    results = {name: _evaluate(method, problem, truths, keep_hypotheses) for name, method in methods.items()}
+    truths, turns = _true_poses(problem, labels), _symmetries(problem)
+    results = {name: _evaluate(method, problem, truths, turns) for name, method in methods.items()}
     saliency_iou = _saliency_iou(problem, store)
     seconds, timings = round(time.perf_counter() - start, 5), dict(store.timings)
     cost = {"seconds": seconds, "timings": timings, "saliency_iou": saliency_iou}
@@ -56,7 +57,19 @@ def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Poses:
     return np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
 
 
-def _evaluate(method: Method, problem: Problem, truths: Poses, keep_hypotheses: bool) -> dict[str, Any]:
+def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
+    """Turns in the world of the target after which both objects look the same; None where no renderer knows them."""
+    pair, poses = problem.pair, read_poses(problem.store.dataset.root, problem.pair.category)
+    if not {pair.reference_sequence, pair.target_sequence} <= poses.keys():
+        return None
+    first, second = poses[pair.reference_sequence], poses[pair.target_sequence]
+    turns = [Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in first.turns if turn in second.turns]
+    return np.stack([np.eye(3), *(second.R @ turn @ second.R.T for turn in turns)])
+
+
+def _evaluate(
+    method: Method, problem: Problem, truths: Poses, symmetries: Float[np.ndarray, "s 3 3"] | None
+) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         answer = _solve(method, problem) if method.solve else _answer(method, problem, truths)
@@ -72,20 +85,22 @@ def _evaluate(method: Method, problem: Problem, truths: Poses, keep_hypotheses: 
 
     details = {"timings": {"total": time.perf_counter() - start}} | dict(answer.details)
     result = {"error": error_of(answer.rotation, answer.view), "view": int(answer.view)}
-    if answer.translation is not None:
-        result["translation_error"] = float(translation_error(answer.translation, truths[answer.view, :3, 3]))
+    reference, target = problem.frames()[0].camera, problem.frames()[1 + answer.view].camera
+    if symmetries is not None:
+        turned = target.R @ symmetries @ target.R.T @ truths[answer.view, :3, :3]
+        result["symmetric_error"] = float(np.min(rotation_error(answer.rotation, turned)))
+    ends = problem.store.extent(problem.pair.reference_sequence), problem.store.extent(problem.pair.target_sequence)
+    if answer.translation is not None and None not in ends:
+        centre = reference.to_camera(ends[0][0])
+        found = (1.0 if answer.scale is None else answer.scale) * answer.rotation @ centre + answer.translation
+        true = truths[answer.view, :3, :3] @ centre + truths[answer.view, :3, 3]
+        result["translation"] = float(np.linalg.norm(found - true) / ends[1][1])
     if answer.scale is not None:
         result["scale"] = float(answer.scale)
     if answer.hypotheses:
         result["one_of_two"] = answer.one_of_two
         different = [one for index, one in enumerate(answer.hypotheses) if one.mode == index]
         result |= {"second_error": error_of(one.sim3.R, one.view) for one in different[1:2]}
-    if keep_hypotheses and answer.hypotheses:
-        result["hypotheses"] = [
-            {"error": error_of(one.sim3.R, one.view), "view": one.view, "scale": one.sim3.scale}
-            | {"score": one.score, "confidence": one.confidence, "terms": one.terms}
-            for one in answer.hypotheses
-        ]
     timings = {stage: round(seconds, 5) for stage, seconds in details.pop("timings").items()}
     return result | details | {"note": answer.note, "timings": timings}
 
@@ -95,7 +110,7 @@ def _solve(method: Method, problem: Problem) -> Answer:
     try:
         return as_answer(method.solve(problem))
     except Exception as error:
-        own = getattr(method.solve, "estimator", method.solve)
+        own = getattr(method.solve, "own", method.solve)
         module = getattr(own, "__module__", None) or type(own).__module__
         if isinstance(error, InputError) or module.startswith("zsp_lite."):
             raise

@@ -8,12 +8,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import groupby, islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
-from pathlib import Path
 from typing import Any
 
 import cloudpickle
@@ -21,11 +20,10 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import Method, describe_failure, import_object
+from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.store import FrameStore, torch_threads
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
@@ -45,9 +43,7 @@ class Setup:
     methods: Mapping[str, Method]
     backbone: Any  # what `load_backbone` takes, or an extractor
     fingerprint: str | None = None  # of the backbone that a worker must find under the name; None for any
-    cache: str | Path | None = None  # folder of feature maps
     threads: int | None = None  # of torch during feature extraction
-    keep_hypotheses: bool = False  # see `evaluate_pair`
 
     def extractors(self) -> dict[str, Any]:
         """Make the extractors of the rows. Raises InputError if the backbone's name stands for another one here."""
@@ -65,18 +61,17 @@ class Evaluator:
     def __init__(self, setup: Setup, extractors: Mapping[str, Any] | None = None):
         self.setup, self.extractors = setup, setup.extractors() if extractors is None else extractors
         self._dataset = Co3D(setup.root)
-        self._cache = None if setup.cache is None else FeatureCache(setup.cache, self.extractors)
         self._store: FrameStore | None = None
 
     def records(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Evaluate the pairs of a chunk (see `evaluate_pair`)."""
         category = chunk[0][0].category
         if self._store is None or self._store.category != category:
-            self._store = FrameStore(self._dataset, category, self.extractors, self._cache, self.setup.threads)
+            self._store = FrameStore(self._dataset, category, self.extractors, self.setup.threads)
             self._labels = read_labels(self.setup.root, category)
         for pair, names in chunk:
             methods = {name: self.setup.methods[name] for name in names}
-            yield evaluate_pair(pair, methods, self._store, self._labels, self.setup.keep_hypotheses)
+            yield evaluate_pair(pair, methods, self._store, self._labels)
 
 
 def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
@@ -112,34 +107,24 @@ class Workers:
 
 
 @contextmanager
-def open_workers(executor: Executor | str | None, number: int = 1) -> Iterator[Workers]:
+def open_workers(executor: Executor | str | int = 1) -> Iterator[Workers]:
     """Open an executor, and close it after the block; an Executor stays open.
 
-    It is None for this process or, with number > 1, a process pool; "dask://HOST:PORT"; "module:Class" of an executor
-    that is called with the number of workers; or an Executor.
+    It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor.
     """
-    check_integer("workers", number, 1, MOST_WORKERS)
-    if executor is None and number == 1:
-        yield Workers(None, 1)
-    elif executor is None:
-        with _process_pool(number) as pool:
-            yield Workers(pool, number)
-    elif isinstance(executor, Executor):
-        yield Workers(executor, getattr(executor, "_max_workers", number))
-    elif executor.startswith("dask://"):
+    if isinstance(executor, Executor):
+        yield Workers(executor, getattr(executor, "_max_workers", 1))
+    elif isinstance(executor, str):
+        if not executor.startswith("dask://"):
+            raise InputError(
+                f"executor is {executor!r}, expected a number of processes, dask://HOST:PORT or an Executor"
+            )
         with _dask(executor.removeprefix("dask://")) as workers:
             yield workers
     else:
-        maker = import_object(executor) if ":" in executor else None
-        if not (isinstance(maker, type) and issubclass(maker, Executor)):
-            raise InputError(f"executor {executor!r}: expected dask://HOST:PORT or module:Class of an executor")
-        try:
-            own = maker(number)
-        except Exception as error:  # it is not of this library
-            told = f"executor {executor!r} cannot be made for {number} workers: {describe_failure(error)}"
-            raise InputError(told) from error
-        with own:
-            yield Workers(own, number)
+        check_integer("workers", executor, 1, MOST_WORKERS)
+        with _process_pool(executor) if executor > 1 else nullcontext() as pool:
+            yield Workers(pool, executor)
 
 
 def evaluate_chunks(

@@ -64,17 +64,20 @@ def fingerprint(extractor: Any) -> str:
 
 
 @functools.cache
-def library_version() -> dict[str, str]:
-    """Return {"version": of zsp_lite, "source": a hash of its Python files}."""
-    files = sorted(_PACKAGE.rglob("*.py"))
-    parts = (part for path in files for part in (path.relative_to(_PACKAGE).as_posix(), path.read_bytes()))
-    return {"version": __version__, "source": digest(*parts)}
+def library_version() -> dict[str, str | None]:
+    """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ; None if installed."""
+    git, commit = ["git", "-C", str(_PACKAGE)], None
+    with suppress(OSError, subprocess.SubprocessError):
+        # An installed copy may lie inside the repository of another project, whose commit says nothing.
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], check=True, capture_output=True)
+        describe = [*git, "describe", "--always", "--abbrev=40", "--dirty", "--exclude", "*"]
+        commit = subprocess.run(describe, check=True, capture_output=True, text=True).stdout.strip()
+    return {"version": __version__, "commit": commit}
 
 
 def environment() -> dict[str, Any]:
-    """Describe this call: time, command, versions of the library and its dependencies, git commit and machine."""
-    program = Path(sys.argv[0]).name
-    versions = {"python": platform.python_version(), "zsp-lite": __version__}
+    """Describe this call: time, command, versions of the library's dependencies, and machine."""
+    program, versions = Path(sys.argv[0]).name, {"python": platform.python_version()}
     for package in _DEPENDENCIES:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
@@ -82,16 +85,5 @@ def environment() -> dict[str, Any]:
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
         "versions": versions,
-        "git": {"commit": _git_commit()},
         "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
     }
-
-
-def _git_commit() -> str | None:
-    """The commit of the library's checkout; None for an installed copy."""
-    git = ["git", "-C", str(_PACKAGE)]
-    with suppress(OSError, subprocess.SubprocessError):
-        # An installed copy may lie inside the repository of another project, whose commit says nothing.
-        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], check=True, capture_output=True)
-        return subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
-    return None

@@ -4,17 +4,14 @@ A row is the paper's method with some settings changed, or a function (`solve`).
 results of such functions.
 """
 
-import importlib
-import operator
-import os
-import sys
-import traceback
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
+from zsp_lite.benchmark.own import Estimator, KeypointMatcher, import_object, kind_of, read_poses
 from zsp_lite.errors import InputError
 
 
@@ -32,20 +29,9 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-def describe_failure(error: BaseException) -> str:
-    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
-    *_, last = traceback.extract_tb(error.__traceback__)
-    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
-
-
 _MASK = {"foreground": "mask"}
 _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
 _VERIFIED = {"solver": "verified"}
-
-
-def _by_number_of_views(row: str, method: Method, *numbers: int) -> dict[str, Method]:
-    """Return a row at fixed numbers of target views: ROW-n1, ROW-n3 and so on."""
-    return {f"{row}-n{n}": replace(method, targets=n) for n in numbers}
 
 
 METHODS: dict[str, Method] = {
@@ -53,10 +39,8 @@ METHODS: dict[str, Method] = {
     "ours-bv": Method(answer="best view"),
     # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says so.
     "rootsift": Method("rootsift", settings=_MASK),
-    "rootsift-bv": Method("rootsift", "best view", _MASK),
     "ours-mask": Method(settings=_MASK),
     "oracle-view": Method(answer="true view"),
-    "random": Method("random"),
     # Supplement, "Number and diversity of correspondences"; K = 50 with k-means is "ours".
     "ours-k30": Method(settings={"k": 30}),
     "ours-k70": Method(settings={"k": 70}),
@@ -81,14 +65,9 @@ METHODS: dict[str, Method] = {
     "sift": Method("sift", solve=baseline_rows.sift),
     "swav": Method("swav", settings=_MUTUAL),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
-    # Table 2 and supplement, "Number of target views".
-    **_by_number_of_views("ours", Method(), 1, 3, 5, 10, 20),
-    **_by_number_of_views("ours-bv", Method(answer="best view"), 1, 3, 5, 10, 20),
     # Beyond the paper.
     "verified": Method(settings=_VERIFIED),
     "verified-mask": Method(settings=_VERIFIED | _MASK),
-    **_by_number_of_views("verified", Method(settings=_VERIFIED), 1, 3, 10),
-    **_by_number_of_views("verified-mask", Method(settings=_VERIFIED | _MASK), 1, 3, 10),
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -102,7 +81,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "trials": ("ours-trials500", "ours", "ours-trials2000"),
     "depth": ("ours-nodepth", "ours-bv", "ours"),
     "published": ("ours", "ours-published"),
-    "verified-views": tuple(f"verified{mask}{n}" for n in ("", "-n1", "-n3", "-n10") for mask in ("", "-mask")),
+    "verified-views": ("verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"),
 }
 
 
@@ -114,31 +93,56 @@ def _union(*names: str) -> tuple[str, ...]:
 # All ablations of the paper at one number of views, and all its tables. "swav" and "posecontrast" are in no group: they
 # need checkpoints that have to be downloaded.
 GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
-GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "rootsift-bv", "ours-mask")
+GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask")
 # The paper's tables and the rows beyond the paper.
 GROUPS["all"] = _union("paper", "verified-views", "oracle-view")
-_EXPECTED = (
-    f"one of {', '.join((*GROUPS, *METHODS))}, module:name, a Method, a function of a problem, or an object with "
-    "estimate(reference, targets)"
-)
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
     Args:
-        methods: Names in `METHODS` or `GROUPS`, or "module:name"; or a mapping from names for the tables to such names,
-            `Method`s, functions of a `Problem`, or objects with the method `estimate(reference, targets)`.
+        methods: Names of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
+            "poses.csv", or NAME=one of these; or a mapping from names to these, to `Method`s, or to objects of
+            one's own (see `own.kind_of`).
 
     Raises:
-        InputError: A name is unknown or cannot be imported, or an object is none of these.
+        InputError: A name is unknown, a thing cannot be imported or read, or is none of these.
     """
     if not isinstance(methods, Mapping):
-        names = [methods] if isinstance(methods, str) else methods
-        methods = {member: member for name in names for member in GROUPS.get(name, (name,))}
+        members = [
+            one for name in ([methods] if isinstance(methods, str) else methods) for one in GROUPS.get(name, [name])
+        ]
+        methods = {}
+        for member in members:
+            name, _, meant = member.partition("=")
+            methods[name] = meant or name
     if not methods:
-        raise InputError(f"no methods, expected {_EXPECTED}")
+        raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     return {str(name): _method(str(name), meant) for name, meant in methods.items()}
+
+
+def _method(name: str, meant: Any) -> Method:
+    """Return the row that a name, an object or a function means."""
+    if isinstance(meant, str):
+        row, views = re.fullmatch(r"(.*?)(?:-n([1-9][0-9]{0,3}))?", meant, re.DOTALL).groups()
+        if row in METHODS:
+            return replace(METHODS[row], targets=int(views)) if views else METHODS[row]
+        if meant.endswith(".csv"):
+            return Method("none", solve=read_poses(meant))
+        if ":" not in meant:
+            known = ", ".join((*GROUPS, *METHODS))
+            raise InputError(f"method {meant!r} is unknown, expected one of {known}, ROW-nN, module:thing or FILE.csv")
+        meant = import_object(meant)
+    if isinstance(meant, Method):
+        return meant
+    try:
+        kind = kind_of(meant)
+    except InputError as error:
+        raise InputError(f"method {name!r} is {error}") from error
+    if kind == "matcher":
+        return Method(settings={"matcher": meant})
+    return Method(solve={"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind, lambda own: own)(meant))
 
 
 def description(method: Method) -> str:
@@ -149,39 +153,3 @@ def description(method: Method) -> str:
     settings = ", ".join(f"{name}={described(value)}" for name, value in sorted(method.settings.items()))
     parts = [method.features, method.answer, settings, f"{method.targets} views" if method.targets else ""]
     return "; ".join(filter(None, [*parts, "" if method.solve is None else described(method.solve)]))
-
-
-def _method(name: str, meant: Any) -> Method:
-    if isinstance(meant, str):
-        meant = METHODS.get(meant) or (import_object(meant) if ":" in meant else meant)
-    if isinstance(meant, Method):
-        return meant
-    if callable(getattr(meant, "estimate", None)):
-        return Method(solve=_Estimator(meant))
-    if callable(meant):
-        return Method(solve=meant)
-    what = "unknown" if isinstance(meant, str) else f"a {type(meant).__name__}"
-    raise InputError(f"method {name!r} is {what}, expected {_EXPECTED}")
-
-
-def import_object(path: str) -> Any:
-    """Import the object "module:name" from an installed module or a module in the current folder."""
-    module, _, name = path.partition(":")
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
-    try:
-        return operator.attrgetter(name)(importlib.import_module(module))
-    except (Exception, SystemExit) as error:  # a module may raise anything
-        reason = error if isinstance(error, ImportError | AttributeError) else describe_failure(error)
-        raise InputError(f"{path!r} cannot be imported: {reason}") from error
-
-
-@dataclass(frozen=True)
-class _Estimator:
-    """Adapter of a user-defined object with `estimate(reference, targets)`, which gets the whole frames."""
-
-    estimator: Any
-
-    def __call__(self, problem: Any) -> Any:
-        reference, *targets = problem.full_frames()
-        return self.estimator.estimate(reference, targets)

@@ -19,7 +19,9 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
 # Members of a stored result; an answer's details must have other names.
-RESERVED = ("error", "failed", "translation_error", "scale", "view", "note", "hypotheses", "second_error", "one_of_two")
+RESERVED = (
+    "error", "failed", "symmetric_error", "translation", "scale", "view", "note", "second_error", "one_of_two",
+)  # fmt: skip
 # What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
 _MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
 
@@ -125,6 +127,12 @@ class Problem:
     def frames(self) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input."""
         return [self.store.frame(key) for key in self.keys]
+
+    def frames_with_depth(self) -> list[Frame]:
+        """Return `frames`; InputError, which fails the pair, if one has no depth map."""
+        if missing := [frame.name for frame in self.frames() if frame.depth is None]:
+            raise InputError(f"no depth map: {', '.join(missing)}")
+        return self.frames()
 
     def full_frames(self) -> list[Frame]:
         """Return the uncropped frames, the reference first."""

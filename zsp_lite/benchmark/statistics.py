@@ -89,7 +89,8 @@ def bootstrap_ci(
 def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see `bootstrap_ci`).
 
-    "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back.
+    "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back; "auc30" the area
+    under the curve of accuracy against the threshold from 0 to 30 degrees, in percent.
     """
     errors = np.asarray(errors, np.float64)
     weights = pair_draws(len(errors)) if weights is None else weights
@@ -101,7 +102,8 @@ def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
     summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
     for name, figure in figures.items():
         summary[f"{name}_ci"] = list(bootstrap_ci(errors, figure, weights))
-    return summary | {"above150": float(100 * np.mean(errors > 150))}
+    summary["above150"] = float(100 * np.mean(errors > 150))
+    return summary | {"auc30": float(100 * np.mean(np.clip(1 - errors / 30, 0, None)))}
 
 
 def mean_category_median(

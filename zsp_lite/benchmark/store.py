@@ -2,17 +2,18 @@
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 
-from zsp_lite.benchmark.cache import FeatureCache
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
+from zsp_lite.errors import InputError
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, crop_size, frame_view, object_crop
@@ -38,12 +39,12 @@ class FrameStore:
     dataset: Co3D  # the folder in CO3D's layout
     category: str
     extractors: Mapping[str, Any]  # by name
-    cache: FeatureCache | None = None  # feature maps on disk
     threads: int | None = None  # threads of torch during feature extraction; None leaves them as they are
     # Seconds of every frame read ("reading"), every feature extraction (the extractor's name) and every comparison of
     # two frames ("similarity"), since the last `timings.clear()`.
     timings: dict[str, list[float]] = field(default_factory=dict)
     _entries: dict[FrameKey, _Entry] = field(default_factory=dict)
+    _extents: dict[str, tuple[np.ndarray, float] | None] = field(default_factory=dict)
     _similarities: dict[tuple, Float[torch.Tensor, "n1 n2"]] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -61,6 +62,19 @@ class FrameStore:
     def first_camera(self, sequence: str) -> Camera:
         """Return the camera of a sequence's first frame."""
         return self.dataset.camera(self.dataset.frames(self.category, sequence)[0])
+
+    def extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
+        """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
+
+        They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        """
+        if sequence not in self._extents:
+            self._extents[sequence] = None
+            with suppress(InputError):
+                points, _ = self.dataset.point_cloud(self.category, sequence)
+                low, high = np.quantile(points, (0.02, 0.98), axis=0)
+                self._extents[sequence] = (low + high) / 2, float(np.linalg.norm(high - low))
+        return self._extents[sequence]
 
     def describe(self, features: str, key: FrameKey) -> Any:
         """Return what an extractor computes from a frame's crop."""
@@ -111,13 +125,9 @@ class FrameStore:
 
     def _extract(self, features: str, frame: Frame) -> Any:
         extractor = self.extractors[features]
-        if self.cache is not None and (cached := self.cache.read(features, frame)) is not None:
-            return cached
         # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
         with self._timed(features), torch_threads(self.threads):
             (found,) = extractor.describe([frame]) if hasattr(extractor, "describe") else extractor([frame.rgb])
-        if self.cache is not None:
-            self.cache.write(features, frame, found)
         return found
 
     @contextmanager

@@ -5,14 +5,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options
-
-if TYPE_CHECKING:
-    from zsp_lite.data.check import CategoryCheck
 
 _PROBLEMS_SHOWN = 5  # of a category
 _CHECK_COLUMNS = ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk")
@@ -39,7 +36,7 @@ def check(root, deep, partial) -> int:
     return print_checks(root, check_folder(root, deep, partial=partial), deep)
 
 
-def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> int:
+def print_checks(root: Path, checks: Sequence[Any], deep: bool) -> int:
     """Print the results of `check_folder`, and return the exit code: 1 if there is any problem, else 0."""
     from rich.filesize import decimal
 
@@ -57,6 +54,8 @@ def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> i
             lines.append(f"{check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
         if check.labelled > check.usable:
             lines.append(f"{check.usable} of {check.labelled} labelled sequences can be evaluated")
+        if check.cloudless:
+            lines.append(f"{check.cloudless:,} of {check.sequences:,} sequences have no point cloud")
         if check.defects:
             kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
             lines.append(f"{check.defects.total():,} frames cannot be used ({kinds})")
@@ -65,8 +64,10 @@ def print_checks(root: Path, checks: "Sequence[CategoryCheck]", deep: bool) -> i
             lines.append(f"and {more} more")
         for line in lines:
             print(f"{check.category}: {line}")
-    problems = sum(len(check.problems) for check in checks)
-    tested = "can be decoded" if deep else "exists and is not empty (--deep decodes them)"
+    problems, clouds = (sum(numbers) for numbers in zip(*((len(one.problems), one.cloudless) for one in checks)))
+    black = sum(one.defects["black image"] for one in checks) if deep else "--deep decodes all files and counts"
+    tested = "can be decoded" if deep else "exists and is not empty"
+    print(f"{clouds:,} sequences without a point cloud; {black} black frames.")
     print(f"{problems} problems." if problems else f"No problems: every annotated file {tested}.")
     return 1 if problems else 0
 

@@ -45,9 +45,7 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     if dataset == "co3d-v1":
         refuse_options({"single_sequence": single_sequence, "chunks": chunks}, (), dataset)
     else:
-        refuse_options(
-            {"labels": labels}, (), f"{dataset}: labels are of v1; `zsp-lite data transfer` copies them to v2"
-        )
+        refuse_options({"labels": labels}, (), f"{dataset}: labels are of v1 (see `zsp-lite data transfer`)")
     if labelled_only and not labels:
         raise click.UsageError("--labelled-only goes with --labels")
 

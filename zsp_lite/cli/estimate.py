@@ -1,14 +1,11 @@
 """The command `estimate`: the pose between two objects of the user's own."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from zsp_lite.choices import MASKS, SOLVERS
 from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, backbone_options, examples
-
-if TYPE_CHECKING:
-    from zsp_lite.estimates import PairResult
 
 
 @click.command(
@@ -73,8 +70,8 @@ def estimate(reference, target, solver, reference_frame, targets, not_upright, a
             print(f"Written: {path}")
 
 
-def _print_tables(found: "PairResult") -> None:
-    """Print the answers, the other hypotheses, the matrices and the flags."""
+def _print_tables(found: Any) -> None:
+    """Print the answers of a `PairResult`, the other hypotheses, the matrices and the flags."""
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.viz.report import COLUMNS, legend, table_rows
 

@@ -49,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # names of files need not be valid text
     try:
         with cli.make_context("zsp-lite", list(sys.argv[1:] if argv is None else argv)) as context:
-            return cli.invoke(context) or 0
+            code = cli.invoke(context) or 0
+        sys.stdout.flush()
+        return code
     except click.exceptions.Exit as stop:  # --help
         return stop.exit_code
     except click.UsageError as error:
@@ -57,6 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         message = f"{error.format_message()} (see: {command} --help)"
     except InputError as error:
         message = str(error)
+    except BrokenPipeError:  # the reader of the output, such as `head`, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:  # a folder without write permission, a full disk
         message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except KeyboardInterrupt:

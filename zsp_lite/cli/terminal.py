@@ -1,14 +1,11 @@
 """Tables in the terminal: a table that is wider continues in the next line, and no figure is cut."""
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
-
-if TYPE_CHECKING:
-    from zsp_lite.benchmark.tables import Table
 
 
 def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> None:
@@ -21,15 +18,14 @@ def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
     _print_whole(table)
 
 
-def print_tables(tables: Iterable["Table"]) -> None:
-    """Print the tables of a benchmark run."""
+def print_tables(tables: Iterable[Any]) -> None:
+    """Print every `Table` of a benchmark run."""
     for table in tables:
         _print_whole(as_rich(table))
 
 
-def as_rich(table: "Table") -> RichTable:
-    """Format a table of a benchmark run: intervals below their figures, published figures dim."""
-    from zsp_lite.benchmark.formats import short_group
+def as_rich(table: Any) -> RichTable:
+    """Format a `Table` of a benchmark run: intervals below their figures, published figures dim."""
     from zsp_lite.benchmark.tables import PUBLISHED
 
     made = RichTable(
@@ -39,7 +35,7 @@ def as_rich(table: "Table") -> RichTable:
     made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
     for group, title in table.text.columns:
         style = "dim" if group == PUBLISHED else None
-        group = short_group(group).replace(" on ", "\non ").replace(" (", "\n(")
+        group = group.replace("this run: ", "").replace("this run", "").replace(" on ", "\non ").replace(" (", "\n(")
         title = title.replace(" (", "\n(").replace(" Acc30", "\nAcc30")
         made.add_column(f"{group}\n{title}" if group else title, justify="right", style=style, header_style=style)
     for label, *cells in table.text.itertuples():

@@ -33,7 +33,8 @@ class CategoryCheck:
     labelled: int = 0  # sequences with a label
     # Labelled sequences that can be evaluated: at least two frames have image, mask, depth and camera, and no defect.
     usable: int = 0
-    # Frames with each `frames.frame_defect`, such as a black image; counted by a deep check alone.
+    cloudless: int = 0  # sequences without a point cloud, in the annotations or on the disk
+    # Frames with each `frames.frame_defect`, such as "black image"; counted by a deep check alone.
     defects: Counter[str] = field(default_factory=Counter)
     pairs: int = 0  # valid files of evaluation pairs
     size: int = 0  # of all annotated files, bytes
@@ -90,7 +91,9 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
                 layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
         if name not in sequences:
             check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
-        elif (cloud := sequences[name].point_cloud) and _check_file(dataset, cloud.path, check) and deep:
+        elif not (cloud := sequences[name].point_cloud) or not _check_file(dataset, cloud.path, check):
+            check.cloudless += 1
+        elif deep:
             check.attempt(dataset.point_cloud, category, name)
         check.complete += len(check.problems) == before
         if complete_frames >= _MIN_FRAMES:

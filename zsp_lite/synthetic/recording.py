@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
@@ -19,8 +20,6 @@ from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence, render_seque
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _JPEG_QUALITY = 88
-
-
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 
@@ -32,6 +31,7 @@ class ObjectPose(msgspec.Struct):
     scale: float
     low: _Vector  # corners of the box
     high: _Vector
+    turns: tuple[int, ...] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
 
     @property
     def R(self) -> Float[np.ndarray, "3 3"]:
@@ -72,8 +72,17 @@ def write_sequence(
     write_co3d(out, category, [data], _JPEG_QUALITY)
     low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
-    poses[data.name] = ObjectPose(exact.object_pose.tolist(), exact.scale, low, high)
+    poses[data.name] = ObjectPose(exact.object_pose.tolist(), exact.scale, low, high, shape_turns(mesh.vertices))
     write_atomic(out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode())
+
+
+def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
+    """Return the quarter turns about the up axis, in degrees, after which the vertices are the same within 3 %."""
+    points = vertices - (vertices.min(0) + vertices.max(0)) / 2
+    x, y, z = points.T
+    turned = {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}
+    distance = {turn: KDTree(points).query(np.stack(one, 1))[0].max() for turn, one in turned.items()}
+    return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
 
 
 def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
