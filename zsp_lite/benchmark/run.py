@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
+from torch import get_num_threads
 from tqdm import tqdm
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
@@ -62,8 +63,7 @@ def evaluate(
     rows, dataset = resolve(methods), Co3D(data)
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     row_pairs = pairs_of_rows(dataset, rows, numbers, targets)
-    named = isinstance(backbone, str | BackboneConfig)
-    loaded = load_backbone(backbone) if named else backbone
+    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     extractors = make_extractors(loaded, [row.features for row in rows.values()])
     for row in rows.values():
         if row.solve is None:
@@ -79,9 +79,8 @@ def evaluate(
         "methods": {name: description(row) + others.get(row.features, "") for name, row in rows.items()},
     }  # fmt: skip
     with open_run(out, settings, allow_other_version), execution.open_workers(executor) as workers:
-        threads = max(1, execution.available_cores() // workers.number)
-        folder, sent = str(Path(data).resolve()), backbone if named else loaded
-        setup = execution.Setup(folder, rows, sent, settings["backbone"], threads)
+        threads = max(1, min(get_num_threads(), execution.available_cores() // workers.number))
+        setup = execution.Setup(str(Path(data).resolve()), rows, backbone, settings["backbone"], threads)
         known = {(row, line["pair"]) for line in read_lines(out) for row in line.get("results", ())}
         todo = rows_of_pairs(
             {name: [pair for pair in found if (name, pair.key) not in known] for name, found in row_pairs.items()}
