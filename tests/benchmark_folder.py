@@ -16,7 +16,7 @@ from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.run import evaluate
-from zsp_lite.benchmark.runs import add_lines, open_run, read_run
+from zsp_lite.benchmark.runs import Call, Settings, add_lines, open_run, read_run
 from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 
@@ -140,26 +140,24 @@ PAIRS = 8
 
 def write_run(out, rows, categories=CATEGORIES, **settings):
     """Write a run's folder with results by row and pair."""
-    settings = {"data": "made up", "targets": 5, "backbone": "none 0", "labels": {}, "library": {}} | settings
-    with open_run(out, {"methods": dict.fromkeys(rows, "x")} | settings):
-        add_lines(out, [{"call": {"rows": list(rows), "categories": list(categories)}}])
-        cost = {"seconds": 1.0, "timings": {}, "saliency_iou": {}}
+    call = Call("now", [], {}, {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
+    settings = {"data": "made up", "backbone": "none 0", "targets": 5, "labels": {}, "origins": {}} | settings
+    methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
+    with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):
         for name, results in rows.items():
-            add_lines(out, ({"pair": key, "results": {name: found}} | cost for key, found in results.items()))
+            add_lines(out, ({"pair": key, "results": {name: found}} for key, found in results.items()))
     return read_run(out)
 
 
-def made_up_run(out, rows, seed=0, **settings):
-    """A run with random errors of pairs that share a few objects, other ones for each seed."""
-    rng, found, names = np.random.default_rng(seed), {}, [f"{seed}_{i}" for i in range(PAIRS)]
+def made_up_run(out, rows):
+    """A run with random errors of pairs that share a few objects."""
+    rng, found = np.random.default_rng(0), {}
     for name in dict.fromkeys(rows):
         targets = tuple(range(int((re.findall(r"-n(\d+)$", name) or [5])[0])))
-        pairs = [Pair(category, names[i % PAIRS], i, names[(i * i + 1) % PAIRS], targets)
+        pairs = [Pair(category, f"{i}", i, f"{(i * i + 1) % PAIRS}", targets)
                  for category in CATEGORIES for i in range(PAIRS)]  # fmt: skip
         found[name] = {pair.key: {"error": round(rng.uniform(0, 180), 4), "view": 0, "inliers": 9} for pair in pairs}
-        for one in found[name].values():
-            one |= {"confidence": round(rng.random(), 4)} if name in ("verified", "mine") else {}
-    return write_run(out, found, **settings)
+    return write_run(out, found)
 
 
 def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
@@ -167,8 +165,7 @@ def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
 
     def add_and_act(out, lines):
         add_lines(out, lines)
-        if any("pair" in line for line in lines):
-            act()
+        act()
 
     return add_and_act
 

@@ -57,11 +57,19 @@ def _gzip(data: bytes) -> bytes:
 
 
 def _lines(text: bytes) -> bytes:
-    """A gzipped file with a line for each member of a list."""
+    """A file with a line for each member of a list."""
     try:
-        return _gzip(b"\n".join(_text(line) for line in json.loads(text)))
+        return b"".join(_text(line) + b"\n" for line in json.loads(text))
     except (ValueError, TypeError):
-        return _gzip(text)
+        return text + b"\n"
+
+
+def _run(name: str, other: str, content: bytes, pack: Callable[[bytes], bytes] = lambda data: data):
+    """Reader of a run of which one file is fuzzed."""
+    root = ROOT / f"run {name}"
+    root.mkdir()
+    (root / other).write_bytes(content)
+    return _file(f"run {name}/{name}", lambda path: read_run(path.parent).summary, pack)
 
 
 def _frames(path: Path) -> None:
@@ -110,12 +118,17 @@ _NERF = {
     "fl_x": 30, "cx": 16, "cy": 12, "w": 32, "h": 24, "k1": 0.1,
     "frames": [{"file_path": "rgb/0.png", "depth_file_path": "depth/0.png", "transform_matrix": _EYE}],
 }  # fmt: skip
-_PAIR = {"timings": {"reading": [0.1]}, "saliency_iou": {"a/1": 0.5}}
+_CALL = {
+    "time": "t", "command": ["c"], "versions": {"python": "3"}, "machine": {"cores": 2}, "workers": 1,
+    "rows": ["ours"], "pairs": {"cup": 4},
+}  # fmt: skip
+_SETTINGS = {
+    "data": "d", "backbone": "n 0", "targets": 2, "library": [{"version": "0", "commit": None}],
+    "methods": {"ours": "x"}, "labels": {"cup": "0"}, "origins": {"cup, N = 2": "sampled"}, "calls": [_CALL],
+}  # fmt: skip
+_FOUND = {"error": 1.0, "symmetric_error": 0.5, "confidence": 0.5, "scale": 1.1, "view": 1, "inliers": 9, "note": "x"}
 _RESULTS = [
-    {"data": "d", "backbone": "n 0", "targets": 2, "library": [{"version": "0"}], "methods": {"ours": "x"}},
-    {"call": {"rows": ["ours"], "categories": ["cup"]}},
-    *({"pair": f"cup/a:{i}/b:0,1", "results": {"ours": {"error": 1.0, "second_error": 9.0}}} | _PAIR for i in range(4)),
-    {"seconds": 1.0},
+    {"pair": f"cup/a:{i}/b:0,1", "results": {"ours": _FOUND}, "timings": {"reading": 0.1}} for i in range(4)
 ]  # fmt: skip
 _POSES = b"""category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale
 cup,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
@@ -159,7 +172,9 @@ TARGETS: dict[str, Target] = {
         b"# camera to world\n1 0 0 0 0 1 0 0 0 0 1 0\n",
     ),
     "nerfstudio": Target(_capture("nerfstudio", "transforms.json", {}), _text(_NERF), True),
-    "results": Target(_file("r.jsonl.gz", lambda path: read_run(path).summary, _lines), _text(_RESULTS), True),
+    "results": Target(_run("run.jsonl", "run.json", _text(_SETTINGS), _lines), _text(_RESULTS), True),
+    "packed results": Target(_run("run.jsonl.gz", "run.json", _text(_SETTINGS)), _gzip(_lines(_text(_RESULTS)))),
+    "settings of a run": Target(_run("run.json", "run.jsonl", _lines(_text(_RESULTS))), _text(_SETTINGS), True),
     "poses": Target(_file("poses.csv", read_poses), _POSES),
 }  # fmt: skip
 

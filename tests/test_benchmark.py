@@ -41,10 +41,12 @@ def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
         assert row["n"] == 12 and row["per_category"].keys() == {"lump", "pebble"}
         assert row["per_category"]["lump"]["n"] == 6
         assert row["acc30_ci"][0] <= row["acc30"] <= row["acc30_ci"][1]
-    assert {"matching", "view", "alignment", "features_per_frame", "reading_each"} <= summary["timings"].keys()
-    assert read_run(out).settings["origins"] == {"lump, N = 5": "sampled", "pebble, N = 5": "sampled"}
-    assert summary["saliency_iou"].keys() == {"lump", "pebble", "mean"}
-    assert all(value > 0.8 for value in summary["saliency_iou"].values())
+    assert {"reading", "backbone", "similarity", "matching", "view", "alignment"} <= summary["timings"].keys()
+    assert all(0 < seconds < 60 for seconds in summary["timings"].values())
+    settings = read_run(out).settings
+    assert settings.origins == {"lump, N = 5": "sampled", "pebble, N = 5": "sampled"}
+    (call,) = settings.calls
+    assert call.versions and call.machine and (call.rows, call.pairs) == ([*ROWS], {"lump": 6, "pebble": 6})
 
 
 def test_a_second_run_computes_nothing_again_and_says_the_same(run, monkeypatch):
@@ -53,7 +55,7 @@ def test_a_second_run_computes_nothing_again_and_says_the_same(run, monkeypatch)
     before = read_run(out)
     assert evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out) == summary
     after = read_run(out)
-    assert after.table.equals(before.table) and after.costs == before.costs
+    assert after.table.equals(before.table) and len(after.settings.calls) == 1 + len(before.settings.calls)
 
 
 def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
@@ -62,7 +64,7 @@ def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
     every = evaluate(small_folder(), BACKBONE, ("ours",), 3, 2, tmp_path / "every")
     assert every["methods"]["ours"]["per_category"]["lump"] == alone["methods"]["ours"]["per_category"]["lump"]
     assert both["methods"]["ours"] == alone["methods"]["ours"]
-    assert both["timings"]["features_per_frame"] == alone["timings"]["features_per_frame"]
+    assert both["timings"]["backbone"] == alone["timings"]["backbone"]
     assert both["methods"]["rootsift"]["n"] == 3
     assert both["against"]["rootsift"]["accuracy_gain"] == pytest.approx(
         both["methods"]["rootsift"]["acc30"] - both["methods"]["ours"]["acc30"]
@@ -82,7 +84,7 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             angles = [rotation_error(turn, reference.R @ labels[a].trans[:3, :3]) for turn in turns]
             assert found.row("oracle-view")["view"][pair.key] == np.argmin(angles)
             best_view = found.row("ours-bv").loc[pair.key]
-            assert best_view["error"] == pytest.approx(angles[int(best_view["view"])], abs=1e-6)
+            assert best_view["error"] == pytest.approx(angles[int(best_view["view"])], abs=1e-4)
     assert run[1]["methods"]["oracle-view"]["acc30"] >= 90
 
 
@@ -120,8 +122,8 @@ def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_ar
         pass
 
     for root, backbone, options, told in (
-        (small_folder(), BACKBONE, {"out": run[0], "targets": 3}, r"other settings \(targets\)"),
-        (small_folder(), Renamed(grid=8), {"out": run[0]}, r"other settings \(backbone\)"),
+        (small_folder(), BACKBONE, {"out": run[0], "targets": 3}, "a run with targets 5, this is 3"),
+        (small_folder(), Renamed(grid=8), {"out": run[0]}, "a run with backbone .*Renamed"),
         (
             small_folder(),
             BACKBONE,

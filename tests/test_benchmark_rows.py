@@ -10,9 +10,8 @@ from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
-from zsp_lite.benchmark import extractors
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import GROUPS, METHODS
+from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS
 from zsp_lite.benchmark.problem import Problem
 from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_run
@@ -56,7 +55,7 @@ def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
         truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
         truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ reference.camera.R.T
         found = row(name).loc[pair.key]
-        assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-9)
+        assert found["error"] == pytest.approx(rotation_error(estimate.sim3.R, truth), abs=1e-4)
         assert found["view"] == estimate.view and found["inliers"] == estimate.inliers.sum()
 
 
@@ -72,10 +71,11 @@ def test_rows_differ_as_their_names_say(run):
 def test_a_pair_without_depth_fails(row, monkeypatch):
     dataset = Co3D(small_folder())
     problem = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
-    frames = [replace(frame, depth=None) for frame in problem.frames()]
-    monkeypatch.setattr(problem, "frames", lambda: frames)
+    crops = {key: replace(problem.store.frame(key), depth=None) for key in problem.keys}
+    monkeypatch.setattr(problem.store, "frame", crops.get)
     with pytest.raises(InputError, match="no depth map: 100_a"):
         METHODS[row].solve(problem)
+    assert problem.frames() == [*crops.values()]
 
 
 def test_stages_that_rows_have_in_common_are_done_once_and_others_are_not_shared(tmp_path, monkeypatch):
@@ -102,12 +102,12 @@ class TrueViewpoints:
 
 
 def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):
-    monkeypatch.setitem(extractors.EXTRACTORS, "posecontrast", lambda backbone: TrueViewpoints())
+    monkeypatch.setitem(EXTRACTORS, "posecontrast", lambda backbone: TrueViewpoints())
     assert run_rows(["posecontrast"], tmp_path, 4, 3, "pebble")["posecontrast"]["median"] < 1e-5
 
 
 def test_swav_is_matched_as_mutual_neighbours(tmp_path, monkeypatch):
-    monkeypatch.setitem(extractors.EXTRACTORS, "swav", lambda backbone: BACKBONE)
+    monkeypatch.setitem(EXTRACTORS, "swav", lambda backbone: BACKBONE)
     assert run_rows(["swav"], tmp_path, 4, 5, "pebble")["swav"]["acc30"] >= 75
 
 

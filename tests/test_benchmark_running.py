@@ -1,6 +1,7 @@
 """A run's results: the same whoever computes them, in whatever order, however often it is killed."""
 
 import functools
+import gzip
 import json
 import os
 import shutil
@@ -21,14 +22,14 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.compare import compare, write_reports
-from zsp_lite.benchmark.execution import Evaluator, Setup, make_chunks, open_workers
+from zsp_lite.benchmark.execution import Evaluator, make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import Problem
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows, rows_of_pairs
-from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, export_run, read_lines, read_run
+from zsp_lite.benchmark.run import evaluate, pairs_of_rows
+from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, compare, read_lines, read_run
 from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
 from zsp_lite.data.pairs import sample_pairs
@@ -52,7 +53,7 @@ def undisturbed(tmp_path_factory):
 
 def pairs_in(out) -> list[str]:
     """The evaluations of pairs in a run's folder."""
-    return [line["pair"] for line in read_lines(out) if "pair" in line]
+    return [line.pair for line in read_lines(out)]
 
 
 def _children(pid: int) -> set[int]:
@@ -78,10 +79,10 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
                 time.sleep(0.05)
     assert 4 <= stored < 12
     # An interrupted run has tables, figures and comparisons of what is finished.
-    half = write_reports(tmp_path)
-    assert half.summary["methods"]["ours"]["n"] == stored and half.calls[-1]["rows"] == list(ROWS)
+    assert main(["tables", str(tmp_path)]) == 0
+    assert read_run(tmp_path).summary["methods"]["ours"]["n"] == stored
     assert (tmp_path / "tables" / "all_rows.csv").is_file() and (tmp_path / "figures" / "error_curves.pdf").is_file()
-    assert {one["n"] for one in compare(half, read_run(undisturbed[0])).values()} == {stored}
+    assert {one["n"] for one in compare(read_run(tmp_path), read_run(undisturbed[0])).values()} == {stored}
     assert again(tmp_path)["methods"] == undisturbed[1]["methods"]
     assert sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0])) and len(set(pairs_in(tmp_path))) == 12
 
@@ -90,14 +91,39 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
     before, path = read_run(run), run / LINES
     whole = path.read_bytes()
-    path.write_bytes(2 * whole + whole[: len(whole) // 2].rpartition(b"\n")[2])  # a repeated line counts once
+    path.write_bytes(whole + whole[: len(whole) // 2].rpartition(b"\n")[2])
     assert read_run(run).table.equals(before.table)
     again(run)
-    assert read_run(run).table.equals(before.table) and len(read_run(run).calls) == 3
-    path.write_bytes(whole.replace(b'"pair":', b'"pair:', 1))
-    for read in (read_run, export_run, again):
+    assert read_run(run).table.equals(before.table) and path.read_bytes() == whole
+    damaged = whole.split(b"\n")
+    damaged[1] = damaged[1].replace(b'"pair":', b'"pair:')
+    path.write_bytes(b"\n".join(damaged))
+    for read in (read_run, again):
         with pytest.raises(InputError, match="run.jsonl, line 2"):
             read(run)
+
+
+def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_continued(
+    undisturbed, tmp_path, monkeypatch
+):
+    out, summary = undisturbed
+    shutil.copy(out / SETTINGS, tmp_path)  # what was killed between the settings and the first result has no run.jsonl
+    with pytest.raises(InputError, match="run.jsonl cannot be read"):
+        read_run(tmp_path)
+    packed = tmp_path / f"{LINES}.gz"
+    packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
+    assert read_run(tmp_path).table.equals(read_run(out).table) and read_run(tmp_path).summary == summary
+    with monkeypatch.context() as context:
+        context.setattr("zsp_lite.benchmark.execution.evaluate_pair", None)  # nothing is left to compute
+        assert again(tmp_path) == summary
+    more = evaluate(small_folder(), QUICK, ["ours", "oracle-view"], 6, 3, tmp_path)["methods"]
+    assert more["ours"] == summary["methods"]["ours"] and more["oracle-view"]["n"] == 12
+    assert not packed.exists() and len(pairs_in(tmp_path)) == 24
+    (tmp_path / LINES).unlink()
+    assert (
+        evaluate(small_folder(), QUICK, ["oracle-view"], 6, 3, tmp_path)["methods"]["oracle-view"]
+        == more["oracle-view"]
+    )
 
 
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path, monkeypatch):
@@ -140,7 +166,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     def look() -> None:
         seen.append(read_run(tmp_path).summary["methods"]["ours-bv"]["n"])
         if len(seen) == 3:
-            write_reports(tmp_path, tmp_path / "reports")
+            assert main(["tables", str(tmp_path), "--out", str(tmp_path / "reports")]) == 0
             with pytest.raises(InputError, match="another process is writing"):
                 evaluate(*arguments)
 
@@ -184,17 +210,18 @@ def test_unusable_executors_are_refused(monkeypatch):
             pass
 
 
-def work_of(rows, pairs: int, targets: int) -> dict:
-    return rows_of_pairs(pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets))["lump"]
+def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
+    found = pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
+    return {pair: rows for pairs in found.values() for pair in pairs}
 
 
 def errors(chunk, backbone, threads=None) -> dict:
-    evaluator = Evaluator(Setup(str(small_folder()), resolve(["ours"]), backbone, threads=threads))
-    return {record["pair"]: record["results"]["ours"]["error"] for record in evaluator.records(chunk)}
+    evaluator = Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
+    return {line["pair"]: line["results"]["ours"]["error"] for line in evaluator.lines(chunk)}
 
 
 def test_a_frame_is_described_by_itself_so_that_no_order_matters():
-    (chunk,) = make_chunks(work_of(["ours"], 6, 3))
+    (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 6, 3))
     assert errors(chunk, Sociable(grid=8)) == errors(chunk[::-1], Sociable(grid=8))
 
 
@@ -202,27 +229,26 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
-    (chunk,) = make_chunks(work_of(["ours"], 2, 2))
+    (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
     assert errors(chunk, backbone, 1) == errors(chunk, backbone, 2)
 
 
-def test_chunks_hold_every_pair_once_and_keep_a_target_sequence_together_where_it_fits():
+def test_chunks_hold_every_pair_once_and_keep_pairs_together_that_differ_in_the_number_of_views():
     work = {pair: ["ours"] for n in (3, 5) for pair in sample_pairs(Co3D(small_folder()), "lump", 12, n)}
 
     def question(pair):  # is the same for 3 and 5 target views
         return pair.target_sequence, pair.reference_sequence, pair.reference_frame
 
-    def are_together(chunks, part):
-        parts = [{part(pair) for pair, _ in chunk} for chunk in chunks]
-        return sum(map(len, parts)) == len(set().union(*parts))
-
-    largest = max(Counter(pair.target_sequence for pair in work).values())
-    for size in (1, 4, largest, 100):
+    for size in (1, 4, 100):
         chunks = make_chunks(work, size)
         assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
         assert all(len(chunk) < size + max(Counter(map(question, work)).values()) for chunk in chunks)
-        assert are_together(chunks, question)
-        assert size < largest or are_together(chunks, lambda pair: pair.target_sequence)
+        assert all(len(chunk) >= size for chunk in chunks[:-1])
+        questions = [{question(pair) for pair, _ in chunk} for chunk in chunks]
+        assert sum(map(len, questions)) == len(set().union(*questions))
+        # Frames of a target sequence are read in as few chunks as possible.
+        targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
+        assert targets == sorted(targets)
     assert len(chunks) == 1
 
 
@@ -235,9 +261,7 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
         run(["ours"])
     run(["ours"], allow_other_version=True)
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]
-    calls = read_run(tmp_path).calls
-    assert all(call["versions"] and call["machine"] and call["seconds"] > 0 for call in calls)
-    assert [call["rows"] for call in calls] == [["ours-bv"], ["ours"]] and calls[0]["pairs"] == {"lump": 1}
+    assert [call.rows for call in read_run(tmp_path).settings.calls] == [["ours-bv"], ["ours"]]
     run(["ours"])  # both are now known
 
 
@@ -251,13 +275,13 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
             with pytest.raises(InputError, match=told):
                 read(run)
     (run / SETTINGS).unlink()
-    with pytest.raises(InputError, match="holds results in run.jsonl without run.json"):
-        again(run)
-    with pytest.raises(InputError, match="nowhere cannot be read"):
+    with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
+        again(run)  # it has results
+    with pytest.raises(InputError, match="nowhere/run.json cannot be read"):
         read_run(tmp_path / "nowhere")
     (tmp_path / LINES).symlink_to("/dev/full")
     with pytest.raises(InputError, match="run.jsonl cannot be written: .*No space left"):
-        add_lines(tmp_path, [{"seconds": 1.0}])
+        add_lines(tmp_path, [{"pair": "lump/a:0/b:1", "results": {}}])
 
 
 def test_features_are_computed_once_for_all_rows(tmp_path):
@@ -269,7 +293,7 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    frames = {key for pair in work_of(rows, 4, 3) for key in Problem(pair, frames_of()).keys}
+    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, frames_of()).keys}
     assert sum(calls) == len(frames) and set(calls) == {1}
 
 
@@ -298,24 +322,9 @@ def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
     frames = frames_of(backbone=BACKBONE)
     for number in (0, 1, 2, 0, 3):
         frames.describe("backbone", ("100_a", number))
-    assert [frames.description("backbone", ("100_a", number)) is not None for number in (2, 0, 3)] == [True] * 3
-    assert len(frames.timings["reading"]) == 4  # frame 1 was dropped, as it had not been used for longest
-
-
-def test_the_second_poses_error_is_kept_of_solvers_with_alternatives(tmp_path):
-    def second_of(problem):
-        found = problem.estimate(settings={"solver": "verified"})
-        return next((one.sim3, one.view) for index, one in enumerate(found.hypotheses) if index and one.mode == index)
-
-    rows = {"verified": "verified", "second": second_of, "ours": "ours"}
-    methods = run_rows(rows, tmp_path, 2)
-    verified, second, ours = map(read_run(tmp_path).row, rows)
-    assert verified["second_error"].equals(second["error"]) and set(map(type, verified["one_of_two"])) == {bool}
-    assert ours[["second_error", "one_of_two"]].isna().all(axis=None) and "best_two" not in methods["ours"]
-    assert (
-        methods["verified"]["best_two"]["acc30"] == 100 * (verified[["error", "second_error"]].min(axis=1) < 30).mean()
-    )
-    assert verified["confidence"].between(0, 1).all() and verified["confidence"].nunique() == 2
+    for number, read in ((2, 4), (0, 4), (3, 4), (1, 5)):  # frame 1 was dropped: it had not been used for longest
+        frames.describe("backbone", ("100_a", number))
+        assert len(frames.timings["reading"]) == len(frames.timings["backbone"]) == read
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
@@ -325,14 +334,9 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     labels = read_labels(root, "lump")
     name = next(name for name, label in labels.items() if name != label.reference_seq)
     write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])))
-    with pytest.raises(InputError, match=f"lump/{name}: the pose label has changed"):
+    with pytest.raises(InputError, match="results with other labels of lump"):
         run(tmp_path / "run")
     run(tmp_path / "other")
-
-
-def test_a_worker_that_finds_another_backbone_under_the_name_says_so():
-    with pytest.raises(InputError, match="zsp-tiny is zsp-tiny .* on a worker, expected zsp-tiny 0123"):
-        Evaluator(Setup(str(small_folder()), resolve(["ours"]), "zsp-tiny", "zsp-tiny 0123"))
 
 
 def test_by_default_a_run_is_of_the_categories_that_have_labels(tmp_path):

@@ -248,13 +248,16 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, caps
     for name in "ab":
         assert cli.main([*rows, "--out", str(tmp_path / name), "--quiet"]) == 0
         assert capsys.readouterr().out == ""
-    assert cli.main(["tables", str(tmp_path / "a" / "results.jsonl.gz"), "--out", str(tmp_path / "c")]) == 0
+    assert cli.main(["tables", str(tmp_path / "a"), "--out", str(tmp_path / "c")]) == 0
     assert "GlobalSim" in capsys.readouterr().out
     tables = [(tmp_path / name / "tables" / "table_3.md").read_bytes() for name in "abc"]
     assert tables[0] == tables[1] == tables[2]
     assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
     assert "ours:ours-globalsim" in capsys.readouterr().out
+    assert cli.main(["compare", *(str(tmp_path / name) for name in "ab"), "--out", str(tmp_path / "d")]) == 0
+    assert {path.name for path in (tmp_path / "d").iterdir()} == {f"compare.{kind}" for kind in ("csv", "md", "tex")}
+    capsys.readouterr()
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
     assert "nowhere" in assert_one_line(capsys)
 
@@ -293,24 +296,20 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
 
 
 def test_every_option_of_the_tables_reaches_the_library(monkeypatch, tmp_path):
-    run = SimpleNamespace(summary={"methods": {"ours": {"n": 3}, "sift": {"n": 5}}})
     calls = []
 
     def recorded(name, found):
         return lambda *arguments: calls.append((name, *arguments)) or found
 
-    monkeypatch.setattr("zsp_lite.benchmark.runs.read_runs", recorded("read", run))
-    monkeypatch.setattr("zsp_lite.benchmark.compare.write_reports", recorded("write", run))
-    monkeypatch.setattr("zsp_lite.benchmark.tables.every_table", lambda summary, metrics: metrics)
-    monkeypatch.setattr("zsp_lite.benchmark.tables.update_document", recorded("update", None))
+    run = SimpleNamespace(summary={"methods": {}})
+    monkeypatch.setattr("zsp_lite.benchmark.runs.read_run", recorded("read", run))
+    monkeypatch.setattr("zsp_lite.benchmark.tables.every_table", recorded("tables", []))
+    monkeypatch.setattr("zsp_lite.benchmark.tables.write_tables", recorded("write", None))
+    monkeypatch.setattr("zsp_lite.benchmark.figures.write_figures", recorded("figures", None))
     monkeypatch.setattr("zsp_lite.cli.benchmark._print_summary", lambda *arguments, with_paper: calls.append(arguments))
-    a, b, there, shown = tmp_path / "a", tmp_path / "b", tmp_path / "there", ["scale", "acc30"]
-    for words, expected in (
-        ([a, b, "--into", there], [("read", (a, b)), ("update", there, shown, 5)]),
-        ([a, b], [("read", (a, b)), (run.summary, shown)]),
-        ([a, b, "--out", there], [("write", (a, b), there, shown), (run.summary, shown)]),
-        ([a], [("write", (a,), None, shown), (run.summary, shown)]),
-    ):
+    a, there, shown = tmp_path / "a", tmp_path / "there", ["scale", "acc30"]
+    for words, out in (([a, "--out", there], there), ([a], a)):
         calls.clear()
-        assert cli.main(["tables", *map(str, words), "--metrics", "scale,acc30"]) == 0 and calls == expected
-    assert cli.main(["tables", str(a), "--into", str(there), "--out", str(there)]) == 2
+        assert cli.main(["tables", *map(str, words), "--metrics", "scale,acc30"]) == 0
+        written = [("write", [], out / "tables"), ("figures", run, out / "figures")]
+        assert calls == [("read", a), ("tables", run.summary, shown), *written, (run.summary, shown)]

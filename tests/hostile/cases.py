@@ -49,7 +49,7 @@ def _capture(layout):
 
 
 FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
-PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/results.jsonl.gz"
+PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/run.jsonl"
 # Every reader, with the file that it reads.
 READERS_OF = {
     "image": ("x.png", lambda folder: read_image(folder / "x.png")),
@@ -72,8 +72,10 @@ READERS_OF = {
 }
 COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
-    "results": (RESULTS, ("tables", f"ROOT/{RESULTS}")),
-    "compared results": (RESULTS, ("compare", f"ROOT/{RESULTS}", f"ROOT/{RESULTS}")),
+    "results": (RESULTS, ("tables", "ROOT/out")),
+    "packed results": (f"{RESULTS}.gz", ("tables", "ROOT/out")),
+    "settings of results": ("out/run.json", ("tables", "ROOT/out")),
+    "compared results": (RESULTS, ("compare", "ROOT/out", "ROOT/out")),
     "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "settings of a run": ("out/run.json", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "checked annotations": (FRAMES, ("data", "check", "ROOT/data")),
@@ -89,7 +91,9 @@ for kind in STRANGE:
         ):
             case("file", f"{what}: {kind}", read, strange(name, kind))
     for what, (name, argv) in COMMANDS_OF.items():
-        codes = (0, 2) if kind == "missing" and "run" in what else (1, 2) if what == "checked annotations" else (2,)
+        codes = (1, 2) if what == "checked annotations" else (2,)
+        if kind == "missing" and "run" in what or kind in ("missing", "link to itself") and what == "packed results":
+            codes = (0, 2)
         command("file", f"{what}: {kind}", *argv, change=strange(name, kind), codes=codes)
 
 # oversized
@@ -142,7 +146,7 @@ OVERSIZED = [
 for number, (what, data) in enumerate(OVERSIZED):
     name, read = READERS_OF[what]
     case("oversized", f"{what} {number}", read, written(name, data))
-command("oversized", "results that are a gzip bomb", "tables", f"ROOT/{RESULTS}", change=written(RESULTS, gzip_bomb))
+command("oversized", "results that are a gzip bomb", "tables", "ROOT/out", change=written(f"{RESULTS}.gz", gzip_bomb))
 command("oversized", "data check of a gzip bomb", "data", "check", "ROOT/data", change=written(FRAMES, gzip_bomb),
         codes=(1,))  # fmt: skip
 case("oversized", "depth map of 10^15 numbers", _capture("lists"), lambda folder: (
@@ -218,16 +222,17 @@ for values in ({"fl_x": 1e-300}, {"w": 1e300}, {"w": 10**9, "h": 10**9}, {"w": m
                {"depth_unit_scale_factor": 1e300}, {"camera_model": "[/1]"}):  # fmt: skip
     case("damaged", f"nerfstudio: {values}", _capture("nerfstudio"),
          edited("capture/transforms.json", lambda content, values=values: content.update(values)))  # fmt: skip
-for values in ({"error": -5.0}, {"error": "5"}, {"error": math.nan}, {"error": None}, {"second_error": 200.0},
-               {"one_of_two": "yes"}, {"confidence": 2.0}, {"symmetric_error": -1}):  # fmt: skip
-    command("damaged", f"results: {values}", "tables", f"ROOT/{RESULTS}", change=edited(RESULTS, lambda lines, v=values: [
-        line["results"]["icp"].update(v) for line in lines if "pair" in line]))  # fmt: skip
+for values in ({"error": -5.0}, {"error": "5"}, {"error": math.nan}, {"error": None}, {"symmetric_error": 200.0},
+               {"inliers": "yes"}, {"confidence": 2.0}, {"symmetric_error": -1}):  # fmt: skip
+    command("damaged", f"results: {values}", "tables", "ROOT/out", change=edited(RESULTS, lambda lines, v=values: [
+        line["results"]["icp"].update(v) for line in lines]))  # fmt: skip
+command("damaged", "results: no pair", "tables", "ROOT/out", change=edited(RESULTS, lambda lines: [
+    line.update(pair="cup") for line in lines]))  # fmt: skip
 for name, change in {
-    "no rows": lambda lines: [line["call"].update(rows=[]) for line in lines if "call" in line],
-    "no pair": lambda lines: [line.update(pair="cup") for line in lines if "pair" in line],
-    "no settings": lambda lines: lines.pop(0), "no library": lambda lines: lines[0].update(library=[]),
+    "no rows": lambda settings: settings["calls"][0].update(rows=[]),
+    "no call": lambda settings: settings["calls"].clear(), "no library": lambda settings: settings.update(library=[]),
 }.items():  # fmt: skip
-    command("damaged", f"results: {name}", "tables", f"ROOT/{RESULTS}", change=edited(RESULTS, change))
+    command("damaged", f"results: {name}", "tables", "ROOT/out", change=edited("out/run.json", change))
 
 # options of every command
 for argv in (

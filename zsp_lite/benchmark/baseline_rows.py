@@ -26,9 +26,12 @@ def icp_best_view(problem: Problem) -> Answer:
 
 
 def _icp(problem: Problem, view: int) -> Answer:
-    reference, *targets = problem.frames_with_depth()
+    reference, *targets = problem.frames(depth=True)
+    sequences = problem.pair.reference_sequence, problem.pair.target_sequence
+    dataset, category = problem.store.dataset, problem.store.category
+    first = tuple(dataset.camera(dataset.frames(category, sequence)[0]) for sequence in sequences)
     try:
-        sim3 = align(reference, targets, view, problem.first_cameras(), problem.seed)
+        sim3 = align(reference, targets, view, first, problem.seed)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the initial one, not a fit: {error}")
     return Answer(sim3.R, view, sim3.t, sim3.scale)
@@ -37,7 +40,7 @@ def _icp(problem: Problem, view: int) -> Answer:
 def sift(problem: Problem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
     first: Keypoints
-    first, *others = problem.descriptions("sift")
+    first, *others = (problem.store.describe("sift", key) for key in problem.keys)
     found = [mutual_matches(first, other, _K) for other in others]
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
@@ -47,7 +50,7 @@ def sift(problem: Problem) -> Answer:
 def posecontrast(problem: Problem) -> Answer:
     """Run "PoseContrast": the relative rotation of the viewpoints of the reference and the most similar view."""
     first: Viewpoint
-    first, *others = problem.descriptions("posecontrast")
+    first, *others = (problem.store.describe("posecontrast", key) for key in problem.keys)
     similarity = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
     view = int(np.argmax(similarity))
     return Answer(others[view].rotation @ first.rotation.T, view)

@@ -14,17 +14,16 @@ from zsp_lite.benchmark.methods import Method
 from zsp_lite.benchmark.own import describe_failure
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.best_view import mask_iou
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.labels import PoseLabel, relative_pose
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
 from zsp_lite.synthetic.recording import read_poses
-from zsp_lite.views import has_saliency, patch_mask
 
 # Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
 FAILED = 180.0
+_MEASURED = ("symmetric_error", "translation", "scale", "failed")  # details must not stand in for them
 Poses = Float[np.ndarray, "n 4 4"]
 
 
@@ -35,26 +34,19 @@ def evaluate_pair(
 
     Its "results" are by row {"error": degrees, and where they are known "symmetric_error" (up to turns after which both
     objects look the same), "translation" (error of the object's centre in diameters of the target),
-    "scale" (estimated over labelled, which is 1), "view", "note", "timings" and the row's details, and of solvers with
-    hypotheses "one_of_two" and the error of the second pose, "second_error"}, or {"error": 180, "failed": the reason}
-    for a row that raises InputError.
+    "scale" (estimated over labelled, which is 1), "view", "note", "seconds" and the row's details}, or {"error": 180,
+    "failed": the reason} for a row that raises InputError. "timings" are the medians of the store's.
     """
-    start = time.perf_counter()
     store.timings.clear()
     problem = Problem(pair, store)
-    truths, turns = _true_poses(problem, labels), _symmetries(problem)
-    results = {name: _evaluate(method, problem, truths, turns) for name, method in methods.items()}
-    saliency_iou = _saliency_iou(problem, store)
-    seconds, timings = round(time.perf_counter() - start, 5), dict(store.timings)
-    cost = {"seconds": seconds, "timings": timings, "saliency_iou": saliency_iou}
-    return {"pair": pair.key, "results": results} | cost
-
-
-def _true_poses(problem: Problem, labels: Mapping[str, PoseLabel]) -> Poses:
-    """Ground truth from the reference's camera to each target's."""
-    first, second = (labels[name] for name in (problem.pair.reference_sequence, problem.pair.target_sequence))
+    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
     reference, *targets = problem.frames()
-    return np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
+    # Ground truth from the reference's camera to each target's.
+    truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
+    symmetries = _symmetries(problem)
+    results = {name: _evaluate(method, problem, truths, symmetries) for name, method in methods.items()}
+    timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
+    return {"pair": pair.key, "results": results, "timings": timings}
 
 
 def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
@@ -79,30 +71,22 @@ def _evaluate(
         raise
     except InputError as error:
         return {"error": FAILED, "failed": str(error)}
-
-    def error_of(rotation: Float[np.ndarray, "3 3"], view: int) -> float:
-        return float(rotation_error(rotation, truths[view, :3, :3]))
-
-    details = {"timings": {"total": time.perf_counter() - start}} | dict(answer.details)
-    result = {"error": error_of(answer.rotation, answer.view), "view": int(answer.view)}
-    reference, target = problem.frames()[0].camera, problem.frames()[1 + answer.view].camera
+    result = {"seconds": time.perf_counter() - start, "note": answer.note, "view": int(answer.view)}
+    truth, cameras = truths[answer.view], [frame.camera for frame in problem.frames()]
+    reference, target = cameras[0], cameras[1 + answer.view]
+    result["error"] = float(rotation_error(answer.rotation, truth[:3, :3]))
     if symmetries is not None:
-        turned = target.R @ symmetries @ target.R.T @ truths[answer.view, :3, :3]
+        turned = target.R @ symmetries @ target.R.T @ truth[:3, :3]
         result["symmetric_error"] = float(np.min(rotation_error(answer.rotation, turned)))
     ends = problem.store.extent(problem.pair.reference_sequence), problem.store.extent(problem.pair.target_sequence)
     if answer.translation is not None and None not in ends:
         centre = reference.to_camera(ends[0][0])
         found = (1.0 if answer.scale is None else answer.scale) * answer.rotation @ centre + answer.translation
-        true = truths[answer.view, :3, :3] @ centre + truths[answer.view, :3, 3]
-        result["translation"] = float(np.linalg.norm(found - true) / ends[1][1])
+        result["translation"] = float(np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / ends[1][1])
     if answer.scale is not None:
         result["scale"] = float(answer.scale)
-    if answer.hypotheses:
-        result["one_of_two"] = answer.one_of_two
-        different = [one for index, one in enumerate(answer.hypotheses) if one.mode == index]
-        result |= {"second_error": error_of(one.sim3.R, one.view) for one in different[1:2]}
-    timings = {stage: round(seconds, 5) for stage, seconds in details.pop("timings").items()}
-    return result | details | {"note": answer.note, "timings": timings}
+    result = {name: value for name, value in answer.details.items() if name not in _MEASURED} | result
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
 
 
 def _solve(method: Method, problem: Problem) -> Answer:
@@ -125,23 +109,13 @@ def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
     estimate = problem.estimate(method.features, method.settings, nearest)
     answer = as_answer(estimate)
     if nearest is not None:
-        return replace(answer, view=nearest, hypotheses=())
+        return replace(answer, view=nearest)
+    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
     if method.answer == "best view":
-        sim3 = view_alignment(estimate.reference_view, estimate.target_views[estimate.view])
-        return Answer(sim3.R, answer.view, sim3.t, sim3.scale, "", answer.details)
+        sim3 = view_alignment(reference, target)
+        return Answer(sim3.R, answer.view, sim3.t, sim3.scale, details=answer.details)
     if method.answer == "essential matrix":
-        views = estimate.reference_view.frame, estimate.target_views[estimate.view].frame
-        rotation, inliers, note = essential_rotation(*views, estimate.matches, estimate.reference_view.features.grid)
+        found = essential_rotation(reference.frame, target.frame, estimate.matches, reference.features.grid)
+        rotation, inliers, note = found
         return Answer(rotation, answer.view, note=note, details=dict(answer.details) | {"inliers": inliers})
     return answer
-
-
-def _saliency_iou(problem: Problem, store: FrameStore) -> dict[str, float]:
-    """IoU of the backbone's foreground (the paper's threshold) with the mask's patches, by SEQUENCE/FRAME."""
-    found: dict[str, float] = {}
-    for key in problem.keys if has_saliency(store.extractors.get("backbone")) else ():
-        features = store.description("backbone", key)
-        if features is not None and (frame := store.frame(key)).mask is not None:
-            iou = mask_iou(features.foreground().cpu(), patch_mask(frame, features.grid))
-            found[f"{key[0]}/{key[1]}"] = round(iou, 4)
-    return found

@@ -8,8 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import contextmanager
 from itertools import groupby, islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
@@ -21,9 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.evaluation import evaluate_pair
-from zsp_lite.benchmark.extractors import make_extractors
-from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import Method
+from zsp_lite.benchmark.methods import Method, make_extractors
 from zsp_lite.benchmark.store import FrameStore, torch_threads
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
@@ -35,140 +32,95 @@ MOST_WORKERS = 4096  # also of threads
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
-@dataclass(frozen=True)
-class Setup:
-    """What all chunks of a run have in common; picklable."""
-
-    root: str  # of the data
-    methods: Mapping[str, Method]
-    backbone: Any  # what `load_backbone` takes, or an extractor
-    fingerprint: str | None = None  # of the backbone that a worker must find under the name; None for any
-    threads: int | None = None  # of torch during feature extraction
-
-    def extractors(self) -> dict[str, Any]:
-        """Make the extractors of the rows. Raises InputError if the backbone's name stands for another one here."""
-        backbone = self.backbone
-        if isinstance(backbone, str | BackboneConfig):
-            backbone = load_backbone(backbone)
-            if self.fingerprint not in (None, found := fingerprint(backbone)):
-                raise InputError(f"backbone {self.backbone} is {found} on a worker, expected {self.fingerprint}")
-        return make_extractors(backbone, [method.features for method in self.methods.values()])
-
-
 class Evaluator:
     """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
 
-    def __init__(self, setup: Setup, extractors: Mapping[str, Any] | None = None):
-        self.setup, self.extractors = setup, setup.extractors() if extractors is None else extractors
-        self._dataset = Co3D(setup.root)
+    def __init__(
+        self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int | None = None,
+        extractors: Mapping[str, Any] | None = None,
+    ):  # fmt: skip
+        """Make the extractors from `backbone`, if they are not given; `threads` are torch's in feature extraction."""
+        if extractors is None:
+            backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+            extractors = make_extractors(backbone, methods)
+        self._dataset, self._methods, self._threads, self._extractors = Co3D(root), methods, threads, extractors
         self._store: FrameStore | None = None
 
-    def records(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
+    def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Evaluate the pairs of a chunk (see `evaluate_pair`)."""
         category = chunk[0][0].category
         if self._store is None or self._store.category != category:
-            self._store = FrameStore(self._dataset, category, self.extractors, self.setup.threads)
-            self._labels = read_labels(self.setup.root, category)
+            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
+            self._labels = read_labels(self._dataset.root, category)
         for pair, names in chunk:
-            methods = {name: self.setup.methods[name] for name in names}
-            yield evaluate_pair(pair, methods, self._store, self._labels)
+            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
 
 
-def make_chunks(pairs: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
-    """Divide pairs of one category into chunks of about `size` pairs that share frames.
+def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
+    """Divide pairs into chunks of one category and about `size` pairs that share frames.
 
-    Pairs that differ only in the number of target views stay together. Where possible, so do those of a target
-    sequence.
+    Pairs that differ only in the number of target views stay together.
     """
 
     def question(pair: Pair) -> tuple:
-        return pair.target_sequence, pair.reference_sequence, pair.reference_frame
+        return pair.category, pair.target_sequence, pair.reference_sequence, pair.reference_frame
 
-    chunks: list[Chunk] = [[]]
-    ordered = sorted(pairs, key=lambda pair: (*question(pair), len(pair.target_frames), pair.key))
-    for _, members in groupby(ordered, lambda pair: pair.target_sequence):
-        together = [list(found) for _, found in groupby(members, question)]
-        if len(chunks[-1]) + sum(map(len, together)) > size:
+    chunks: list[Chunk] = []
+    ordered = sorted(work, key=lambda pair: (*question(pair), len(pair.target_frames), pair.key))
+    for (category, *_), members in groupby(ordered, question):
+        if not chunks or len(chunks[-1]) >= size or chunks[-1][0][0].category != category:
             chunks.append([])
-        for found in together:
-            if len(chunks[-1]) >= size:
-                chunks.append([])
-            chunks[-1] += [(pair, pairs[pair]) for pair in found]
-    return [chunk for chunk in chunks if chunk]
-
-
-@dataclass(frozen=True)
-class Workers:
-    """An executor (None: this process), the number of its workers, and the exceptions raised if a worker dies."""
-
-    executor: Executor | None
-    number: int
-    deaths: tuple[type[BaseException], ...] = (BrokenExecutor,)
-
-
-@contextmanager
-def open_workers(executor: Executor | str | int = 1) -> Iterator[Workers]:
-    """Open an executor, and close it after the block; an Executor stays open.
-
-    It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor.
-    """
-    if isinstance(executor, Executor):
-        yield Workers(executor, getattr(executor, "_max_workers", 1))
-    elif isinstance(executor, str):
-        if not executor.startswith("dask://"):
-            raise InputError(
-                f"executor is {executor!r}, expected a number of processes, dask://HOST:PORT or an Executor"
-            )
-        with _dask(executor.removeprefix("dask://")) as workers:
-            yield workers
-    else:
-        check_integer("workers", executor, 1, MOST_WORKERS)
-        with _process_pool(executor) if executor > 1 else nullcontext() as pool:
-            yield Workers(pool, executor)
+        chunks[-1] += [(pair, work[pair]) for pair in members]
+    return chunks
 
 
 def evaluate_chunks(
-    setup: Setup,
+    make: Callable[[], Evaluator],
     chunks: Sequence[Chunk],
-    workers: Workers,
+    executor: Executor | None,
+    workers: int,
     save: Callable[[list[dict[str, Any]]], None],
-    extractors: Mapping[str, Any],
 ) -> None:
-    """Evaluate chunks; `save` gets the records of each, or of each pair where this process evaluates them."""
-    if workers.executor is None:
-        evaluator = Evaluator(setup, extractors)
+    """Evaluate chunks with what `make` makes; `save` gets the lines of each, or of each pair in this process."""
+    if executor is None:
+        evaluator = make()
         with one_thread():
-            for chunk in chunks:
-                for record in evaluator.records(chunk):
-                    save([record])
+            for line in (line for chunk in chunks for line in evaluator.lines(chunk)):
+                save([line])
         return
     # cloudpickle: methods and backbones that are defined in a notebook travel by value.
-    pickled, waiting, running = cloudpickle.dumps(setup), iter(chunks), set[Future]()
+    pickled, waiting, running = cloudpickle.dumps(make), iter(chunks), set[Future]()
     try:
         while True:
             # Two chunks per worker keep it busy; more would fill queues with copies of the backbone.
-            for chunk in islice(waiting, 2 * workers.number - len(running)):
-                running.add(workers.executor.submit(_evaluate_chunk, pickled, chunk))
+            for chunk in islice(waiting, 2 * workers - len(running)):
+                running.add(executor.submit(_evaluate_chunk, pickled, chunk))
             if not running:
                 return
             finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             # Failures last: all that has been evaluated is saved before an error ends the run.
             for future in sorted(finished, key=lambda one: one.cancelled() or one.exception() is not None):
                 save(future.result())
-    except workers.deaths as error:
-        fewer = f"run again to continue, with fewer workers than {workers.number}"
-        raise InputError(
-            f"a worker ended abruptly, perhaps out of memory; finished pairs are stored: {fewer}"
-        ) from error
+    except Exception as error:
+        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
+            fewer = f"run again to continue, with fewer workers than {workers}"
+            reason = "a worker ended abruptly, perhaps out of memory; finished pairs are stored"
+            raise InputError(f"{reason}: {fewer}") from error
+        raise
     finally:
         for future in running:
             future.cancel()
 
 
-def available_cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    # A container or a batch system may grant fewer than the machine has.
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_worker = threading.local()  # an executor's workers may be threads
+
+
+def _evaluate_chunk(make: bytes, chunk: Chunk) -> list[dict[str, Any]]:
+    """Evaluate a chunk in a worker, which keeps its evaluator for the next one."""
+    if getattr(_worker, "make", None) != make:
+        _worker.evaluator, _worker.make = cloudpickle.loads(make)(), make
+    with one_thread():
+        return list(_worker.evaluator.lines(chunk))
 
 
 @contextmanager
@@ -183,31 +135,34 @@ def one_thread() -> Iterator[None]:
             cv2.setNumThreads(cv2_threads)
 
 
-_worker = threading.local()  # an executor's workers may be threads
-
-
-def _evaluate_chunk(setup: bytes, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps its evaluator for the next one."""
-    if getattr(_worker, "setup", None) != setup:
-        _worker.evaluator = Evaluator(cloudpickle.loads(setup))
-        _worker.setup = setup
-    with one_thread():
-        return list(_worker.evaluator.records(chunk))
-
-
 @contextmanager
-def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    before = set(active_children())
-    # Spawned, not forked: a fork of a process whose threads have already computed may hang.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker)
-    try:
-        yield pool
-    except BaseException:
-        for child in set(active_children()) - before:
-            child.terminate()
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    pool.shutdown()
+def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor | None, int]]:
+    """Open an executor (None: this process) with its number of workers, and close it after the block.
+
+    It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor, which stays open.
+    """
+    if isinstance(executor, Executor):
+        yield executor, getattr(executor, "_max_workers", 1)
+    elif isinstance(executor, str):
+        with _dask(executor) as client:
+            # A chunk depends on files: equal arguments need not give equal results.
+            yield client.get_executor(pure=False), sum(client.nthreads().values())
+    else:
+        check_integer("workers", executor, 1, MOST_WORKERS)
+        if executor == 1:
+            yield None, 1
+            return
+        before = set(active_children())
+        # Spawned, not forked: a fork of a process whose threads have already computed may hang.
+        pool = ProcessPoolExecutor(executor, get_context("spawn"), _start_worker)
+        try:
+            yield pool, executor
+        except BaseException:
+            for child in set(active_children()) - before:
+                child.terminate()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _start_worker() -> None:
@@ -221,19 +176,17 @@ def _start_worker() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-@contextmanager
-def _dask(address: str) -> Iterator[Workers]:
+def _dask(address: str) -> Any:
+    """Connect to a Dask cluster."""
+    if not address.startswith("dask://"):
+        raise InputError(f"executor is {address!r}, expected a number of processes, dask://HOST:PORT or an Executor")
     try:
         from distributed import Client
-        from distributed.scheduler import KilledWorker
     except ImportError as error:
-        raise InputError("executor dask://: needs Dask: pip install dask distributed") from error
+        raise InputError(f"executor {address}: needs Dask: pip install dask distributed") from error
     try:
-        client = Client(f"tcp://{address}" if "://" not in address else address, timeout=_DASK_TIMEOUT)
+        client = Client(f"tcp://{address.removeprefix('dask://')}", timeout=_DASK_TIMEOUT)
         client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
     except (OSError, ValueError) as error:
-        raise InputError(f"executor dask://{address}: no scheduler with workers answers there ({error})") from error
-    with client:
-        # A chunk depends on files: equal arguments need not give equal results.
-        executor = client.get_executor(pure=False)
-        yield Workers(executor, sum(client.nthreads().values()), (BrokenExecutor, KilledWorker))
+        raise InputError(f"executor {address}: no scheduler with workers answers there ({error})") from error
+    return client

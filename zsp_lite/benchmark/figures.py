@@ -1,4 +1,4 @@
-"""Figures of a run: error distribution, error curves, accuracy against target views, and reliability of confidences."""
+"""Figures of a run: errors of every pair, error curves, and accuracy against the number of target views."""
 
 import re
 from collections.abc import Sequence
@@ -11,13 +11,9 @@ from matplotlib.figure import Figure
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.tables import own_rows, read_paper_tables
 from zsp_lite.choices import METRICS
-from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
-from zsp_lite.viz.reliability import draw_reliability, reliability
 
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")
-_DPI = 150
-_LEAST_STATED = 20
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
@@ -39,38 +35,6 @@ def error_distribution(run: Run, row: str = "ours") -> Figure:
     return figure
 
 
-def accuracy_against_views(run: Run) -> Figure:
-    """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals.
-
-    The results that the paper published for CO3D are dotted grey. InputError for fewer than two numbers of views.
-    """
-    methods, views = run.summary["methods"], run.summary["data"]["targets"]
-    table = next(one for one in read_paper_tables() if one["name"] == "table_a_targets")
-    numbers = [int(line["label"].rpartition(" ")[2]) for line in table["rows"]]
-    drawn = {}
-    own = [re.sub(r"-n\d+$", "", name) for name in own_rows(run.summary)]
-    for row in ("ours", "ours-bv", "verified", *dict.fromkeys(own)):
-        found = {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in numbers}
-        if len(found := {n: one for n, one in found.items() if one is not None}) > 1:
-            drawn[row] = found
-    if not drawn:
-        raise InputError("accuracy against views: the run has fewer than two numbers of target views")
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
-    for place, (axis, metric) in enumerate(zip(axes, ("acc30", "acc15"), strict=True)):
-        for index, (row, found) in enumerate(drawn.items()):
-            look = {"color": _COLOURS[index % len(_COLOURS)], "label": row}
-            ends = np.array([one[f"{metric}_ci"] for one in found.values()])
-            axis.fill_between(list(found), *ends.T, color=look["color"], alpha=0.18, lw=0)
-            axis.plot(list(found), [one[metric] for one in found.values()], "os^Dv"[index % 5] + "-", **look)
-        for first, row in ((0, "ours-bv"), (2, "ours")):  # the published columns: Acc30 and Acc15 of each
-            values = [line["published"][first + place] for line in table["rows"]]
-            axis.plot(numbers, values, ":", marker="s", ms=3, color="0.55", label=f"{row}, published on CO3D")
-        axis.set(xlabel="target views N", ylabel=METRICS[metric], xticks=numbers, ylim=(0, None))
-        axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    return figure
-
-
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     """Draw the cumulative distribution of the errors, one line per row; by default of seven, first one's own."""
     names = list(rows or dict.fromkeys([*own_rows(run.summary), *run.summary["methods"]]))[: len(_COLOURS)]
@@ -89,39 +53,52 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     return figure
 
 
-def reliability_diagram(run: Run) -> Figure:
-    """Draw a reliability diagram of the first row, one's own before others, that states enough confidences."""
-    stated, own = run.table.dropna(subset="confidence"), own_rows(run.summary)
-    enough = [name for name, row in stated.groupby("row", sort=False) if len(row) >= _LEAST_STATED]
-    enough.sort(key=lambda name: name not in own)
-    if not enough:
-        raise InputError(f"reliability: no row has {_LEAST_STATED} confidences")
-    row = stated[stated["row"] == enough[0]]
-    figure, axis = plt.subplots(figsize=(5, 5), layout="constrained")
-    right = (row["error"] < 30).to_numpy()
-    draw_reliability(axis, reliability(row["confidence"].to_numpy(), right, min(10, len(row) // 5)))
-    figure.suptitle(f'Confidences of "{enough[0]}"', fontsize=10)
+def accuracy_against_views(run: Run) -> Figure | None:
+    """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals; None without two numbers of views.
+
+    The results that the paper published for CO3D are dotted grey.
+    """
+    methods, views = run.summary["methods"], run.summary["data"]["targets"]
+    published = next(one["rows"] for one in read_paper_tables() if one["name"] == "table_a_targets")
+    numbers = [int(line["label"].rpartition(" ")[2]) for line in published]
+    names = dict.fromkeys(re.sub(r"-n\d+$", "", name) for name in own_rows(run.summary))
+    drawn = {
+        row: {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in numbers}
+        for row in ("ours", "ours-bv", "verified", *names)
+    }
+    drawn = {row: {n: one for n, one in found.items() if one} for row, found in drawn.items()}
+    drawn = {row: found for row, found in drawn.items() if len(found) > 1}
+    if not drawn:
+        return None
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
+    for place, (axis, metric) in enumerate(zip(axes, ("acc30", "acc15"), strict=True)):
+        for index, (row, found) in enumerate(drawn.items()):
+            colour, ends = _COLOURS[index % len(_COLOURS)], np.array([one[f"{metric}_ci"] for one in found.values()])
+            axis.fill_between(list(found), *ends.T, color=colour, alpha=0.18, lw=0)
+            values = [one[metric] for one in found.values()]
+            axis.plot(list(found), values, "os^Dv"[index % 5] + "-", color=colour, label=row)
+        for first, row in ((0, "ours-bv"), (2, "ours")):  # the published columns: Acc30 and Acc15 of each
+            values = [line["published"][first + place] for line in published]
+            axis.plot(numbers, values, ":", marker="s", ms=3, color="0.55", label=f"{row}, published on CO3D")
+        axis.set(xlabel="target views N", ylabel=METRICS[metric], xticks=numbers, ylim=(0, None))
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
     return figure
 
 
-def write_figures(run: Run, folder: str | Path) -> list[Path]:
-    """Write the figures for which the run has rows as PDF and PNG files; returns their paths."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+def write_figures(run: Run, folder: str | Path) -> None:
+    """Write the figures for which the run has rows as PDF and PNG files."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
     methods = run.summary["methods"]
     first = [*own_rows(run.summary), *(["ours"] if "ours" in methods else methods)][0]
-    makers = {"error_distribution": lambda: error_distribution(run, first)}
-    makers |= {"accuracy_against_views": lambda: accuracy_against_views(run)}
-    makers |= {"error_curves": lambda: error_curves(run), "reliability": lambda: reliability_diagram(run)}
-    written = []
-    for name, make in makers.items():
-        with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
-            try:
-                figure = make()
-            except InputError:  # the run has no rows for this figure
-                continue
-            for suffix in (".pdf", ".png"):
-                written.append(folder / f"{name}{suffix}")
-                figure.savefig(written[-1], dpi=_DPI, metadata={"CreationDate": None} if suffix == ".pdf" else None)
-        plt.close(figure)
-    return written
+    with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
+        figures = {
+            "error_distribution": error_distribution(run, first),
+            "error_curves": error_curves(run),
+            "accuracy_against_views": accuracy_against_views(run),
+        }
+        for name, figure in figures.items():
+            if figure is not None:
+                figure.savefig(Path(folder) / f"{name}.pdf", metadata={"CreationDate": None})
+                figure.savefig(Path(folder) / f"{name}.png", dpi=150)
+                plt.close(figure)

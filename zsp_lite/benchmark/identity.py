@@ -9,7 +9,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
 
 _PACKAGE = Path(__file__).parents[1]
-_DEPENDENCIES = ("torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d")
+_DEPENDENCIES = {"torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d"}
 
 
 def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
@@ -77,13 +77,11 @@ def library_version() -> dict[str, str | None]:
 
 def environment() -> dict[str, Any]:
     """Describe this call: time, command, versions of the library's dependencies, and machine."""
-    program, versions = Path(sys.argv[0]).name, {"python": platform.python_version()}
-    for package in _DEPENDENCIES:
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
+    program, installed = Path(sys.argv[0]).name, {one.name for one in distributions()}
+    words = ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]]
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]],
-        "versions": versions,
+        "command": [text.encode(errors="replace").decode() for text in words],
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in _DEPENDENCIES & installed},
         "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
     }

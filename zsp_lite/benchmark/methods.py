@@ -1,4 +1,4 @@
-"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and user-defined methods.
+"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own.
 
 A row is the paper's method with some settings changed, or a function (`solve`). `problem` defines the argument and the
 results of such functions.
@@ -9,17 +9,32 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from zsp_lite.baselines.posecontrast import load_posecontrast
+from zsp_lite.baselines.rootsift import RootSift
+from zsp_lite.baselines.sift import Sift
+from zsp_lite.baselines.swav import load_swav
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
 from zsp_lite.benchmark.own import Estimator, KeypointMatcher, import_object, kind_of, read_poses
 from zsp_lite.errors import InputError
+from zsp_lite.features import FeatureExtractor
+
+# Feature extractors by name, as functions of the backbone under test. They are called on images, or `describe` frames.
+EXTRACTORS: dict[str, Callable[[Any], Any]] = {
+    "none": lambda backbone: None,  # for rows that use depth only
+    "backbone": lambda backbone: backbone,
+    "rootsift": lambda backbone: RootSift(),
+    "sift": lambda backbone: Sift(),
+    "swav": lambda backbone: load_swav(),
+    "posecontrast": lambda backbone: load_posecontrast(),
+}
 
 
 @dataclass(frozen=True)
 class Method:
     """A row of the tables."""
 
-    features: str = "backbone"  # name of the feature extractor in `extractors.EXTRACTORS`
+    features: str = "backbone"  # name of the feature extractor in `EXTRACTORS`
     # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
     # rotation to the ground truth; or the rotation between the reference and the best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
@@ -110,13 +125,9 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
         InputError: A name is unknown, a thing cannot be imported or read, or is none of these.
     """
     if not isinstance(methods, Mapping):
-        members = [
-            one for name in ([methods] if isinstance(methods, str) else methods) for one in GROUPS.get(name, [name])
-        ]
-        methods = {}
-        for member in members:
-            name, _, meant = member.partition("=")
-            methods[name] = meant or name
+        names = [methods] if isinstance(methods, str) else methods
+        members = [member.partition("=") for name in names for member in GROUPS.get(name, [name])]
+        methods = {name: meant or name for name, _, meant in members}
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     return {str(name): _method(str(name), meant) for name, meant in methods.items()}
@@ -136,13 +147,15 @@ def _method(name: str, meant: Any) -> Method:
         meant = import_object(meant)
     if isinstance(meant, Method):
         return meant
-    try:
-        kind = kind_of(meant)
-    except InputError as error:
-        raise InputError(f"method {name!r} is {error}") from error
+    kind = kind_of(name, meant)
     if kind == "matcher":
         return Method(settings={"matcher": meant})
     return Method(solve={"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind, lambda own: own)(meant))
+
+
+def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
+    """Make the feature extractors of rows, by name."""
+    return {name: EXTRACTORS[name](backbone) for name in dict.fromkeys(method.features for method in methods.values())}
 
 
 def description(method: Method) -> str:

@@ -1,19 +1,19 @@
 """Methods of one's own: which kind of method an object is, and poses that another program computed."""
 
-import csv
-import importlib
 import inspect
 import io
-import operator
 import os
+import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from torch import nn
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
@@ -29,8 +29,8 @@ _QUESTION = ("category", "reference_sequence", "reference_frame", "target_sequen
 _POSE = {"rotation": 9, "translation": 3, "scale": 1}  # how many numbers
 
 
-def kind_of(thing: Any) -> str:
-    """Tell what a thing is: "estimator" (has `estimate`), or the function of one of `KINDS`.
+def kind_of(name: str, thing: Any) -> str:
+    """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of `KINDS`.
 
     The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
     InputError if it is none of these.
@@ -41,19 +41,18 @@ def kind_of(thing: Any) -> str:
         return kind
     found = f"a {type(thing).__name__}, which is no function"
     if callable(thing) and not isinstance(thing, type):
-        try:
+        found = "a function of unknown arguments"
+        with suppress(TypeError, ValueError):
             signature = inspect.signature(thing.forward if isinstance(thing, nn.Module) else thing)
-        except (TypeError, ValueError):
-            signature = inspect.Signature()
-        parameters = signature.parameters.values()
-        positional = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
-        needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
-        if positional and needed == positional[: len(needed)] and 1 <= len(needed) <= 3:
-            return KINDS[len(needed) - 1]
-        found = f"a function of {signature}"
+            found = f"a function of {signature}"
+            parameters = signature.parameters.values()
+            needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
+            if all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed):
+                return KINDS[range(1, 4).index(len(needed))]
     raise InputError(
-        f"{found}: expected an object with estimate(reference, targets), or a function of a problem, of two images, or "
-        f"of similarities and two foregrounds (its attribute `kind`, one of {', '.join(KINDS)}, may say which)"
+        f"method {name!r} is {found}: expected an object with estimate(reference, targets), or a function of a "
+        "problem, of two images, or of similarities and two foregrounds (its attribute `kind`, one of "
+        f"{', '.join(KINDS)}, may say which)"
     )
 
 
@@ -65,11 +64,10 @@ def describe_failure(error: BaseException) -> str:
 
 def import_object(path: str) -> Any:
     """Import the object "module:name" from an installed module or a module in the current folder."""
-    module, _, name = path.partition(":")
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
     try:
-        return operator.attrgetter(name)(importlib.import_module(module))
+        return pkgutil.resolve_name(path)
     except (Exception, SystemExit) as error:  # a module may raise anything
         reason = error if isinstance(error, ImportError | AttributeError) else describe_failure(error)
         raise InputError(f"{path!r} cannot be imported: {reason}") from error
@@ -82,7 +80,7 @@ class Estimator:
     own: Any
 
     def __call__(self, problem: Problem) -> Any:
-        reference, *targets = problem.full_frames()
+        reference, *targets = (problem.store.full_frame(key) for key in problem.keys)
         return self.own.estimate(reference, targets)
 
 
@@ -106,12 +104,11 @@ class KeypointMatcher:
 
 def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answer:
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
-    frames = problem.frames_with_depth()
-    reference, target = frames[0], frames[1 + view]
+    reference, *targets = problem.frames(depth=True)
     first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
     details = {"matches": len(first), "inliers": 0}
     try:
-        points = unproject_pixels(reference, first), unproject_pixels(target, second)
+        points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
         sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
@@ -124,7 +121,7 @@ class StoredPoses:
 
     path: str
     digest: str  # of the file
-    _poses: Mapping[tuple[str, str, int, str, int], Answer]
+    _poses: Mapping[tuple, Answer]
 
     def __call__(self, problem: Problem) -> Answer:
         pair = problem.pair
@@ -142,31 +139,32 @@ def read_poses(path: str | Path) -> StoredPoses:
     numbers, row by row) and, if they are known, translation (three numbers) and scale; numbers are separated by spaces.
     The pose leads from camera points of the reference frame to those of the target frame, any of the pair's.
     """
-    data = read_bytes(path, "poses")
+    data, poses = read_bytes(path, "poses"), {}
     try:
-        lines = list(csv.DictReader(io.StringIO(data.decode())))
-    except (UnicodeDecodeError, csv.Error) as error:
+        lines = pd.read_csv(io.BytesIO(data), dtype=str, keep_default_na=False, index_col=False).fillna("")
+    except ValueError as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
-    if missing := [name for name in (*_QUESTION, "rotation") if not lines or name not in lines[0]]:
-        raise InputError(f"poses {path}: no column {', '.join(missing)}, or no line")
-    poses = {}
-    for number, line in enumerate(lines, 2):
+    if missing := [name for name in (*_QUESTION, "rotation") if name not in lines]:
+        raise InputError(f"poses {path}: no column {', '.join(missing)}")
+    for number, line in enumerate(lines.to_dict("records"), 2):
         try:
-            rotation, translation, scale = (_numbers(line, name, size) for name, size in _POSE.items())
-            category, reference, reference_frame, target, target_frame = (line[name] for name in _QUESTION)
-            key = category, reference, int(reference_frame), target, int(target_frame)
-            poses[key] = as_answer(Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0]))
-        except (InputError, ValueError, AttributeError, TypeError) as error:
+            rotation, translation, scale = (_numbers(name, line.get(name, ""), size) for name, size in _POSE.items())
+            key = tuple(int(line[name]) if name.endswith("frame") else line[name] for name in _QUESTION)
+            answer = Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0])
+            poses[key] = as_answer(answer)
+        except ValueError as error:  # an InputError is one, too
             raise InputError(f"poses {path}, line {number}: {error}") from error
     return StoredPoses(str(path), digest(data), poses)
 
 
-def _numbers(line: Mapping[str, str], name: str, size: int) -> np.ndarray | None:
+def _numbers(name: str, text: str, size: int) -> np.ndarray | None:
     """Read the numbers of a column; None where it is empty."""
-    values = np.array([float(text) for text in (line.get(name) or "").split()])
-    if len(values) not in (size, 0 if name != "rotation" else size) or not np.isfinite(values).all():
-        raise ValueError(f"{name} is {line[name]!r}, expected {size} numbers separated by spaces")
-    return values if len(values) else None
+    if not text and name != "rotation":
+        return None
+    values = np.array([float(part) for part in text.split()])
+    if len(values) != size or not np.isfinite(values).all():
+        raise ValueError(f"{name} is {text!r}, expected {size} numbers separated by spaces")
+    return values
 
 
 def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> Path:
@@ -176,20 +174,20 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     folder; empty where there is none. The camera maps x_cam = R @ x_world + t, R row by row, and its intrinsics are in
     pixels with pixel centres at half-integers.
     """
-    lines = [["pair", "role", "category", "sequence", "frame", "image", "depth", "depth_scale", "mask", "fx", "fy"]]
-    lines[0] += ["cx", "cy", "R", "t"]
+    lines = []
     for number, pair in enumerate(pairs):
-        ends = [("reference", pair.reference_sequence, pair.reference_frame)]
-        ends += [("target", pair.target_sequence, frame) for frame in pair.target_frames]
-        for role, sequence, frame in ends:
+        ends = [(pair.reference_sequence, pair.reference_frame)]
+        for sequence, frame in [*ends, *((pair.target_sequence, frame) for frame in pair.target_frames)]:
             found = dataset.frame(pair.category, sequence, frame)
             camera, depth, mask = dataset.camera(found), found.depth, found.mask
-            files = [found.image.path, *((depth.path, depth.scale_adjustment) if depth else ("", ""))]
-            files += [mask.path if mask else ""]
-            values = [*camera.focal_length.tolist(), *camera.principal_point.tolist()]
-            values += [" ".join(map(repr, part.ravel().tolist())) for part in (camera.R, camera.t)]
-            lines.append([number, role, pair.category, sequence, frame, *files, *values])
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    write_atomic(path, text.getvalue().encode())
+            role = "reference" if (sequence, frame) in ends else "target"
+            line = {"pair": number, "role": role, "category": pair.category, "sequence": sequence, "frame": frame}
+            line |= {"image": found.image.path, "depth": depth and depth.path}
+            line |= {"depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path}
+            line |= dict(
+                zip(("fx", "fy", "cx", "cy"), (*camera.focal_length.tolist(), *camera.principal_point.tolist()))
+            )
+            line |= {name: " ".join(map(repr, getattr(camera, name).ravel().tolist())) for name in ("R", "t")}
+            lines.append(line)
+    write_atomic(path, pd.DataFrame(lines).to_csv(index=False).encode())
     return Path(path)

@@ -1,6 +1,5 @@
 """Argument and results of a benchmark row: `Problem` and `Answer`."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -10,18 +9,14 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.store import FrameKey, FrameStore
-from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
-from zsp_lite.estimates import Hypothesis, PoseEstimate
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
-# Members of a stored result; an answer's details must have other names.
-RESERVED = (
-    "error", "failed", "symmetric_error", "translation", "scale", "view", "note", "second_error", "one_of_two",
-)  # fmt: skip
 # What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
 _MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
 
@@ -35,10 +30,7 @@ class Answer:
     translation: Float[np.ndarray, "3"] | None = None  # in the target's unit, if the method estimates it
     scale: float | None = None  # if the method estimates it
     note: str = ""  # warning about the pose; "" for none
-    # Numbers and texts to store with the result, such as {"inliers": 12}; "timings" in it are seconds per stage.
-    details: Mapping[str, Any] = field(default_factory=dict)
-    hypotheses: tuple[Hypothesis, ...] = ()  # ranked candidate poses, of solvers that have them
-    one_of_two: bool = False  # whether the solver cannot decide between the two best poses
+    details: Mapping[str, Any] = field(default_factory=dict)  # numbers and texts to store, such as {"inliers": 12}
 
 
 class Row(Protocol):
@@ -73,13 +65,19 @@ class Row(Protocol):
 def as_answer(found: Any) -> Answer:
     """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
-        details = {"matches": len(found.matches), "inliers": int(found.inliers.sum()), "timings": found.timings}
+        details = {"matches": len(found.matches), "inliers": int(found.inliers.sum())}
         if found.confidence is not None:
             details["confidence"] = round(found.confidence, 4)
         sim3 = found.sim3
-        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details, found.hypotheses, found.one_of_two)
+        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details)
     if isinstance(found, Answer):
-        return replace(found, rotation=_rotation(found.rotation), details=_details(found.details))
+        details = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in found.details.items()
+        }
+        for name, value in details.items():
+            if not isinstance(value, bool | int | float | str | None):
+                raise InputError(f"detail {name} of the row is a {type(value).__name__}, expected a number or a text")
+        return replace(found, rotation=_rotation(found.rotation), details=details)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
@@ -88,17 +86,6 @@ def as_answer(found: Any) -> Answer:
 
 def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
     return Sim3(1.0, real_array("pose of the row", pose), np.zeros(3)).R
-
-
-def _details(details: Mapping[str, Any]) -> dict[str, Any]:
-    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in details.items()}
-    for name, value in plain.items():
-        if name in RESERVED or (name != "timings" and not isinstance(value, bool | int | float | str | None)):
-            raise InputError(
-                f"detail {name} of the row is a {type(value).__name__}, expected a number or a text with another name "
-                f"than {', '.join(RESERVED)}"
-            )
-    return plain
 
 
 class Problem:
@@ -112,7 +99,6 @@ class Problem:
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
         # (sequence, frame number) of the reference and of each target
         self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
-        self._shared: dict[tuple, Any] = {}
 
     @property
     def reference(self) -> View:
@@ -124,62 +110,55 @@ class Problem:
         """The targets' crops with the features of the run's backbone."""
         return self.views()[1:]
 
-    def frames(self) -> list[Frame]:
-        """Return the object crops, the reference's first, resized to the backbone's input."""
-        return [self.store.frame(key) for key in self.keys]
+    def frames(self, depth: bool = False) -> list[Frame]:
+        """Return the object crops, the reference's first, resized to the backbone's input.
 
-    def frames_with_depth(self) -> list[Frame]:
-        """Return `frames`; InputError, which fails the pair, if one has no depth map."""
-        if missing := [frame.name for frame in self.frames() if frame.depth is None]:
+        With `depth`, InputError, which fails the pair, if one has no depth map.
+        """
+        frames = [self.store.frame(key) for key in self.keys]
+        if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
             raise InputError(f"no depth map: {', '.join(missing)}")
-        return self.frames()
-
-    def full_frames(self) -> list[Frame]:
-        """Return the uncropped frames, the reference first."""
-        return [self.store.full_frame(key) for key in self.keys]
-
-    def descriptions(self, features: str = "backbone") -> list[Any]:
-        """Return what an extractor computes from each crop (see `extractors.EXTRACTORS`)."""
-        return [self.store.describe(features, key) for key in self.keys]
+        return frames
 
     def views(self, features: str = "backbone", foreground: str = "saliency") -> list[View]:
         """Return the crops with their features and foregrounds (see `views.frame_view`)."""
         return [self.store.view(features, key, foreground) for key in self.keys]
-
-    def first_cameras(self) -> tuple[Camera, Camera]:
-        """Return the cameras of the first frame of the reference's and the target's sequence."""
-        return self.store.first_camera(self.pair.reference_sequence), self.store.first_camera(self.pair.target_sequence)
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
     ) -> PoseEstimate:
         """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index.
 
-        Estimates that differ in later stages only share the matches.
+        Estimates that differ in later stages only share the similarities and the matches.
         """
-        name = (features, target, tuple(sorted((settings or {}).items(), key=lambda item: item[0])))
-        if name not in self._shared:
-            method = ZeroShotPose(self.store.extractors[features], **(settings or {}), seed=self.seed)
-            self._shared[name] = self._estimate(features, method, target)
-        return self._shared[name]
+        keys = tuple(self.keys[1:] if target is None else [self.keys[1 + target]])
 
-    def _estimate(self, features: str, method: ZeroShotPose, target: int | None) -> PoseEstimate:
-        reference, *views = self.views(features, method.foreground)
-        keys = self.keys[1:]
-        if target is not None:
-            keys, views = [keys[target]], [views[target]]
-        if not method.upright:
-            return method.estimate_from_views(reference, views)
-        settings = tuple(getattr(method, name) for name in _MATCH_SETTINGS)
-        matched, seconds = [], 0.0
-        for key, view in zip(keys, views):
-            name = ("matches", features, key, settings)
-            if name not in self._shared:
-                similarity = self.store.similarity(features, self.keys[0], key, method, reference, view)
-                start = time.perf_counter()
-                self._shared[name] = method.match_views(reference, [view], [similarity]), time.perf_counter() - start
-            one, matching_seconds = self._shared[name]
-            matched += one
-            seconds += matching_seconds
-        found = method.estimate_from_views(reference, views, matched)
-        return replace(found, timings={"matching": seconds} | found.timings)
+        def compute() -> PoseEstimate:
+            method = ZeroShotPose(self.store.extractors[features], **(settings or {}), seed=self.seed)
+            reference, *targets = (self.store.view(features, key, method.foreground) for key in (self.keys[0], *keys))
+            matched = None  # a reference that may stand on its side is matched in four turns
+            if method.upright:
+                matched = [self._match(features, method, key, reference, view) for key, view in zip(keys, targets)]
+            found = method.estimate_from_views(reference, targets, matched)
+            for stage, seconds in found.timings.items():
+                self.store.timings.setdefault(stage, []).append(round(seconds, 5))
+            return found
+
+        return self._shared("estimate", keys, self.seed, features, *sorted((settings or {}).items()), make=compute)
+
+    def _match(self, features: str, method: ZeroShotPose, key: FrameKey, reference: View, target: View) -> Any:
+        def compare() -> Any:
+            with self.store.timed("similarity"):
+                return (similarities if method.binning else key_similarities)(reference.features, [target.features])
+
+        def match() -> Any:
+            similarity = self._shared("similarity", key, features, method.binning, make=compare)
+            with self.store.timed("matching"):
+                (found,) = method.match_views(reference, [target], similarity)
+            return found
+
+        settings = (getattr(method, name) for name in _MATCH_SETTINGS)
+        return self._shared("matches", key, self.seed, features, *settings, make=match)
+
+    def _shared(self, *name: Any, make: Any) -> Any:
+        return self.store.shared((self.keys[0], self.pair.target_sequence), name, make)

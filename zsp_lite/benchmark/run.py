@@ -2,9 +2,9 @@
 
 import json
 import logging
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,9 @@ from tqdm import tqdm
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark import execution
-from zsp_lite.benchmark.extractors import make_extractors
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, Method, description, resolve
-from zsp_lite.benchmark.runs import add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, resolve
+from zsp_lite.benchmark.runs import Call, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
@@ -64,46 +63,51 @@ def evaluate(
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     row_pairs = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-    extractors = make_extractors(loaded, [row.features for row in rows.values()])
+    extractors = make_extractors(loaded, rows)
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
-    settings = {
-        "data": str(data).encode(errors="replace").decode(), "backbone": fingerprint(loaded), "targets": targets,
-        "library": library_version(), "labels": _labels(dataset, row_pairs),
-        "origins": {
-            f"{name}, N = {n}": "evaluation set" if shipped_pairs(dataset, name, n, at_least=number) else "sampled"
-            for name, number in numbers.items() for n in dict.fromkeys(row.targets or targets for row in rows.values())
-        },
-        "methods": {name: description(row) + others.get(row.features, "") for name, row in rows.items()},
-    }  # fmt: skip
-    with open_run(out, settings, allow_other_version), execution.open_workers(executor) as workers:
-        threads = max(1, min(get_num_threads(), execution.available_cores() // workers.number))
-        setup = execution.Setup(str(Path(data).resolve()), rows, backbone, settings["backbone"], threads)
-        known = {(row, line["pair"]) for line in read_lines(out) for row in line.get("results", ())}
-        todo = rows_of_pairs(
-            {name: [pair for pair in found if (name, pair.key) not in known] for name, found in row_pairs.items()}
-        )
-        total, left = (sum(map(len, work.values())) for work in (rows_of_pairs(row_pairs), todo))
-        call = {"workers": workers.number, "rows": list(rows), "categories": list(numbers), "pairs": dict(numbers)}
-        add_lines(out, [{"call": environment() | call}])
-        start = time.perf_counter()
-        size = max(1, min(execution.CHUNK_SIZE, left // (4 * workers.number)))
-        chunks = [chunk for found in todo.values() for chunk in execution.make_chunks(found, size)]
-        # Hidden outside a terminal, and where the user wants to hear warnings only.
-        hidden = None if logger.isEnabledFor(logging.INFO) else True
-        with tqdm(total=total, initial=total - left, unit="pair", delay=1, disable=hidden) as bar:
-
-            def save(evaluated: list[dict[str, Any]]) -> None:
-                add_lines(out, evaluated)
-                bar.update(len(evaluated))
-
-            execution.evaluate_chunks(setup, chunks, workers, save, extractors)
-        add_lines(out, [{"seconds": round(time.perf_counter() - start, 2)}])
-        summary = read_run(out).summary
-        write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
+    with execution.open_workers(executor) as (pool, workers):
+        settings = Settings(
+            data=str(data).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
+            library=[library_version()], labels={category: _labels(dataset, category) for category in numbers},
+            methods={name: description(row) + others.get(row.features, "") for name, row in rows.items()},
+            origins={
+                f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
+                for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
+            },
+            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
+        )  # fmt: skip
+        with open_run(out, settings, allow_other_version):
+            setup = str(Path(data).resolve()), rows, backbone, max(1, get_num_threads() // workers)
+            make = partial(execution.Evaluator, *setup, extractors=None if pool else extractors)
+            known = {(row, line.pair) for line in read_lines(out) for row in line.results}
+            asked = [(pair, name) for name, found in row_pairs.items() for pair in found]
+            todo: dict[Pair, list[str]] = {}
+            for pair, name in asked:
+                if (name, pair.key) not in known:
+                    todo.setdefault(pair, []).append(name)
+            evaluate_pairs(out, make, todo, len({pair for pair, _ in asked}), pool, workers)
+            summary = read_run(out).summary
+            write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
     return summary
+
+
+def evaluate_pairs(
+    out: str | Path, make: Callable[[], Any], todo: Mapping[Pair, list[str]], total: int, pool: Any, workers: int
+) -> None:
+    """Evaluate the rows of pairs, and add what is found to a run's folder at once; a progress bar counts to `total`."""
+    size = max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
+    # Hidden outside a terminal, and where the user wants to hear warnings only.
+    hidden = None if logger.isEnabledFor(logging.INFO) else True
+    with tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar:
+
+        def save(lines: list[dict[str, Any]]) -> None:
+            add_lines(out, lines)
+            bar.update(len(lines))
+
+        execution.evaluate_chunks(make, execution.make_chunks(todo, size), pool, workers, save)
 
 
 def pairs_of_rows(
@@ -115,9 +119,10 @@ def pairs_of_rows(
         raise InputError(f"{dataset.root}: no categories {unknown or ''}, found {', '.join(known) or 'none'}")
     for category, number in numbers.items():
         check_integer(f"pairs of {category}", number, 1)
-    found: dict[int, list[Pair]] = {}
-    for n_targets in dict.fromkeys(row.targets or targets for row in rows.values()):
-        found[n_targets] = [pair for name, n in numbers.items() for pair in category_pairs(dataset, name, n, n_targets)]
+    found = {
+        n_targets: [pair for category, n in numbers.items() for pair in category_pairs(dataset, category, n, n_targets)]
+        for n_targets in {row.targets or targets for row in rows.values()}
+    }
     return {name: found[row.targets or targets] for name, row in rows.items()}
 
 
@@ -127,25 +132,7 @@ def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list
     return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
 
 
-def rows_of_pairs(row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, dict[Pair, list[str]]]:
-    """Return the rows that are evaluated on each pair, by category and pair."""
-    work: dict[str, dict[Pair, list[str]]] = {}
-    for name, pairs in row_pairs.items():
-        for pair in dict.fromkeys(pairs):
-            work.setdefault(pair.category, {}).setdefault(pair, []).append(name)
-    return work
-
-
-def _labels(dataset: Co3D, row_pairs: Mapping[str, Sequence[Pair]]) -> dict[str, str]:
-    """Hashes of the pose labels that the pairs need, by CATEGORY/SEQUENCE."""
-    used = {
-        (pair.category, name)
-        for pairs in row_pairs.values() for pair in pairs
-        for name in (pair.reference_sequence, pair.target_sequence)
-    }  # fmt: skip
-    found, labels = {}, {category: read_labels(dataset.root, category) for category, _ in used}
-    for category, name in sorted(used):
-        if name not in labels[category]:
-            raise InputError(f"{category}/{name}: no pose label, expected one for each sequence of a pair")
-        found[f"{category}/{name}"] = digest(labels[category][name].trans, labels[category][name].reference_seq)
-    return found
+def _labels(dataset: Co3D, category: str) -> str:
+    """Hash of the pose labels of a category."""
+    labels = read_labels(dataset.root, category)
+    return digest(*(part for name, label in labels.items() for part in (name, label.trans, label.reference_seq)))

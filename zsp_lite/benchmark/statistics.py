@@ -38,9 +38,6 @@ def object_draws(
         categories: The category of each pair; the draws of one do not depend on the others. None for one category.
         resamples: Number of replicates.
         seed: Seed of the draws; equal pairs and seeds give equal weights.
-
-    Returns:
-        Weights of the pairs, a row for each replicate; for `bootstrap_ci`, `summarise` and `paired_test`.
     """
     objects = np.asarray(objects, dtype=str)
     categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
@@ -68,22 +65,18 @@ def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Draws:
 
 
 def bootstrap_ci(
-    errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None, level: float = 0.95
+    errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None
 ) -> tuple[float, float]:
-    """Compute the percentile bootstrap interval of a statistic.
+    """Compute the 95 % percentile bootstrap interval of a statistic.
 
     Args:
         errors: (n,).
         statistic: Maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
             `lambda errors, weights: accuracy(errors, 30, weights)` do.
         weights: From `object_draws`; None for `pair_draws(n)`, which treats pairs as independent.
-        level: Confidence level.
-
-    Returns:
-        The lower and the upper end of the interval.
     """
     errors = np.asarray(errors, np.float64)
-    return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights), level)
+    return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights))
 
 
 def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
@@ -100,10 +93,9 @@ def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
     }
     summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    for name, figure in figures.items():
-        summary[f"{name}_ci"] = list(bootstrap_ci(errors, figure, weights))
-    summary["above150"] = float(100 * np.mean(errors > 150))
-    return summary | {"auc30": float(100 * np.mean(np.clip(1 - errors / 30, 0, None)))}
+    summary |= {f"{name}_ci": list(bootstrap_ci(errors, figure, weights)) for name, figure in figures.items()}
+    above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
+    return summary | {"above150": float(above150), "auc30": float(auc30)}
 
 
 def mean_category_median(
@@ -118,22 +110,20 @@ def mean_category_median(
 
 def paired_difference(
     first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None
-) -> dict:
-    """Measure by how much the second method is better than the first on the same pairs (see `paired_test`)."""
+) -> dict[str, float]:
+    """Measure by how much the second method is more accurate than the first on the same pairs (see `paired_test`)."""
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    weights = pair_draws(len(first)) if weights is None else weights
-    gain, result = 100.0 * (second < threshold) - 100.0 * (first < threshold), {}
-    for name, values in (("accuracy_gain", gain), ("error_drop", first - second)):
-        replicates = weighted_mean(values, weights).round(9)  # rounding errors must not hide a difference of 0
-        p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
-        found = {"": float(values.mean()), "_ci": list(_interval(replicates)), "_p": min(1.0, float(p))}
-        result |= {f"{name}{suffix}": value for suffix, value in found.items()}
-    return result
+    gain = 100.0 * (second < threshold) - 100.0 * (first < threshold)
+    # Rounding errors must not hide a difference of 0.
+    replicates = weighted_mean(gain, pair_draws(len(gain)) if weights is None else weights).round(9)
+    p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
+    interval = list(_interval(replicates))
+    return {"accuracy_gain": float(gain.mean()), "accuracy_gain_ci": interval, "accuracy_gain_p": min(1.0, float(p))}
 
 
 def paired_test(
     first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None, seed: int = 0
-) -> dict:
+) -> dict[str, float]:
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
     The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
@@ -147,35 +137,28 @@ def paired_test(
         seed: Seed of the permutation test, which is exact for up to 13 pairs.
 
     Returns:
-        {"accuracy_gain": second - first in percentage points, "error_drop": mean of first - second in degrees, for both
-        NAME_ci: the 95 % bootstrap interval, and NAME_p: the p value that the same bootstrap gives, "sign_test_p":
-        McNemar's exact test over the pairs that only one of the two solves, "permutation_test_p": of the mean
-        difference, by 10,000 flips of the differences' signs}.
+        {"accuracy_gain": second - first in percentage points, "accuracy_gain_ci": its 95 % bootstrap interval,
+        "accuracy_gain_p": the p value that the same bootstrap gives, "sign_test_p": McNemar's exact test over the pairs
+        that only one of the two solves, "permutation_test_p": of the mean difference of the errors, by 10,000 flips of
+        the differences' signs}.
     """
-    from scipy.stats import permutation_test
+    from scipy.stats import binomtest, permutation_test
 
-    result = paired_difference(first, second, threshold, weights)
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    solved = first < threshold, second < threshold
+    only_first, only_second = int((solved[0] & ~solved[1]).sum()), int((solved[1] & ~solved[0]).sum())
+    sign = float(binomtest(only_first, only_first + only_second).pvalue) if only_first + only_second else 1.0
     p = 1.0  # of one pair: both signs give the same absolute difference, and scipy refuses one pair
     if len(first) > 1:
         how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
         p = permutation_test((first - second,), np.mean, rng=seed, **how).pvalue
-    return result | {"sign_test_p": sign_test(first < threshold, second < threshold), "permutation_test_p": float(p)}
+    tests = {"sign_test_p": sign, "permutation_test_p": float(p)}
+    return paired_difference(first, second, threshold, weights) | tests
 
 
-def sign_test(first: ArrayLike, second: ArrayLike) -> float:
-    """Compute the exact two-sided p value of McNemar's test of which pairs each of two methods solves."""
-    from scipy.stats import binomtest
-
-    first, second = np.asarray(first), np.asarray(second)
-    only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
-    return float(binomtest(only_first, only_first + only_second).pvalue) if only_first + only_second else 1.0
-
-
-def _interval(replicates: np.ndarray, level: float = 0.95) -> tuple[float, float]:
-    """Compute the percentile interval of bootstrap replicates (resamples,)."""
-    tail = 50 * (1 - level)
-    low, high = np.percentile(replicates, [tail, 100 - tail])
+def _interval(replicates: np.ndarray) -> tuple[float, float]:
+    """Compute the 95 % percentile interval of bootstrap replicates (resamples,)."""
+    low, high = np.percentile(replicates, [2.5, 97.5])
     return float(low), float(high)
 
 

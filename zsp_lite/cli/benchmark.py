@@ -2,11 +2,12 @@
 
 import logging
 import textwrap
+from pathlib import Path
 
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, refuse_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples
 
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
@@ -54,7 +55,6 @@ def benchmark(
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
         return _list_methods()
-    from zsp_lite.benchmark.compare import write_reports
     from zsp_lite.benchmark.methods import resolve
     from zsp_lite.benchmark.own import write_questions
     from zsp_lite.benchmark.run import evaluate, pairs_of_rows
@@ -72,11 +72,11 @@ def benchmark(
         print(f"Written: {write_questions(list_pairs, dataset, every)}, {len(every)} pairs")
         return None
     summary = evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
-    write_reports(out, metrics=metrics)
+    _write_reports(out, out, metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
         _print_summary(summary, metrics, with_paper=len(summary["methods"]) > 3)
-        print(f"Written: {out / 'summary.json'}, tables/, figures/, results.jsonl.gz")
+        print(f"Written: {out / 'summary.json'}, tables/, figures/")
     return None
 
 
@@ -90,44 +90,34 @@ def _list_methods() -> None:
         print(textwrap.fill(f"{name}: {', '.join(members)}", 100, subsequent_indent="    ", break_on_hyphens=False))
 
 
+def _write_reports(run: Path, out: Path, metrics: list[str]) -> dict:
+    """Write the tables and figures of a run; returns its summary."""
+    from zsp_lite.benchmark.figures import write_figures
+    from zsp_lite.benchmark.runs import read_run
+    from zsp_lite.benchmark.tables import every_table, write_tables
+
+    found = read_run(run)
+    write_tables(every_table(found.summary, metrics), out / "tables")
+    write_figures(found, out / "figures")
+    return found.summary
+
+
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     """Print the tables of a summary, with those of the paper or without."""
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_tables
 
-    found = [tables.all_rows(summary, metrics), *tables.best_two_tables(summary)]
-    found += tables.paper_tables(summary) if with_paper else []
-    print_tables([*found, tables.by_category(summary, list(summary["methods"])[:_ROWS_SHOWN])])
+    paper = tables.paper_tables(summary) if with_paper else []
+    print_tables([tables.all_rows(summary, metrics), *paper, tables.by_category(summary, most=_ROWS_SHOWN)])
 
 
-@click.command(
-    epilog=examples(
-        "tables outputs/benchmark",
-        "tables outputs/seed0 outputs/seed1 --out outputs/tables",
-        "tables notebooks/results/paper_run/procedural.jsonl.gz --into docs/results.md",
-    )
-)
-@click.argument("runs", type=PATH, nargs=-1, required=True)
-@click.option("--out", type=PATH, show_default="the run's folder; none for several runs", help="Folder to write.")
-@click.option("--into", type=PATH, help="Only update the marked tables of this Markdown file.")
+@click.command(epilog=examples("tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"))
+@click.argument("run", type=PATH)
+@click.option("--out", type=PATH, show_default="the run's folder", help="Folder to write.")
 @metrics_option
-def tables(runs, out, into, metrics) -> None:
-    """Write tables and figures of a benchmark run, or of several runs on different objects, pooled.
-
-    A run is its folder or its results.jsonl.gz.
-    """
-    from zsp_lite.benchmark.compare import write_reports
-    from zsp_lite.benchmark.runs import read_runs
-    from zsp_lite.benchmark.tables import every_table, update_document
-
-    if into:
-        refuse_options({"out": out}, (), "--into")
-        summary = read_runs(runs).summary
-        update_document(into, every_table(summary, metrics), max(row["n"] for row in summary["methods"].values()))
-        print(f"Written: {into}")
-    else:
-        found = write_reports(runs, out, metrics) if len(runs) == 1 or out else read_runs(runs)
-        _print_summary(found.summary, metrics, with_paper=True)
+def tables(run, out, metrics) -> None:
+    """Write tables and figures of a benchmark run, also of one that goes on."""
+    _print_summary(_write_reports(run, out or run, metrics), metrics, with_paper=True)
 
 
 @click.command(epilog=examples("compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"))
@@ -138,16 +128,14 @@ def tables(runs, out, into, metrics) -> None:
 def compare(run_a, run_b, rows, out) -> None:
     """Compare two benchmark runs on their common pairs, with intervals over objects and tests of significance.
 
-    RUN_A and RUN_B are folders of runs or files results.jsonl.gz.
+    RUN_A and RUN_B are folders of runs.
     """
-    from zsp_lite.benchmark.compare import compare as compare_runs
-    from zsp_lite.benchmark.compare import comparison_table, split_rows
+    from zsp_lite.benchmark.runs import compare as compare_runs
     from zsp_lite.benchmark.runs import read_run
-    from zsp_lite.benchmark.tables import write_tables
+    from zsp_lite.benchmark.tables import comparison_table, write_tables
     from zsp_lite.cli.terminal import print_tables
 
-    results = read_run(run_a), read_run(run_b)
-    found = compare_runs(*results, [split_rows(text, *results) for text in rows] if rows else None)
+    found = compare_runs(read_run(run_a), read_run(run_b), rows)
     table = comparison_table(found, str(run_a), str(run_b))
     print_tables([table])
     if out:

@@ -1,0 +1,42 @@
+"""Put the tables of the stored runs into the pages: python -m tools.results_page.
+
+A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->, without its notes and
+without the columns of single categories.
+"""
+
+import re
+
+from zsp_lite.benchmark.runs import read_run
+from zsp_lite.benchmark.tables import Table, as_markdown, every_table
+from zsp_lite.io.files import write_atomic
+from zsp_lite.samples import REPOSITORY
+
+RUNS = REPOSITORY / "notebooks" / "results" / "paper_run"
+PAGE = REPOSITORY / "docs" / "results.md"
+_MARKED = re.compile(r"(<!-- table (\w+) (\w+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
+
+
+def updated(text: str) -> str:
+    """Replace the marked tables of a page."""
+
+    def render(found: re.Match[str]) -> str:
+        start, run, name, _, end = found.groups()
+        summary = read_run(RUNS / run).summary
+        (table,) = (one for one in every_table(summary) if one.name == name)
+        cells = table.cells.loc[:, [not re.fullmatch(r"\w+ Acc30", title) for _, title in table.cells.columns]]
+        cells = cells.rename(columns=lambda group: group.removeprefix("this run").removeprefix(": "), level="group")
+        title = f"{table.title} ({max(row['n'] for row in summary['methods'].values()):,} pairs)"
+        shown = Table(name, title, list(cells.columns), dict(zip(cells.index, cells.to_numpy().tolist())))
+        return f"{start}{as_markdown(shown)}\n{end}"
+
+    return _MARKED.sub(render, text)
+
+
+def main() -> None:
+    """Update the page of results."""
+    write_atomic(PAGE, updated(PAGE.read_text(encoding="utf-8")).encode())
+    print(f"Written: {PAGE}")
+
+
+if __name__ == "__main__":
+    main()
