@@ -10,7 +10,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified.maps import Projection, ViewMaps
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
-from zsp_lite.viz import feature_plots, plots, result_plots, verified
+from zsp_lite.viz import plots, verified
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.reliability import draw_reliability, reliability
 
@@ -29,10 +29,26 @@ def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     np.testing.assert_allclose(centres, [[10, 10], [70, 50]])
     similar = np.zeros((3, 4))
     similar[2, 1] = 0.9
-    figure = feature_plots.similarities_of_patch(IMAGE, (0, 0), [IMAGE], {"key": similar}, np.array([1, 3]))
-    first, second = (axis for axis in figure.axes if axis.get_title())
+    maps, circles = {"this patch": None, "key": similar}, [(0, 0), (2, 1)]
+    first, second = plots.show_maps([IMAGE, IMAGE], maps, circles=circles, stars=[None, (1, 3)]).axes
     marks = [(line.get_marker(), *line.get_xydata()[0]) for axis in (first, second) for line in axis.lines]
-    assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]  # the patch, the most similar one, the true one
+    assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]
+
+
+def test_the_outline_of_patches_is_cut_at_the_border_of_the_image():
+    _, (axis,) = plots.show_images([IMAGE])
+    for cell, reach in (((1, 2), 0), ((1, 2), 1), ((0, 5), 1)):
+        plots.outline_patch(axis, cell, (3, 4), reach)
+    boxes = [[40, 20, 60, 40], [20, 0, 80, 60], [40, 0, 80, 40]]
+    assert [patch.get_bbox().extents.tolist() for patch in axis.patches] == boxes
+
+
+def test_the_panels_of_points_share_their_extent():
+    square = np.array([[0, 0], [0, 2], [4, 0], [4, 2.0]])
+    panels = {"a": {"square": square}, "b": {"moved": square / 2 + 7, "far": square + 100}}
+    first, second = plots.show_points(panels).axes
+    assert np.diff(first.get_xlim()) == pytest.approx(np.diff(second.get_xlim()))
+    assert np.mean(first.get_xlim()) == pytest.approx(2) and np.mean(second.get_ylim()) == pytest.approx(7.5)
 
 
 def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():
@@ -58,8 +74,11 @@ def test_the_reference_is_drawn_where_the_pose_puts_it():
     reference = render(look_at((0.9, 0.3, 0.3)), AT_HOME, "a/0")
     targets = [render(look_at(ELSEWHERE.R @ at), ELSEWHERE, "b") for at in ((1, 0.2, 0.3), (0.8, -0.5, 0.2))]
     estimate = ZeroShotPose(CoordinateBackbone()).estimate(reference, targets)
-    at_home = reference.camera.to_world(object_cloud(estimate.reference_view, most=1400))
-    for axis, frame in zip(result_plots.pose_over_sequence(estimate, targets, "ab").axes, targets):
+    cloud, cameras = object_cloud(estimate.reference_view, most=1400), [frame.camera for frame in targets]
+    at_home = reference.camera.to_world(cloud)
+    _, axes = plots.show_images([frame.rgb for frame in targets])
+    plots.draw_moved_cloud(axes, cameras, cloud, estimate.propagate(cameras))
+    for axis, frame in zip(axes, targets):
         expected, _ = frame.camera.project(ELSEWHERE.apply(at_home))
         shown = np.asarray(axis.collections[0].get_offsets())
         assert np.linalg.norm(np.sort(shown, axis=0) - np.sort(expected, axis=0), axis=1).mean() < 8

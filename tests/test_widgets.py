@@ -8,7 +8,6 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import torch
 from synthetic_views import level_camera
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
@@ -98,16 +97,16 @@ def test_attention_names_the_patch_with_the_largest_weight():
     assert f"patch ({top[0]}, {top[1]})" in widget.caption.value
 
 
-def test_facets_are_those_of_the_backbone_and_the_caption_has_the_share_of_correct_neighbours():
-    truth, widget = examples.sample_pair(), examples.facets()
-    images = [truth.reference.rgb, truth.target.rgb]
-    facets = features.all_facets(load_backbone("zsp-tiny", "cpu"), images)
-    for layer, facet in ((9, "token"), (3, "value"), (11, "key")):
-        first, second = (one.keys for one in load_backbone("zsp-tiny", "cpu", layer=layer, facet=facet)(images))
-        assert torch.allclose(facets[layer, facet][0, 1:], first.flatten(0, 1), atol=1e-3)
-        cells = np.stack(np.divmod(similarity(first, second).argmax(1).numpy(), 28), -1).reshape(28, 28, 2)
-        widget.controls["layer"].value, widget.controls["facet"].value = layer, facet
-        assert f"{correct_matches(cells, truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
+def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
+    truth = examples.sample_pair()
+    kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
+    widget = features.similarities(truth.reference.rgb, truth.target.rgb, kinds, truth.cells, truth.valid, "other")
+    widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
+    row, col = cells[15 * 28 + 9]
+    assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
+    assert (
+        f"{correct_matches(cells.reshape(28, 28, 2), truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
+    )
 
 
 def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
@@ -168,14 +167,6 @@ def test_cameras_on_a_circle_are_on_a_circle_from_above():
     assert np.allclose(np.diff(turns), 45) and np.allclose(np.linalg.norm(ring, axis=1), 1)
     from_first = np.degrees(np.arctan2(*other[0][::-1])) - turns[0]
     assert np.isclose((from_first + 180) % 360 - 180, 20)
-
-
-def test_lines_end_in_the_second_image_and_outliers_have_their_own_lines():
-    canvas = views.MatchCanvas(plt.figure().add_subplot(), *np.zeros((2, 10, 20, 3)), ("a", "b"))
-    canvas.draw(np.array([[1, 2], [3, 4]]), np.array([[5, 6], [7, 8]]), np.array([True, False]))
-    (inlier,), (outlier,) = canvas.inliers.get_segments(), canvas.outliers.get_segments()
-    assert inlier.tolist() == [[1, 2], [5 + canvas.offset, 6]] and canvas.offset > 20
-    assert outlier.tolist() == [[3, 4], [7 + canvas.offset, 8]]
 
 
 # alignment, hypotheses and metrics

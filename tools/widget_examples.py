@@ -19,14 +19,14 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.demo import demo_pairs
 from zsp_lite.estimates import match_points
 from zsp_lite.labelling.session import Labelling
-from zsp_lite.matching import match, similarity
+from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.samples import sample_data
 from zsp_lite.synthetic.ground_truth import GroundTruthPair, ground_truth_pair
 from zsp_lite.verified import Solution, VerifiedSolver
 from zsp_lite.views import View, extract_views
-from zsp_lite.viz.plots import patch_centres
+from zsp_lite.viz.plots import match_pixels
 from zsp_lite.widgets import alignment as alignment_widgets
 from zsp_lite.widgets import features, labelling, masks, matching, metrics, verified, views
 
@@ -68,18 +68,13 @@ def attention() -> "VBox":
     return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
-def facets() -> "VBox":
-    """`features.facets` on a sample pair."""
-    pair = sample_pair()
+def similarities() -> "VBox":
+    """`features.similarities` on a sample pair: the keys of two layers, and those of the last with context."""
+    pair, (first, second) = sample_pair(), sample_views()
     tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
-    maps = {name: tuple(values[:, 1:].unflatten(1, GRID)) for name, values in tokens.items()}
-    return features.facets(pair.reference.rgb, pair.target.rgb, maps, pair.cells, pair.valid)
-
-
-def context() -> "VBox":
-    """`features.context` on a sample pair."""
-    pair, keys = sample_pair(), tuple(view.features.keys for view in sample_views())
-    return features.context(pair.reference.rgb, pair.target.rgb, keys, pair.cells, pair.valid)
+    sims = {f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)}
+    sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
+    return features.similarities(pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid)
 
 
 def saliency() -> "VBox":
@@ -117,11 +112,7 @@ def ransac_settings() -> "VBox":
     pair = sample_views()
     found = match(pair[0].features, pair[1].features)
     images = tuple(view.frame.rgb for view in pair)
-    pixels = tuple(
-        patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
-        for cells, view in zip((found.reference, found.target), pair)
-    )
-    return alignment_widgets.ransac_settings(images, pixels, match_points(*pair, found))
+    return alignment_widgets.ransac_settings(images, tuple(match_pixels(pair, found)), match_points(*pair, found))
 
 
 def one_outlier() -> "VBox":
@@ -180,7 +171,7 @@ def label_poses() -> "VBox":
 WIDGETS: dict[str, Callable[[], "VBox"]] = {
     build.__name__: build
     for build in (
-        attention, facets, context, saliency, cycle, matches, best_view, ransac_settings, one_outlier,
+        attention, similarities, saliency, cycle, matches, best_view, ransac_settings, one_outlier,
         measured_accuracy, accuracy_threshold, symmetry_rotation, ranked_hypotheses, box_to_mask, label_poses,
     )
 }  # fmt: skip

@@ -1,6 +1,6 @@
 """The photographed motorcycle: its pose, estimated from views of a synthetic one, and figures of it."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import matplotlib.pyplot as plt
@@ -125,20 +125,11 @@ def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) ->
     centre = np.median(object_points(photograph), axis=0)
     _draw(axes[1 + columns], photograph.camera, np.stack([front, np.cross(up, front), up], axis=1), centre)
     for index, result in enumerate(results):
-        _draw_result(axes[index // columns * (1 + columns) + 1 + index % columns], result)
+        draw_result(axes[index // columns * (1 + columns) + 1 + index % columns], result)
     return figure
 
 
-def photograph_by_backbone(results: Mapping[str, PhotographResult], columns: int = 2, size: float = 4.0) -> Figure:
-    """Draw the aligned cloud and the estimated directions on the photograph, one panel per backbone."""
-    pictures = [result.photograph.rgb for result in results.values()]
-    figure, axes = plots.show_images(pictures, list(results), columns=columns, size=size)
-    for axis, result in zip(axes, results.values()):
-        _draw_result(axis, result)
-    return figure
-
-
-def _draw_result(axis: Axes, result: PhotographResult) -> None:
+def draw_result(axis: Axes, result: PhotographResult) -> None:
     """Draw points of the aligned cloud and the estimated directions."""
     chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
     colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]

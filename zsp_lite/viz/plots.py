@@ -1,16 +1,18 @@
 """Plots of every stage of the method, as primitives to combine.
 
-`show_images` shows images side by side; `overlay_map`, `mark`, `circle_patch`, `draw_points` and `draw_axes` add to its
-axes. `show_maps` shows maps over images, `show_matches` lines between two images, `show_curves`, `show_panels` and
-`show_intervals` values over x. Colours are distinguishable with colour-vision deficiencies.
+`show_...` makes a figure: images in a grid, maps over images, matches between two, curves, points, intervals, dots by
+category, histograms. `draw_...`, `overlay_map` and the marks add to axes, so that a figure is a few calls. A patch is a
+cell (row, col) of a grid (rows, columns). Colours are distinguishable with colour-vision deficiencies.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Bool, Float, Integer, Real, UInt8
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -23,19 +25,25 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.errors import InputError
+from zsp_lite.matching import Matches
 from zsp_lite.points import axis_deviation, near_median, object_pixels
 from zsp_lite.views import View
+
+Cell = Sequence[int] | np.ndarray  # (row, col)
 
 # The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 CHOSEN = ORANGE
-# Of several curves or groups of points in one figure, in this order.
+# Of several curves or groups of points in one figure, in this order and then again.
 COLOURS = BLUE, ORANGE, GREEN, VERMILLION
-LINES = "-", "--", "-.", ":"
-MARKERS = "o", "s", "^", "D"
+_LINES = "-", "--", "-.", ":"
+_MARKERS = "os^DvP*X"
+_CLOUD_MARKERS = "oxs^"  # crosses let discs below them be seen
 _AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
 _MARKED = 20  # points of a curve; more have no markers
+_OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]  # for lines and texts on dark images
+BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]  # for white lines on light images
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 _INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
@@ -46,26 +54,30 @@ def plain_text(text: str) -> str:
 
 
 def show_images(
-    images: Sequence[np.ndarray], titles: Sequence[str] | None = None, columns: int | None = None, size: float = 2.4
+    images: Sequence[np.ndarray],
+    titles: Sequence[str] = (),
+    columns: int | None = None,
+    size: float = 2.4,
+    cmap: str = "gray",
 ) -> tuple[Figure, list[Axes]]:
     """Show images (H, W, 3) or (H, W) in a grid, each `size` inches wide; returns the figure and one axis per image.
 
     Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
     """
-    columns = min(columns or len(images), len(images))
-    rows = -(-len(images) // columns)
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
-    title_height = 0.1 + 0.2 * max((title.count("\n") + 1 for title in titles or []), default=0)
-    height = (size * aspect + title_height) * rows
-    figure, grid = plt.subplots(rows, columns, figsize=(size * columns, height), squeeze=False, layout="constrained")
-    axes = list(grid.flat)
-    for axis in axes:
-        axis.set_axis_off()
+    figure, axes = _panels(len(images), columns, size, size * aspect + 0.1 + 0.2 * _lines_of(titles))
     for axis, image in zip(axes, images):
-        _draw_image(axis, image)
-    for axis, title in zip(axes, titles or []):
+        axis.set_axis_off()
+        draw_image(axis, image, cmap)
+    for axis, title in zip(axes, titles):
         axis.set_title(plain_text(title), fontsize=_FONT)
-    return figure, axes[: len(images)]
+    return figure, axes
+
+
+def draw_image(axis: Axes, image: np.ndarray, cmap: str = "gray") -> None:
+    """Draw an image, with pixel (x, y) at (x, y) of the axes."""
+    height, width = np.shape(image)[:2]
+    axis.imshow(image, cmap=cmap, extent=(0, width, height, 0), interpolation="nearest")
 
 
 def overlay_map(
@@ -110,10 +122,62 @@ def patch_centres(
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
 
-def circle_patch(axis: Axes, cell: tuple[int, int], grid: tuple[int, int], image: np.ndarray, size: float = 7) -> None:
-    """Mark a patch (row, col) of the image of an axis by a white circle."""
-    (centre,) = patch_centres(np.array([cell]), grid, image.shape[:2])
-    axis.plot(*centre, "o", color="white", markersize=size, markeredgecolor="black")
+def match_pixels(views: Sequence[View], matches: Matches) -> list[Float[np.ndarray, "n 2"]]:
+    """Return the pixels (x, y) of matched patches in the images of the reference and of the target."""
+    cells = matches.reference, matches.target
+    return [patch_centres(own, view.features.grid, view.frame.rgb.shape[:2]) for own, view in zip(cells, views)]
+
+
+def circle_patch(axis: Axes, cell: Cell, grid: tuple[int, int], marker: str = "o") -> list[Artist]:
+    """Mark a patch of the image of an axis by a white circle, or by an orange star (`marker` "*")."""
+    style = {"color": ORANGE, "markersize": 18} if marker == "*" else {"color": "white", "markersize": 7}
+    centre = patch_centres(np.array([cell]), grid, _size(axis)).T
+    return axis.plot(*centre, marker, markeredgecolor="black", zorder=8, **style)
+
+
+def outline_patch(
+    axis: Axes,
+    cell: Cell,
+    grid: tuple[int, int],
+    reach: int = 0,
+    colour: str = "white",
+    label: str = "",
+    **style: Any,
+) -> list[Artist]:
+    """Outline a patch of the image of an axis, or the block of patches up to `reach` around it, with a label beside it.
+
+    A cell outside the image is moved to its border, and the block is cut there.
+    """
+    centre = np.clip(cell, 0, np.subtract(grid, 1))
+    corners = np.clip([centre - reach, centre + reach + 1], 0, grid)
+    (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
+    box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
+    at, side = (right, "left") if centre[1] < 0.8 * grid[1] else (left, "right")
+    name = axis.text(at, (top + bottom) / 2, f" {label} ", ha=side, va="center", weight="bold", path_effects=_OUTLINE)
+    return [axis.add_patch(box), name]
+
+
+def draw_cycle(
+    axes: Sequence[Axes],
+    cells: Sequence[Cell] | np.ndarray,
+    grid: tuple[int, int],
+    colour: str = "white",
+    names: Sequence[str] = ("u", "v", "u'"),
+) -> list[Artist]:
+    """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v back to u'."""
+    ends = axes[0], axes[1], axes[0]
+    places = [patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, ends)]
+    drawn = axes[0].plot(*places[0], "o", color=colour, markeredgecolor="black", markersize=8)
+    for start, line in ((0, "-"), (1, "--")):
+        arrow = ConnectionPatch(
+            places[start], places[start + 1], "data", "data", axesA=ends[start], axesB=ends[start + 1],
+            arrowstyle="-|>", mutation_scale=14, connectionstyle="arc3,rad=-0.1", linestyle=line, linewidth=2,
+            color=colour, path_effects=BORDER,
+        )  # fmt: skip
+        drawn.append(axes[0].figure.add_artist(arrow))
+    for axis, place, name, side in zip(ends, places, names, ("left", "left", "right")):
+        drawn.append(axis.text(*place, name, fontsize=11, weight="bold", va="bottom", ha=side, path_effects=_OUTLINE))
+    return drawn
 
 
 def show_matches(
@@ -124,64 +188,135 @@ def show_matches(
     titles: Sequence[str] = ("reference", "target"),
     size: float = 3.4,
 ) -> Figure:
-    """Show two images with a line for each match of patches (row, col); outliers are thin, dashed and grey.
+    """Show two images with a line for each match of patches (row, col), as `draw_matches` draws it."""
+    figure, axes = show_images(images, titles, size=size)
+    draw_matches(axes, [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)], inliers)
+    return figure
+
+
+def draw_matches(
+    axes: Sequence[Axes], pixels: Sequence[Real[np.ndarray, "n 2"]], inliers: Bool[np.ndarray, " n"] | None = None
+) -> list[Artist]:
+    """Draw a line for each match, between pixels (x, y) of the images of two axes; outliers are thin, dashed and grey.
 
     The colour of an inlier depends on its row in the first image, so that lines can be told apart.
     """
-    first, second = (patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images))
-    inliers = np.ones(len(first), bool) if inliers is None else inliers
-    figure, (left, right) = show_images(images, titles, size=size)
+    inliers = np.ones(len(pixels[0]), bool) if inliers is None else inliers
     # plasma without its brightest end, which is not visible on light images.
-    colours = plt.get_cmap("plasma")(0.85 * first[:, 1] / len(images[0]))
-    for a, b, good, colour in sorted(zip(first, second, inliers, colours, strict=True), key=lambda match: match[2]):
+    colours = plt.get_cmap("plasma")(0.85 * pixels[0][:, 1] / _size(axes[0])[0])
+    drawn = []
+    for a, b, good, colour in sorted(zip(*pixels, inliers, colours, strict=True), key=lambda match: match[2]):
         style = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
         if good:  # with a white outline, to be visible on dark images
-            style = {
-                "color": colour,
-                "linewidth": 1.8,
-                "path_effects": [Stroke(linewidth=3, foreground="white"), Normal()],
-            }
-        figure.add_artist(ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, zorder=5, **style))
-        for axis, pixel in ((left, a), (right, b)):
-            axis.plot(
-                *pixel,
-                marker="o" if good else "x",
-                markersize=5 if good else 4,
-                color=style["color"],
-                markeredgecolor="white" if good else style["color"],
-                markeredgewidth=0.7,
-            )
-    return figure
+            style = {"color": colour, "linewidth": 1.8, "path_effects": _OUTLINE}
+        line = ConnectionPatch(a, b, "data", "data", axesA=axes[0], axesB=axes[1], zorder=5, **style)
+        drawn.append(axes[0].figure.add_artist(line))
+    for axis, at in zip(axes, pixels):
+        drawn.append(axis.scatter(*at[~inliers].T, 16, "0.35", marker="x", linewidths=0.7))
+        drawn.append(axis.scatter(*at[inliers].T, 25, colours[inliers], edgecolors="white", linewidths=0.7))
+    return drawn
 
 
-def draw_curves(axis: Axes, curves: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> None:
-    """Draw up to four curves (x, y) that differ in colour, line and marker, each with its name for the legend."""
-    for (name, (x, y)), colour, line, marker in zip(curves.items(), COLOURS, LINES, MARKERS):
-        marker = marker if len(x) <= _MARKED else None
-        axis.plot(x, y, line, marker=marker, color=colour, label=name, markersize=5)
+def draw_curves(axis: Axes, curves: Mapping[str, tuple[ArrayLike, ArrayLike]], joined: bool = True) -> None:
+    """Draw curves (x, y) that differ in colour, line and marker, each with its name for the legend.
+
+    Only their points are drawn if they are not `joined`.
+    """
+    for (name, (x, y)), colour, line, marker in zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS)):
+        if joined:
+            axis.plot(x, y, line, marker=marker if len(x) <= _MARKED else None, color=colour, label=name, markersize=5)
+        else:
+            axis.scatter(x, y, 50, colour, marker=marker, edgecolors="black", linewidths=0.4, label=name)
 
 
 def show_curves(x: ArrayLike, curves: Mapping[str, ArrayLike], **labels: Any) -> Figure:
-    """Show up to four curves over x; `labels` is what `Axes.set` takes, such as xlabel, ylabel and ylim."""
-    figure, axis = plt.subplots(figsize=(7, 3.5), layout="constrained")
-    draw_curves(axis, {name: (x, y) for name, y in curves.items()})
-    axis.set(**labels)
-    figure.legend(ncols=len(curves), fontsize=9, loc="outside upper center")
-    return figure
+    """Show curves over x; `labels` is what `Axes.set` takes, such as xlabel, ylabel and ylim."""
+    return show_panels({"": {name: (x, y) for name, y in curves.items()}}, size=(7, 3.5), **labels)
 
 
 def show_panels(
-    panels: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike]]], columns: int | None = None, **labels: Any
+    panels: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike]]],
+    columns: int | None = None,
+    joined: bool = True,
+    size: tuple[float, float] = (10, 3.4),
+    **labels: Any,
 ) -> Figure:
-    """Show up to four curves (x, y) in each panel, by its title, with one legend; `labels` is what `Axes.set` takes."""
-    columns = min(columns or len(panels), len(panels))
-    rows = -(-len(panels) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(10, 3.4 * rows), layout="constrained", squeeze=False)
-    for axis, (title, curves) in zip(axes.flat, panels.items()):
-        draw_curves(axis, curves)
+    """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one legend.
+
+    `size` is the width of the figure and the height of a row; `labels` is what `Axes.set` takes.
+    """
+    width = size[0] / min(columns or len(panels), len(panels))
+    figure, axes = _panels(len(panels), columns, width, size[1])
+    for axis, (title, curves) in zip(axes, panels.items()):
+        draw_curves(axis, curves, joined)
         axis.set(title=title, **labels)
-    names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*names, ncols=len(names[0]), fontsize=9, loc="outside upper center")
+    _legend(figure, axes[0])
+    return figure
+
+
+def show_points(
+    panels: Mapping[str, Mapping[str, Real[np.ndarray, "_ _"]]],
+    columns: int | None = None,
+    size: float = 4.5,
+    colours: Sequence[str] = (BLUE, ORANGE),
+    down: bool = False,
+    **labels: Any,
+) -> Figure:
+    """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one legend.
+
+    All panels have the same extent, around the first set of each; points far off it are cut. The y axis points `down`
+    as in images. `labels` is what `Axes.set` takes.
+    """
+    firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
+    ranges = np.array([np.percentile(points, [1, 99], axis=0) for points in firsts])
+    extent = (ranges[:, 1] - ranges[:, 0]).max(axis=0)
+    half = extent / 2 + 0.2 * extent.max()
+    height = size * half[1] / half[0] + 0.6 + 0.2 * _lines_of(panels)
+    figure, axes = _panels(len(panels), columns, size, height)
+    for axis, (title, sets), (x, y) in zip(axes, panels.items(), ranges.mean(axis=1)):
+        for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
+            area = np.clip(6000 / max(len(points), 1), 3, 40)
+            style = {"marker": marker, "linewidths": 0.3 + 0.03 * area, "label": name}
+            axis.scatter(*points.T[:2], area, colour, **style)
+        axis.set_title(plain_text(title), fontsize=_FONT)
+        y_limits = (y + half[1], y - half[1]) if down else (y - half[1], y + half[1])
+        axis.set(**{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels)
+    _legend(figure, axes[0], "outside lower center", markerscale=2)
+    return figure
+
+
+def show_dots(groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True, **labels: Any) -> Figure:
+    """Show values as a row of dots for each name, with a bar at the `median`; several groups differ in colour.
+
+    `groups` has the values by the name of the row, by the name of the group; `labels` is what `Axes.set` takes.
+    """
+    rows = list(next(iter(groups.values())))
+    figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(rows)), layout="constrained")
+    rng, width = np.random.default_rng(0), 0.5 / len(groups)
+    for index, ((group, values), colour, marker) in enumerate(zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))):
+        for row, name in enumerate(rows):
+            middle = row + width * (index - (len(groups) - 1) / 2)
+            height = middle + width * rng.uniform(-0.4, 0.4, len(values[name]))
+            style = {"marker": marker, "edgecolors": "white", "linewidths": 0.4, "label": "" if row else group}
+            axis.scatter(values[name], height, 40, colour, **style)
+            if median and len(values[name]):
+                axis.vlines(np.median(values[name]), middle - 0.4, middle + 0.4, color=VERMILLION, linewidth=2.5)
+    axis.set_yticks(range(len(rows)), rows)
+    axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
+    if len(groups) > 1:
+        _legend(figure, axis)
+    return figure
+
+
+def show_histograms(groups: Mapping[str, ArrayLike], bins: ArrayLike | int = 20, **labels: Any) -> Figure:
+    """Show histograms of one to four groups over each other: the first filled, the others as hatched outlines."""
+    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    edges = np.histogram_bin_edges(np.concatenate([np.ravel(values) for values in groups.values()]), bins)
+    for (name, values), colour, hatch in zip(groups.items(), (BLUE, VERMILLION, ORANGE, GREEN), ("", "//", "..", "xx")):
+        style = {"histtype": "step", "hatch": hatch, "linewidth": 2} if hatch else {"alpha": 0.8}
+        axis.hist(values, edges, color=colour, label=name, **style)
+    axis.set(**labels)
+    _legend(figure, axis)
     return figure
 
 
@@ -194,7 +329,7 @@ def show_intervals(
     values of a row if they are `joined`; `labels` is what `Axes.set` takes.
     """
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
-    styles = zip(intervals.items(), COLOURS, LINES, MARKERS)
+    styles = zip(intervals.items(), COLOURS, _LINES, _MARKERS)
     for place, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
         beside = offset_copy(axis.transData, figure, x=5 * (place - (len(intervals) - 1) / 2), units="points")
         line = line if joined else "none"
@@ -203,27 +338,32 @@ def show_intervals(
             artist.set_transform(beside)  # after the limits of the axis are known
     axis.set(**labels)
     axis.minorticks_off()
-    figure.legend(ncols=len(intervals), fontsize=9, loc="outside upper center")
+    _legend(figure, axis)
     return figure
 
 
 def show_maps(
     images: Sequence[np.ndarray],
-    maps: Mapping[str, Real[np.ndarray, "rows cols"]],
+    maps: Mapping[str, Real[np.ndarray, "rows cols"] | None],
     columns: int | None = None,
     size: float = 3.0,
-    circles: Sequence[tuple[int, int]] = (),
+    circles: Sequence[Cell] = (),
+    stars: Sequence[Cell | None] = (),
     **style: Any,
 ) -> Figure:
-    """Show each map, by its title, over its image, with a circle around one of its patches (row, col) where given.
+    """Show each map, by its title, over its image; None is an image without a map.
 
-    `style` is what `overlay_map` takes.
+    `circles` and `stars` mark one patch of each image, and `style` is what `overlay_map` takes.
     """
     figure, axes = show_images(images, list(maps), columns, size)
+    grid = next(np.shape(values) for values in maps.values() if values is not None)
     for axis, values in zip(axes, maps.values()):
-        overlay_map(axis, values, **style)
-    for axis, cell, values, image in zip(axes, circles, maps.values(), images):
-        circle_patch(axis, cell, values.shape, image)
+        if values is not None:
+            overlay_map(axis, values, **style)
+    for marker, cells in (("o", circles), ("*", stars)):
+        for axis, cell in zip(axes, cells):
+            if cell is not None:
+                circle_patch(axis, cell, grid, marker)
     return figure
 
 
@@ -297,7 +437,7 @@ def draw_axes(
             zorder=7,
             ha="center",
             va="center",
-            path_effects=[Stroke(linewidth=3, foreground="white"), Normal()],
+            path_effects=_OUTLINE,
         )
     _keep_limits(axis, camera.size)
 
@@ -357,9 +497,30 @@ def coloured_cloud(
     return points[kept], colours[kept]
 
 
-def _draw_image(axis: Axes, image: np.ndarray) -> None:
-    height, width = np.shape(image)[:2]
-    axis.imshow(image, cmap="gray", extent=(0, width, height, 0), interpolation="nearest")
+def _panels(number: int, columns: int | None, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Return panels of a size in inches in a grid, by default in one row."""
+    columns = min(columns or number, number)
+    rows = -(-number // columns)
+    size = columns * width, rows * height
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in axes.flat[number:]:
+        axis.remove()
+    return figure, list(axes.flat[:number])
+
+
+def _legend(figure: Figure, axis: Axes, place: str = "outside upper center", **style: Any) -> None:
+    handles, names = axis.get_legend_handles_labels()
+    figure.legend(handles, names, ncols=min(len(names), 4), fontsize=9, loc=place, **style)
+
+
+def _lines_of(titles: Iterable[str]) -> int:
+    """Return the most lines of a title."""
+    return max((title.count("\n") + 1 for title in titles), default=0)
+
+
+def _size(axis: Axes) -> tuple[int, int]:
+    """Return the size (H, W) of the image that covers an axis."""
+    return round(axis.get_ylim()[0]), round(axis.get_xlim()[1])
 
 
 def _keep_limits(axis: Axes, size: tuple[int, int]) -> None:

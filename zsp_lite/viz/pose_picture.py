@@ -15,7 +15,7 @@ from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult
 from zsp_lite.points import world_cloud
-from zsp_lite.viz.plots import BLUE, CHOSEN, VERMILLION, coordinate_colours, draw_points
+from zsp_lite.viz.plots import BLUE, CHOSEN, VERMILLION, coordinate_colours, draw_image, draw_points
 
 _OTHERS = 5  # target views that are shown beside the chosen one
 _POINTS = 1500
@@ -171,6 +171,5 @@ def _some(points: np.ndarray) -> np.ndarray:
 
 
 def _show(axis: Axes, image: np.ndarray, title: str, font: float = 10) -> None:
-    height, width = image.shape[:2]
-    axis.imshow(image, extent=(0, width, height, 0), interpolation="nearest")
+    draw_image(axis, image)
     axis.set_title(title, fontsize=font)

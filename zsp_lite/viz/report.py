@@ -28,7 +28,6 @@ from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.viz.feature_plots import matches_of_estimate
 from zsp_lite.viz.photograph import (
     PHOTOGRAPH_COLUMNS,
     PHOTOGRAPH_CREDIT,
@@ -37,6 +36,7 @@ from zsp_lite.viz.photograph import (
     photograph_rows,
 )
 from zsp_lite.viz.pose_picture import pose_picture
+from zsp_lite.viz.result_plots import matches_of_estimate
 from zsp_lite.viz.scene3d import STYLES, aligned_clouds
 
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")

@@ -1,8 +1,8 @@
 """Plots for the verified solver: the point terms of a pose in every view, and its score."""
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
@@ -15,7 +15,19 @@ from zsp_lite.verified.maps import ViewMaps
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.verification import TERM_NAMES, PointTerms, ScoreCoefficients
 from zsp_lite.views import View
-from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_axes, draw_points, mark, object_cloud, show_images
+from zsp_lite.viz.plots import (
+    BLUE,
+    ORANGE,
+    VERMILLION,
+    draw_axes,
+    draw_points,
+    mark,
+    object_cloud,
+    show_dots,
+    show_images,
+    show_panels,
+    show_points,
+)
 
 # Classes of a projected point, each with its colour and marker.
 POINT_CLASSES: dict[str, tuple[str, str]] = {
@@ -64,21 +76,16 @@ def show_point_classes(
 
     `images` and `names` are those of the `views` of the maps. Points outside an image are drawn at its border.
     """
-    figure, rows = _show_poses(images, names, poses, len(images) if len(images) > 1 else len(poses), size)
-    for pose, axes in enumerate(rows):
-        classes, pixels = classify_points(terms, pose)[views], _image_pixels(terms, maps, pose)[views]
+    figure, panels = _show_poses(images, terms, maps, views, names, poses, size)
+    for axis, pose, view, pixels in panels:
+        classes = classify_points(terms, pose)[view]
         # Violations are drawn last, so that no other point covers them.
         for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
-            colour, marker = list(POINT_CLASSES.values())[index]
-            style = {"s": 6 if index == _UNKNOWN else 14, "c": colour, "marker": marker, "linewidths": 0.4}
-            for axis, view_classes, view_pixels in zip(axes, classes, pixels):
-                at = _clip_to_image(axis, view_pixels[view_classes == index])
-                axis.scatter(*at.T, edgecolors="black", zorder=3, **style)
-    handles = [
-        plt.Line2D([], [], marker=marker, linestyle="", color=colour, markeredgecolor="black", label=name)
-        for name, (colour, marker) in POINT_CLASSES.items()
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, handletextpad=0.1)
+            name, (colour, marker) = list(POINT_CLASSES.items())[index]
+            style = {"marker": marker, "edgecolors": "black", "linewidths": 0.4, "zorder": 3, "label": name}
+            axis.scatter(*pixels[classes == index].T, 6 if index == _UNKNOWN else 14, colour, **style)
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, handletextpad=0.1)
     return figure
 
 
@@ -95,19 +102,15 @@ def show_point_term(
 
     Marker areas grow with the term; those of the similarity grow with the surface weight that multiplies it.
     """
-    figure, rows = _show_poses(images, names, poses, len(images), 3.0)
+    figure, panels = _show_poses(images, terms, maps, views, names, poses, 3.0)
     label, (low, high) = _POINT_TERMS[term]
-    for pose, axes in enumerate(rows):
-        values = getattr(terms, term)[pose].numpy()[views]
-        weights = terms.surface[pose].numpy()[views] if term == "similarity" else values
-        for axis, value, weight, pixels in zip(axes, values, weights, _image_pixels(terms, maps, pose)[views]):
-            order = np.argsort(weight, kind="stable")
-            style = {"s": 16 * (0.15 + 1.2 * weight[order]), "c": value[order], "vmin": low, "vmax": high}
-            at = _clip_to_image(axis, pixels[order])
-            drawn = axis.scatter(*at.T, cmap="viridis", edgecolors="black", linewidths=0.3, zorder=3, **style)
-        bar = figure.colorbar(drawn, ax=axes, location="right", shrink=0.8, pad=0.01)
-        bar.set_label(label, fontsize=8)
-        bar.ax.tick_params(labelsize=8)
+    for axis, pose, view, pixels in panels:
+        values = getattr(terms, term)[pose, view].numpy()
+        weights = terms.surface[pose, view].numpy() if term == "similarity" else values
+        order = np.argsort(weights, kind="stable")
+        style = {"s": 16 * (0.15 + 1.2 * weights[order]), "c": values[order], "vmin": low, "vmax": high}
+        drawn = axis.scatter(*pixels[order].T, edgecolors="black", linewidths=0.3, zorder=3, **style)
+    figure.colorbar(drawn, ax=[axis for axis, *_ in panels], shrink=0.6, pad=0.01, label=label)
     return figure
 
 
@@ -164,14 +167,12 @@ def show_moved_reference(
 
 def show_proposal_errors(errors: Float[np.ndarray, " m"], sources: Sequence[str]) -> Figure:
     """Show the rotation error of every proposal, one row per source, in order of appearance."""
-    rows = list(dict.fromkeys(sources))
-    figure, axis = plt.subplots(figsize=(7.5, 0.9 + 0.42 * len(rows)), layout="constrained")
+    rows = {name: errors[np.array(sources) == name] for name in dict.fromkeys(sources)}
+    labels = {"xlabel": "rotation error (degrees)", "xlim": (-4, 184), "xticks": range(0, 181, 30)}
+    figure = show_dots({"": rows}, median=False, **labels)
+    (axis,) = figure.axes
     axis.axvspan(0, MODE_ANGLE, color="0.9", zorder=0, label="within 30 degrees of the truth")
     axis.axvspan(150, 180, color=ORANGE, alpha=0.25, zorder=0, linewidth=0, label="about half a turn off")
-    axis.scatter(errors, [rows.index(source) for source in sources], s=50, color=BLUE, edgecolors="white", zorder=3)
-    axis.set(xlabel="rotation error (degrees)", xlim=(-4, 184), xticks=range(0, 181, 30))
-    axis.set_yticks(range(len(rows)), rows)
-    axis.set_ylim(len(rows) - 0.4, -0.6)
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
     return figure
 
@@ -183,62 +184,45 @@ def show_from_above(
 
     Above means along the y axis of the scene's first target camera, which points down.
     """
-    columns = min(len(poses), 3)
-    rows = -(-len(poses) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(3.3 * columns, 3.5 * rows + 0.3), sharex=True, sharey=True, squeeze=False,
-        layout="constrained",
-    )  # fmt: skip
-    for axis in list(axes.flat)[len(poses) :]:
-        axis.set_axis_off()
-    there = target_points.numpy()[:, [0, 2]].T
-    for axis, moved, title in zip(axes.flat, poses.apply(reference_points).numpy(), titles):
-        axis.scatter(*there, s=5, marker="D", color=ORANGE, linewidths=0, label="targets, all views")
-        axis.scatter(*moved[:, [0, 2]].T, s=7, color=BLUE, linewidths=0, label="reference, moved")
-        axis.set(title=title, xlim=(-2.6, 2.6), ylim=(-2.6, 2.6), box_aspect=1, xlabel="x, to the right")
-        axis.title.set_fontsize(10)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("z, away")
-    figure.get_layout_engine().set(h_pad=0.08)  # otherwise the legend covers the labels
-    handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=2, markerscale=3)
-    return figure
+    moved, across = poses.apply(reference_points).numpy(), [0, 2]
+    targets = {"targets, all views": target_points.numpy()[:, across]}
+    panels = {title: targets | {"reference, moved": one[:, across]} for title, one in zip(titles, moved)}
+    return show_points(panels, 3, 3.3, (ORANGE, BLUE), xlabel="x, to the right", ylabel="z, away")
 
 
 def show_stages(stages: Mapping[str, tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> Figure:
     """Show score (nats) against rotation error (degrees) of every pose after each stage; a star marks the highest."""
-    figure, axes = plt.subplots(
-        1, len(stages), figsize=(3.1 * len(stages), 3.4), sharey=True, squeeze=False, layout="constrained"
-    )
-    for axis, (stage, (error, score)) in zip(axes[0], stages.items()):
+    scores = np.concatenate([score for _, score in stages.values()])
+    margin = 0.06 * np.ptp(scores)
+    labels = {"xlim": (-8, 188), "xticks": range(0, 181, 60), "ylim": (scores.min() - margin, scores.max() + margin)}
+    labels |= {"xlabel": "rotation error (degrees)", "ylabel": "score (nats)"}
+    panels = {f"{stage} ({len(found[0])})": {"a pose; star: highest score": found} for stage, found in stages.items()}
+    figure = show_panels(panels, joined=False, size=(3.1 * len(stages), 3.4), **labels)
+    for axis, (error, score) in zip(figure.axes, stages.values()):
         best = int(np.argmax(score))
         axis.axvspan(0, MODE_ANGLE, color="0.9", zorder=0)
-        axis.scatter(error, score, s=30, color=BLUE, edgecolors="white", linewidths=0.5, label="a pose")
-        axis.scatter(
-            error[best], score[best], s=150, marker="*", color=ORANGE, edgecolors="black", label="highest score"
-        )
-        axis.set(title=f"{stage} ({len(error)})", xlabel="rotation error (degrees)")
-        axis.set(xlim=(-8, 188), xticks=range(0, 181, 60))
-    axes[0, 0].set_ylabel("score (nats)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+        axis.plot(error[best], score[best], "*", color=ORANGE, markersize=14, markeredgecolor="black")
     return figure
 
 
 def _show_poses(
-    images: Sequence[np.ndarray], names: Sequence[str], poses: Sequence[str], columns: int, size: float
-) -> tuple[Figure, list[list[Axes]]]:
-    """Show the images of some views once for each pose; return the axes by pose."""
+    images: Sequence[np.ndarray],
+    terms: PointTerms,
+    maps: ViewMaps,
+    views: Sequence[int],
+    names: Sequence[str],
+    poses: Sequence[str],
+    size: float,
+) -> tuple[Figure, list[tuple[Axes, int, int, Float[np.ndarray, "n 2"]]]]:
+    """Show the images of some views once for each pose; return axis, pose, view, and the points' pixels in the image.
+
+    Pixels outside the image are moved to its border.
+    """
     titles = [f"{pose}: {name}" for pose in poses for name in names]
+    columns = len(images) if len(images) > 1 else len(poses)
     figure, axes = show_images(list(images) * len(poses), titles, columns=columns, size=size)
-    return figure, [axes[start : start + len(images)] for start in range(0, len(axes), len(images))]
-
-
-def _image_pixels(terms: PointTerms, maps: ViewMaps, pose: int) -> Float[np.ndarray, "v n 2"]:
-    """Pixels (x, y) of the points in the images of the views."""
-    return (terms.projection.pixels[pose] * maps.pixel_scale[:, None]).double().numpy()
-
-
-def _clip_to_image(axis: Axes, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Clip pixels to the limits of `axis`, which its image covers."""
-    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    return np.clip(pixels, [left, top], [right, bottom])
+    panels = []
+    for axis, (pose, view) in zip(axes, product(range(len(poses)), views)):
+        pixels = (terms.projection.pixels[pose, view] * maps.pixel_scale[view]).double().numpy()
+        panels.append((axis, pose, view, pixels.clip(0, (axis.get_xlim()[1], axis.get_ylim()[0]))))
+    return figure, panels

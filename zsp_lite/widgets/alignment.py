@@ -8,10 +8,10 @@ from matplotlib.collections import LineCollection
 from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION
-from zsp_lite.widgets.common import Widget, interactive_figure, load_package, slider, small_text
-from zsp_lite.widgets.views import MatchCanvas
+from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
+from zsp_lite.widgets.common import Widget, interactive_figure, load_package, redrawing, slider, small_text
 
+_FARTHEST = 6.0  # that `one_outlier` moves the point, scene units
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -23,8 +23,12 @@ def ransac_settings(
 ) -> Widget:
     """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in both cameras."""
     (source, target), n = points, len(points[0])
-    figure, (matches, graph) = plt.subplots(1, 2, figsize=(9, 3.3), width_ratios=(1.5, 1), layout="constrained")
-    canvas = MatchCanvas(matches, *images, ("reference", "target"))
+    figure, (*axes, graph) = plt.subplots(1, 3, figsize=(9, 3.1), width_ratios=(1, 1, 1.3), layout="constrained")
+    for axis, image, title in zip(axes, images, ("reference", "target")):
+        draw_image(axis, image)
+        axis.set_axis_off()
+        axis.set_title(title, fontsize=9)
+    lines = redrawing(draw_matches)
     inside = graph.scatter([], [], s=26, color=BLUE, marker="o", label="inlier")
     outside = graph.scatter([], [], s=26, color="0.45", marker="x", label="outlier")
     line = graph.axhline(1, color=VERMILLION, linestyle="--", label="threshold")
@@ -38,7 +42,7 @@ def ransac_settings(
         try:
             sim3, inliers = ransac(source, target, threshold, trials, seed=seed, scale_range=SCALE_RANGE)
         except InputError as error:
-            canvas.draw(*pixels, np.zeros(n, bool))
+            lines(axes, pixels, np.zeros(n, bool))
             for dots in (inside, outside):
                 dots.set_offsets(np.empty((0, 2)))
             return f"No fit: {error}."
@@ -47,7 +51,7 @@ def ransac_settings(
         positions = np.column_stack([np.arange(n), distance[order]])
         inside.set_offsets(positions[inliers[order]])
         outside.set_offsets(positions[~inliers[order]])
-        canvas.draw(*pixels, inliers)
+        lines(axes, pixels, inliers)
         text = f"{inliers.sum()} of {n} matches are inliers; scale {sim3.scale:.2f}"
         return text + (f"; rotation error {rotation_error(sim3.R, truth):.0f}°." if truth is not None else ".")
 
@@ -64,16 +68,13 @@ def ransac_settings(
 def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Widget:
     """Show the least-squares fit of corresponding points while the last target point moves along x."""
     exact = umeyama(source, target)
-    figure, axis = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
-    circles = axis.scatter(*target[:, :2].T, s=70, facecolors="none", edgecolors=ORANGE, linewidths=1.8, label="target")
-    crosses = axis.scatter(*target[:, :2].T, s=22, color=BLUE, marker="x", label="source after the fit")
-    bars = LineCollection([], colors="0.5", linewidths=0.8)
-    axis.add_collection(bars)
-    size = np.ptp(target[:, :2], axis=0).max()
-    low, high = target[:, :2].min(axis=0), target[:, :2].max(axis=0)
-    axis.set(xlim=(low[0] - 0.6 * size, high[0] + 2.2 * size), ylim=(high[1] + 0.4 * size, low[1] - 0.4 * size),
-             xlabel="x (scene units)", ylabel="y, down (scene units)", aspect="equal")  # fmt: skip
-    axis.legend(fontsize=8, loc="upper right")
+    farthest = np.vstack([target, target[-1] + [_FARTHEST, 0, 0]])  # the panel has room for it
+    sets = {"target": farthest, "source after the fit": target}
+    labels = {"xlabel": "x (scene units)", "ylabel": "y, down (scene units)"}
+    figure = show_points({"": sets}, size=7, colours=(ORANGE, BLUE), down=True, **labels)
+    (axis,) = figure.axes
+    circles, crosses = axis.collections
+    bars = axis.add_collection(LineCollection([], colors="0.5", linewidths=0.8))
 
     def update(distance: float) -> str:
         changed = target.copy()
@@ -89,4 +90,4 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
         )
 
     alt = "Target points and source points after the least-squares fit; lines connect corresponding points"
-    return interactive_figure(figure, {"distance": slider("moved by", 0.0, 6.0, 0.0, 0.1)}, update, alt)
+    return interactive_figure(figure, {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}, update, alt)

@@ -4,8 +4,8 @@ How to write a widget:
 
 - Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure once, and returns
   `interactive_figure(...)`.
-- Its `update` callback is called when a control moves. It only changes existing artists (`set_data`, `set_offsets`,
-  `set_text`, `set_visible`). Expensive results are computed before, not in `update`.
+- Its `update` callback is called when a control moves. It changes existing artists (`set_data`, `set_offsets`,
+  `set_text`), or draws a primitive of `viz.plots` anew (`redrawing`). Expensive results are computed before.
 - `update` returns a caption with the numbers that the figure shows, also for readers who cannot see it or its colours.
 - The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
 - The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen by sliders, which
@@ -22,11 +22,10 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.patheffects import Normal, Stroke
 
 from zsp_lite.errors import InputError
 
@@ -113,25 +112,16 @@ def small_text(axis: Axes) -> None:
         text.set_fontsize(8)
 
 
-def patch_outline(
-    axis: Axes, grid: tuple[int, int], size: tuple[int, int], label: str, label_left: bool = False
-) -> Callable[[int, int], None]:
-    """Draw a labelled outline around one patch of an image, and return the function that moves it to (row, col)."""
-    height, width = size[0] / grid[0], size[1] / grid[1]
-    outlines = [
-        axis.add_patch(Rectangle((0, 0), width, height, fill=False, edgecolor=colour, linewidth=line, zorder=8))
-        for colour, line in (("black", 4.5), ("white", 2))
-    ]
-    text = axis.text(0, 0, label, fontsize=11, weight="bold", zorder=9, va="center", clip_on=True,
-                     path_effects=[Stroke(linewidth=3, foreground="white"), Normal()])  # fmt: skip
+def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
+    """Return a function that calls `draw`, which returns artists, and removes those of the call before."""
+    drawn: list[Artist] = []
 
-    def move(row: int, col: int) -> None:
-        for outline in outlines:
-            outline.set_xy((col * width, row * height))
-        right = col < 4 or (not label_left and col < grid[1] - 4)
-        text.set(x=(col + (1.5 if right else -0.5)) * width, y=(row + 0.5) * height, ha="left" if right else "right")
+    def redraw(*values, **named) -> None:
+        while drawn:
+            drawn.pop().remove()
+        drawn.extend(draw(*values, **named))
 
-    return move
+    return redraw
 
 
 def png(figure: Figure) -> bytes:

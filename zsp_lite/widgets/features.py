@@ -1,4 +1,4 @@
-"""Widgets on features: attention, layers and facets, descriptors with context, and the saliency threshold."""
+"""Widgets on features: attention, similarities of one patch, and the saliency threshold."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from matplotlib.artist import Artist
 from torch import Tensor
 
 from zsp_lite.backbones.backbone import Backbone, normalize, prepare_images
@@ -13,11 +14,10 @@ from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.errors import InputError
-from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import Widget, choice, interactive_figure, patch_outline, patch_sliders, slider
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, patch_sliders, redrawing, slider
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -45,9 +45,8 @@ def attention(
 ) -> Widget:
     """Show the attention weights of one patch; queries and keys are of all tokens, CLS first, heads concatenated."""
     layers, _, dim = queries.shape
-    size = image.shape[:2]
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
-    outline = patch_outline(axes[0], grid, size, "query")
+    outline = redrawing(plots.outline_patch)
     weights = plots.overlay_map(
         axes[1], np.zeros(grid), alpha=0.8, limits=(0, 1), label="weight relative to the largest"
     )
@@ -61,7 +60,7 @@ def attention(
         patches = found[1:].view(grid).numpy()
         top = np.unravel_index(patches.argmax(), grid)
         weights.set_data(patches / patches.max())
-        outline(row, col)
+        outline(axes[0], (row, col), grid, label="query", linewidth=2, path_effects=plots.BORDER)
         return (
             f"Patch ({row}, {col}), layer {layer}, head {head}: the largest weight is {patches.max():.1%} on patch "
             f"({top[0]}, {top[1]}); uniform attention would give {1 / len(found):.1%}. CLS has {found[0]:.1%}."
@@ -76,65 +75,56 @@ def attention(
     )
 
 
-def facets(
+def similarities(
     reference: Image,
     target: Image,
-    features: Mapping[tuple[int, str], tuple[Float[Tensor, "h w d"], Float[Tensor, "h w d"]]],
+    sims: Mapping[str, Float[Tensor, "n n"]],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
+    start: str | None = None,
 ) -> Widget:
-    """Show the similarities of one patch by each (layer, facet), its nearest neighbour and its true match.
+    """Show how similar one patch is to all patches of the target, its nearest neighbour and its true match.
 
-    `cells` and `valid` are the true matches of the reference patches, from `ground_truth_matches`.
+    `sims` has the matrix of each kind of similarity, `start` is the kind shown first. `cells` and `valid` are the true
+    matches of the reference patches, from `ground_truth_matches`.
     """
-    layers, names = sorted({layer for layer, _ in features}), list(dict.fromkeys(facet for _, facet in features))
     grid = valid.shape
+    figure, axes = plots.show_images([reference, target], ["reference", "similarity to the patch u"], size=3.2)
+    figure.set_figheight(4)  # space for the colour bar
+    axes[0].set_anchor("N")
+    shown = plots.overlay_map(axes[1], np.zeros(grid), limits=(0, 1), label="cosine; star: true match")
+
+    @redrawing
+    def mark(cell: tuple[int, int], nearest: tuple[int, int]) -> list[Artist]:
+        drawn = plots.outline_patch(axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER)
+        drawn += plots.circle_patch(axes[1], nearest, grid)
+        return drawn + (plots.circle_patch(axes[1], cells[cell], grid, "*") if valid[cell] else [])
 
     @cache
-    def compared(layer: int, facet: str) -> tuple[np.ndarray, float]:
-        sim = similarity(*features[layer, facet])
-        nearest = np.stack(np.divmod(sim.argmax(1).numpy(), grid[1]), -1).reshape(*grid, 2)
-        return sim.numpy(), correct_matches(nearest, cells)[valid].mean()
+    def share_correct(kind: str) -> float:
+        nearest = np.stack(np.divmod(sims[kind].argmax(1).numpy(), grid[1]), -1).reshape(*grid, 2)
+        return correct_matches(nearest, cells)[valid].mean()
 
-    panels = _SimilarityPanels(reference, [target], grid, ["similarity to the patch u"])
-
-    def update(row: int, col: int, layer: int, facet: str) -> str:
-        sim, share = compared(layer, facet)
-        panels.place(row, col, cells[row, col] if valid[row, col] else None)
-        text = panels.fill(0, sim[row * grid[1] + col].reshape(grid))
+    def update(row: int, col: int, kind: str) -> str:
+        similar = sims[kind][row * grid[1] + col].view(grid).numpy()
+        nearest = divmod(int(similar.argmax()), grid[1])
+        shown.set_data(similar)
+        mark((row, col), nearest)
+        true = "the true match is not visible"
+        if valid[row, col]:
+            true_row, true_col = cells[row, col]
+            distance = np.abs(np.subtract(nearest, cells[row, col])).max()
+            true = f"true match ({true_row}, {true_col}), distance {distance} patches"
         return (
-            f"Layer {layer}, {facet}: {text} Of the {valid.sum()} patches with a true match, {share:.0%} have their "
-            "nearest neighbour within one patch of it."
+            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of the {valid.sum()} patches "
+            f"with a true match, {share_correct(kind):.0%} have their nearest neighbour within one patch of it."
         )
 
-    controls = {
-        **patch_sliders(grid, _first_patch(valid)),
-        "layer": slider("layer", layers[0], layers[-1], layers[len(layers) * 3 // 4]),
-        "facet": choice("facet", names, "key" if "key" in names else None),
-    }  # fmt: skip
+    known = np.argwhere(valid)
+    middle = tuple(known[np.abs(known - np.median(known, axis=0)).sum(axis=1).argmin()].tolist())
+    controls = {**patch_sliders(grid, middle), "kind": choice("similarity", list(sims), start)}
     alt = "A patch of the reference; its similarities, nearest neighbour and true match in the target."
-    return interactive_figure(panels.figure, controls, update, alt)
-
-
-def context(
-    reference: Image,
-    target: Image,
-    keys: tuple[Float[Tensor, "h w d"], Float[Tensor, "h w d"]],
-    cells: Int[np.ndarray, "h w 2"],
-    valid: Bool[np.ndarray, "h w"],
-) -> Widget:
-    """Show the similarities of one patch by keys alone and by log-binned descriptors."""
-    grid = valid.shape
-    sims = {"keys": key_similarities(keys[0], [keys[1]])[0].numpy(), "log-binned": similarity(*keys).numpy()}
-    panels = _SimilarityPanels(reference, [target, target], grid, list(sims))
-
-    def update(row: int, col: int) -> str:
-        panels.place(row, col, cells[row, col] if valid[row, col] else None)
-        texts = [panels.fill(panel, sim[row * grid[1] + col].reshape(grid)) for panel, sim in enumerate(sims.values())]
-        return "<br>".join(f"{kind}: {text}" for kind, text in zip(sims, texts))
-
-    alt = "A patch of the reference; its similarities in the target without and with context."
-    return interactive_figure(panels.figure, patch_sliders(grid, _first_patch(valid)), update, alt)
+    return interactive_figure(figure, controls, update, alt)
 
 
 def saliency(view: View) -> Widget:
@@ -170,46 +160,3 @@ def saliency(view: View) -> Widget:
     return interactive_figure(
         figure, controls, update, "Patches above the threshold, and a curve of IoU against the threshold."
     )
-
-
-class _SimilarityPanels:
-    """The reference with an outlined patch, and the target with its similarities, nearest neighbour and true match."""
-
-    def __init__(self, reference: Image, targets: list[Image], grid: tuple[int, int], titles: list[str]):
-        self.grid, self.size, self._true = grid, targets[0].shape[:2], None
-        self.figure, axes = plots.show_images([reference, *targets], ["reference", *titles], size=3.0)
-        self.figure.set_figheight(3.9)  # space for the colour bars
-        self._outline = patch_outline(axes[0], grid, reference.shape[:2], "u")
-        self._maps = [plots.overlay_map(axis, np.zeros(grid), limits=(0, 1), label="cosine") for axis in axes[1:]]
-        style = {"markeredgecolor": "black", "linestyle": "none", "zorder": 8}
-        star = {"marker": "*", "color": plots.ORANGE, "markersize": 19, "label": "true match"} | style
-        dot = {"marker": "o", "color": "white", "markersize": 9, "label": "nearest neighbour"} | style
-        self._stars = [axis.plot([], [], **star)[0] for axis in axes[1:]]
-        self._dots = [axis.plot([], [], **dot)[0] for axis in axes[1:]]
-        handles = [self._stars[0], self._dots[0]]
-        axes[0].legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.04), fontsize=9, frameon=False)
-
-    def place(self, row: int, col: int, true: Int[np.ndarray, "2"] | None) -> None:
-        """Outline a patch and mark its true match, if there is one."""
-        self._outline(row, col)
-        self._true = true
-        for star in self._stars:
-            star.set_data(*([[], []] if true is None else plots.patch_centres(true[None], self.grid, self.size).T))
-
-    def fill(self, panel: int, similar: Float[np.ndarray, "rows cols"]) -> str:
-        """Draw the similarities and the nearest neighbour of the patch; returns the text about them."""
-        nearest = np.array(np.unravel_index(similar.argmax(), similar.shape))
-        self._maps[panel].set_data(similar)
-        self._dots[panel].set_data(*plots.patch_centres(nearest[None], self.grid, self.size).T)
-        text = f"nearest neighbour ({nearest[0]}, {nearest[1]}), cosine {similar[tuple(nearest)]:.2f}; "
-        if self._true is None:
-            return text + "the true match is not visible."
-        error = np.abs(np.subtract(nearest, self._true)).max()
-        return text + f"true match ({self._true[0]}, {self._true[1]}), distance {error} patches."
-
-
-def _first_patch(valid: Bool[np.ndarray, "rows cols"]) -> tuple[int, int]:
-    """Return the patch with a true match that is closest to the median of all such patches."""
-    cells = np.argwhere(valid)
-    row, col = cells[np.abs(cells - np.median(cells, axis=0)).sum(axis=1).argmin()]
-    return int(row), int(col)

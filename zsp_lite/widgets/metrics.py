@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from sklearn.neighbors import NearestNeighbors
 
-from zsp_lite.viz.plots import BLUE, ORANGE
+from zsp_lite.viz.plots import BLUE, ORANGE, show_curves
 from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider, small_text
 
 
@@ -22,22 +22,17 @@ def order_probabilities(n: int, first: float, second: float) -> tuple[float, flo
 
 def measured_accuracy() -> Widget:
     """Show the distributions of the measured Acc30 of two methods, and how often a benchmark ranks them correctly."""
-    figure, axis = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
-    lines = [
-        axis.plot([], [], color=colour, linestyle=style, linewidth=2, label=label)[0]
-        for colour, style, label in ((BLUE, "-", "first method"), (ORANGE, "--", "second method"))
-    ]
-    axis.set(xlim=(0, 100), xlabel="measured Acc30 (%)", ylabel="probability density (1/%)")
-    axis.legend(fontsize=8, loc="upper right")
+    labels = {"xlabel": "measured Acc30 (%)", "ylabel": "probability density (1/%)"}
+    figure = show_curves([0, 100], {"first method": [0, 0], "second method": [0, 0]}, xlim=(0, 100), **labels)
+    (axis,) = figure.axes
 
     def update(pairs: int, accuracy: int, gain: int) -> str:
         true = accuracy / 100, min(accuracy + gain, 100) / 100
-        top = 0.0
-        for line, p in zip(lines, true, strict=True):
-            density = binom.pmf(np.arange(pairs + 1), pairs, p) * pairs / 100
-            line.set_data(100 * np.arange(pairs + 1) / pairs, density)
-            top = max(top, density.max())
-        axis.set_ylim(0, 1.08 * top)
+        k = np.arange(pairs + 1)
+        densities = [binom.pmf(k, pairs, p) * pairs / 100 for p in true]
+        for line, density in zip(axis.lines, densities, strict=True):
+            line.set(data=(100 * k / pairs, density), marker="")
+        axis.set_ylim(0, 1.08 * np.max(densities))
         half = 196 * np.sqrt(true[0] * (1 - true[0]) / pairs)
         above, below = order_probabilities(pairs, *true)
         return (

@@ -10,9 +10,9 @@ from matplotlib.ticker import MaxNLocator
 
 from zsp_lite.verified import Solution
 from zsp_lite.verified.poses import rotation_angles
-from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, forward_terms
-from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.viz.verified import POINT_CLASSES, classify_points, score_contributions
+from zsp_lite.verified.verification import ScoreCoefficients, forward_terms
+from zsp_lite.viz.plots import BLUE, ORANGE, draw_image
+from zsp_lite.viz.verified import POINT_CLASSES, classify_points, draw_score_contributions, score_contributions
 from zsp_lite.widgets.common import Widget, interactive_figure, slider, small_text
 
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ def ranked_hypotheses(
         for cloud in solution.poses.apply(scene.reference_points[:: max(len(scene.reference_points) // _MAX_POINTS, 1)])
     ]
     differences = rotation_angles(solution.poses.rotation, solution.poses.rotation[:1])[:, 0].numpy()
-    parts = [score_contributions(one.terms, weights) for one in found]
-    names = [name for name in TERM_NAMES if getattr(weights, name)]
 
     figure = plt.figure(figsize=(9, 3.4), dpi=85)
     # The third column is empty: room for the labels of the bars.
@@ -47,25 +45,15 @@ def ranked_hypotheses(
     space, cloud = _clouds(figure, grid[0], solution, clouds[0])
     image_axis = figure.add_subplot(grid[1])
     image_axis.set_axis_off()
-    size = targets[used[0]].frame.camera.size
-    picture = image_axis.imshow(targets[used[0]].frame.rgb, extent=(0, size[1], size[0], 0))
+    draw_image(image_axis, targets[used[0]].frame.rgb)
     marks = [
         image_axis.scatter([], [], s=14, c=colour, marker=marker, edgecolors="black", linewidths=0.4, label=name)
         for name, (colour, marker) in POINT_CLASSES.items()
     ]
-    image_axis.set(xlim=(0, size[1]), ylim=(size[0], 0))
     image_axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=2, fontsize=6.5, frameon=False)
     bar_axis = figure.add_subplot(grid[3])
-    bars = bar_axis.barh(
-        [name.replace("_", " ") for name in names], np.zeros(len(names)), color=BLUE, edgecolor="black"
-    )
-    bar_axis.invert_yaxis()
-    bar_axis.axvline(0, color="black", linewidth=0.8)
-    bar_axis.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    values = [part[name] for part in parts for name in names]
-    bar_axis.set_xlim(min(0.0, *values) * 1.1 - 0.1, max(0.0, *values) * 1.1 + 0.1)
-    bar_axis.set_xlabel("weight × term (nats)")
-    small_text(bar_axis)
+    parts = [part for one in found for part in score_contributions(one.terms, weights).values()]
+    limits = min(0.0, *parts) * 1.1 - 0.1, max(0.0, *parts) * 1.1 + 0.1
 
     def update(rank: int, view: int, azimuth: int) -> str:
         index, position = rank - 1, solution.view_order.index(used[view - 1])
@@ -73,15 +61,18 @@ def ranked_hypotheses(
         cloud._offsets3d = tuple(clouds[index].T)
         space.view_init(elev=15, azim=azimuth)
         frame = targets[used[view - 1]].frame
-        picture.set_data(frame.rgb)
-        limits, shown = np.array(frame.camera.size[::-1]), classes[index][position]
+        image_axis.images[0].set_data(frame.rgb)
+        corner, shown = np.array(frame.camera.size[::-1]), classes[index][position]
         for point_class, mark in enumerate(marks):
-            mark.set_offsets(np.clip(pixels[index, position][shown == point_class], 0, limits))
+            mark.set_offsets(np.clip(pixels[index, position][shown == point_class], 0, corner))
         counts = np.bincount(shown, minlength=len(marks))
         image_axis.set_title(f"target {used[view - 1] + 1}", fontsize=9)
-        for bar, name in zip(bars, names):
-            bar.set_width(parts[index][name])
-        bar_axis.set_title(f"score {one.score:.1f}", fontsize=9)
+        bar_axis.clear()
+        draw_score_contributions(bar_axis, {f"rank {rank}": one.terms}, weights)
+        bar_axis.set(xlim=limits, title=f"score {one.score:.1f}")
+        bar_axis.get_legend().remove()
+        bar_axis.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        small_text(bar_axis)
         difference = f"{found[0].score - one.score:.1f} nats below the best, {differences[index]:.0f} degrees from it"
         points = ", ".join(f"{count} {name}" for count, name in zip(counts, POINT_CLASSES))
         return (

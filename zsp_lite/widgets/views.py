@@ -4,50 +4,13 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Bool, Float, Real
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from jaxtyping import Float
 
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch
 from zsp_lite.data.cameras import Camera, ground_axes
 from zsp_lite.views import View
-from zsp_lite.viz.plots import BLUE, CHOSEN, patch_centres
-from zsp_lite.widgets.common import Widget, choice, interactive_figure, slider, small_text
-
-_GAP = 16  # pixels between the two images of a `MatchCanvas`
-
-
-class MatchCanvas:
-    """Two images (H, W, 3) side by side in one axes; `draw` replaces the lines between them."""
-
-    def __init__(self, axis: Axes, first: np.ndarray, second: np.ndarray, titles: tuple[str, str]):
-        """Draw the images; both have one size."""
-        height, width = first.shape[:2]
-        self.offset = width + _GAP
-        self.images = []
-        for image, title, left in zip((first, second), titles, (0, self.offset)):
-            extent = (left, left + width, height, 0)
-            self.images.append(axis.imshow(image, extent=extent, interpolation="nearest"))
-            axis.text(left + width / 2, -5, title, ha="center", va="bottom", fontsize=9)
-        axis.set(xlim=(0, self.offset + width), ylim=(height, -22))
-        axis.set_axis_off()
-        dashed = LineCollection([], colors="0.45", linewidths=0.7, linestyles="dashed", alpha=0.8)
-        self.outliers = axis.add_collection(dashed)
-        self.inliers = axis.add_collection(LineCollection([], cmap="cividis", linewidths=1.5))
-        self.inliers.set_clim(0, 1.1 * height)  # without the brightest end of the colour map, invisible on light images
-
-    def draw(
-        self,
-        first: Real[np.ndarray, "n 2"],
-        second: Real[np.ndarray, "n 2"],
-        inliers: Bool[np.ndarray, " n"] | None = None,
-    ) -> None:
-        """Draw lines between matched pixels; the lines of outliers are thin, dashed and grey."""
-        segments = np.stack([first, np.asarray(second) + (self.offset, 0)], axis=1)
-        inliers = np.ones(len(segments), bool) if inliers is None else inliers
-        self.inliers.set_segments(segments[inliers])
-        self.inliers.set_array(segments[inliers, 0, 1])
-        self.outliers.set_segments(segments[~inliers])
+from zsp_lite.viz.plots import BLUE, CHOSEN, draw_image, draw_matches, match_pixels
+from zsp_lite.widgets.common import Widget, choice, interactive_figure, redrawing, slider, small_text
 
 
 def viewpoints_from_above(
@@ -78,9 +41,8 @@ def best_view(
     """
     n = len(targets)
     scores = {name: np.array([score(pair) for pair in pairs]) for name, score in VIEW_SELECTORS.items()}
-    pixels = [_match_pixels(reference, target, pair) for target, pair in zip(targets, pairs)]
-    figure, (above, graph, images) = plt.subplots(
-        1, 3, figsize=(9, 3.1), width_ratios=(1, 1.15, 1.75), layout="constrained"
+    figure, (above, graph, *images) = plt.subplots(
+        1, 4, figsize=(9, 2.9), width_ratios=(1, 1.15, 0.85, 0.85), layout="constrained"
     )
     above.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal", title="from above")
     above.set_axis_off()
@@ -97,8 +59,11 @@ def best_view(
     graph.set_xlabel("angle to the reference (degrees)")
     small_text(above)
     small_text(graph)
-    rgb = [view.frame.rgb for view in targets]
-    canvas = MatchCanvas(images, reference.frame.rgb, rgb[0], ("reference", "best view"))
+    for axis, view, title in zip(images, (reference, targets[0]), ("reference", "best view")):
+        draw_image(axis, view.frame.rgb)
+        axis.set_axis_off()
+        axis.set_title(title, fontsize=9)
+    lines = redrawing(draw_matches)
 
     def update(score: str, views: int, first: int) -> str:
         available = evenly_spaced(n, views, first - 1)
@@ -116,8 +81,8 @@ def best_view(
         graph.set_ylim(low - margin, high + margin)
         ring.set_offsets(positions[0][[best]])
         circle.set_offsets([[angles[best], values[best]]])
-        canvas.images[1].set_data(rgb[best])
-        canvas.draw(*pixels[best])
+        images[1].images[0].set_data(targets[best].frame.rgb)
+        lines(images, match_pixels((reference, targets[best]), pairs[best].matches))
         nearest = int(available[angles[available].argmin()])
         return (
             f'Of {views} view{"s" * (views > 1)}, "{score}" selects view {best + 1}, {angles[best]:.0f}° from the '
@@ -134,11 +99,3 @@ def best_view(
         "and the matches between the reference and the best view"
     )
     return interactive_figure(figure, controls, update, alt)
-
-
-def _match_pixels(reference: View, target: View, pair: ViewMatch) -> tuple[np.ndarray, np.ndarray]:
-    matches = pair.matches
-    return tuple(
-        patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
-        for cells, view in ((matches.reference, reference), (matches.target, target))
-    )
