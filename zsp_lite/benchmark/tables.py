@@ -222,7 +222,10 @@ def as_latex(table: Table) -> str:
             best = values.min() if names[column[1]] in _LOWEST_IS_BEST else values.max()
             bold = values == best
             text.iloc[bold.to_numpy(), place] = text.iloc[bold.to_numpy(), place].map("\\textbf{{{}}}".format)
-    text.columns = [_tex(": ".join(filter(None, (group.removeprefix("this run"), title)))) for group, title in compact]
+    text.columns = [
+        _tex(": ".join(filter(None, (group.removeprefix("this run").removeprefix(": "), title))))
+        for group, title in compact
+    ]
     text.index = [_tex(str(label)) for label in text.index]
     layout = {"caption": _tex(table.title), "label": f"tab:{table.name}", "position": "tb"}
     return text.to_latex(escape=False, column_format="l" + "r" * len(compact), **layout)
