@@ -281,6 +281,7 @@ def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
         "function": (fails, where),
         "object": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), where),
         "keypoints": (lambda first, second: fails(None), where),
+        "patches": (lambda similarity, first, second: fails(None), where),
         "view": (lambda problem: (np.eye(3), "first"), "ValueError: invalid literal"),
     }
     for name, (row, told) in rows.items():

@@ -351,6 +351,14 @@ def test_by_default_a_run_is_of_the_categories_that_have_labels(tmp_path):
         run(pairs=1)
 
 
+def test_rows_of_as_many_views_stand_on_the_problems_that_all_of_them_have(tmp_path):
+    run_rows(["ours"], tmp_path, 3)
+    run_rows(["ours", "ours-bv", "ours-n1"], tmp_path, 2)
+    table = read_run(tmp_path).table
+    assert table.groupby("row").size().to_dict() == {"ours": 2, "ours-bv": 2, "ours-n1": 2}
+    assert set(table["pair"][table["row"] == "ours"]) == set(table["pair"][table["row"] == "ours-bv"])
+
+
 def test_results_are_of_the_rows_and_categories_of_the_last_call(tmp_path):
     evaluate(small_folder(), BACKBONE, ["ours", "ours-bv"], {"lump": 2, "pebble": 1}, 2, tmp_path)
     assert read_run(tmp_path).table.groupby(["row", "category"]).size().to_list() == [2, 1, 2, 1]

@@ -64,13 +64,19 @@ def _evaluate(
 ) -> dict[str, Any]:
     start = time.perf_counter()
     try:
-        answer = _solve(method, problem) if method.solve else _answer(method, problem, truths)
+        answer = as_answer(method.solve(problem)) if method.solve else _answer(method, problem, truths)
         if not 0 <= answer.view < len(truths):
             raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
     except FatalError:
         raise
     except InputError as error:
         return {"error": FAILED, "failed": str(error)}
+    except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
+        own = getattr(method.solve, "own", method.solve) or method.settings.get("matcher")
+        module = getattr(own, "__module__", None) or type(own).__module__
+        if isinstance(own, str | None) or module.startswith("zsp_lite."):
+            raise
+        raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
     result = {"seconds": time.perf_counter() - start, "note": answer.note, "view": int(answer.view)}
     truth, cameras = truths[answer.view], [frame.camera for frame in problem.frames()]
     reference, target = cameras[0], cameras[1 + answer.view]
@@ -87,18 +93,6 @@ def _evaluate(
         result["scale"] = float(answer.scale)
     result = {name: value for name, value in answer.details.items() if name not in _MEASURED} | result
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
-
-
-def _solve(method: Method, problem: Problem) -> Answer:
-    """Call the function of a row. Its exceptions other than InputError end the run, in one line if it is a user's."""
-    try:
-        return as_answer(method.solve(problem))
-    except Exception as error:
-        own = getattr(method.solve, "own", method.solve)
-        module = getattr(own, "__module__", None) or type(own).__module__
-        if isinstance(error, InputError) or module.startswith("zsp_lite."):
-            raise
-        raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
 
 
 def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:

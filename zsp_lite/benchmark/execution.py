@@ -29,6 +29,7 @@ from zsp_lite.errors import InputError, check_integer
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
 MOST_WORKERS = 4096  # also of threads
+_UNKNOWN_WORKERS = 256  # of an executor that does not tell
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
@@ -142,7 +143,7 @@ def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor 
     It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
-        yield executor, getattr(executor, "_max_workers", 1)
+        yield executor, getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
     elif isinstance(executor, str):
         with _dask(executor) as client:
             # A chunk depends on files: equal arguments need not give equal results.

@@ -115,7 +115,8 @@ def pairs_of_rows(
 ) -> dict[str, list[Pair]]:
     """Return the pairs that each row is evaluated on: the same for all rows of as many target views."""
     known = dataset.categories()
-    if unknown := sorted(set(numbers) - set(known)) or not numbers:
+    unknown = sorted(set(numbers) - set(known))
+    if unknown or not numbers:
         raise InputError(f"{dataset.root}: no categories {unknown or ''}, found {', '.join(known) or 'none'}")
     for category, number in numbers.items():
         check_integer(f"pairs of {category}", number, 1)

@@ -179,6 +179,10 @@ def read_run(out: str | Path) -> Run:
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
     table = table[table["row"].isin(rows) & table["category"].isin(categories)]
+    # Rows of as many target views are compared on the problems that all of them have finished.
+    views = table["pair"].str.count(",").rename("views")
+    finished = table.groupby([views, "problem"])["row"].transform("nunique")
+    table = table[finished == table.groupby(views)["row"].transform("nunique")]
     if table.empty:
         raise InputError(f"{out}: the run has no finished pair yet")
     places = {

@@ -91,12 +91,16 @@ def _list_methods() -> None:
 
 
 def _write_reports(run: Path, out: Path, metrics: list[str]) -> dict:
-    """Write the tables and figures of a run; returns its summary."""
+    """Write the summary, tables and figures of a run; returns the summary."""
+    import json
+
     from zsp_lite.benchmark.figures import write_figures
     from zsp_lite.benchmark.runs import read_run
     from zsp_lite.benchmark.tables import every_table, write_tables
+    from zsp_lite.io.files import write_atomic
 
     found = read_run(run)
+    write_atomic(out / "summary.json", json.dumps(found.summary, indent=1).encode())
     write_tables(every_table(found.summary, metrics), out / "tables")
     write_figures(found, out / "figures")
     return found.summary
