@@ -56,7 +56,7 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
 def accuracy_against_views(run: Run) -> Figure | None:
     """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals; None without two numbers of views.
 
-    The results that the paper published for CO3D are dotted grey.
+    The results that the paper published for CO3D are grey.
     """
     methods, views = run.summary["methods"], run.summary["data"]["targets"]
     published = next(one["rows"] for one in read_paper_tables() if one["name"] == "table_a_targets")
@@ -77,9 +77,10 @@ def accuracy_against_views(run: Run) -> Figure | None:
             axis.fill_between(list(found), *ends.T, color=colour, alpha=0.18, lw=0)
             values = [one[metric] for one in found.values()]
             axis.plot(list(found), values, "os^Dv"[index % 5] + "-", color=colour, label=row)
-        for first, row in ((0, "ours-bv"), (2, "ours")):  # the published columns: Acc30 and Acc15 of each
+        # the published columns: Acc30 and Acc15 of each
+        for first, row, look in ((0, "ours-bv", "s:"), (2, "ours", "o--")):
             values = [line["published"][first + place] for line in published]
-            axis.plot(numbers, values, ":", marker="s", ms=3, color="0.55", label=f"{row}, published on CO3D")
+            axis.plot(numbers, values, look, ms=3, color="0.55", label=f"{row}, published on CO3D")
         axis.set(xlabel="target views N", ylabel=METRICS[metric], xticks=numbers, ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
