@@ -8,11 +8,10 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, ren
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.verified.maps import Projection, ViewMaps
+from zsp_lite.verified.maps import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import plots, verified
 from zsp_lite.viz.plots import object_cloud
-from zsp_lite.viz.reliability import draw_reliability, reliability
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
@@ -93,24 +92,15 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
     values = (touch, off / MAX_VIOLATION, front, torch.zeros(5))
     terms = PointTerms(Projection(*(x[None, None] for x in parts)), *(x[None, None] for x in values))
-    # The maps have half the image's size: their pixel 10 is pixel 20 of the image.
-    maps = ViewMaps(
-        torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1), torch.zeros(1, 2), torch.tensor([[40.0, 30.0]]),
-        torch.zeros(1, dtype=torch.long), torch.zeros(1200, 4), torch.tensor([[2.0, 2.0]]),
-    )  # fmt: skip
     assert verified.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
     assert list(verified.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
-    figure = verified.show_point_classes([IMAGE], terms, maps, [0], ["view"], ["pose"])
+    figure = verified.show_point_classes([IMAGE], ["view"], [2 * pixels.numpy()], [*verified.classify_points(terms)])
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).
     np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
 
 
-def test_reliability_points_lie_at_confidence_and_frequency_with_wilsons_interval():
-    _, axis = plt.subplots()
-    measured = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
-    draw_reliability(axis, measured)
-    np.testing.assert_allclose(axis.containers[0][0].get_xydata(), [[0.2, 0.3], [0.9, 0.3]])
-    # For 3 of 10, from a table: 10.8 % to 60.3 %.
-    low, high = axis.containers[0][2][0].get_segments()[0][:, 1]
-    assert (low, high) == pytest.approx((0.108, 0.603), abs=1e-3)
+def test_bars_reach_from_their_lower_to_their_upper_end():
+    (axis,) = plots.show_intervals([1, 2], {"row": ([3, 5], [2, 4], [6, 7])}).axes
+    assert axis.lines[0].get_xydata().tolist() == [[1, 3], [2, 5]]
+    assert [bar.tolist() for bar in axis.collections[0].get_segments()] == [[[1, 2], [1, 6]], [[2, 4], [2, 7]]]

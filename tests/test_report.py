@@ -21,7 +21,6 @@ from zsp_lite.viz.pose_picture import coverage, pose_picture
 from zsp_lite.viz.report import (
     _notebook_link,
     _two_poses_figure,
-    pose_pictures,
     render_page,
     table_rows,
     write_overview,
@@ -118,8 +117,8 @@ def test_two_poses_are_shown_side_by_side_where_the_answer_is_one_of_two(results
     assert "One of two" not in text  # the features are perfect
     estimate = results[0].estimates["verified"]
     doubtful = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
-    _, second = pose_pictures(doubtful)
-    assert f"turned by {estimate.angle_to(estimate.alternatives[0]):.0f} degrees" in second.alt
+    page = render_page([doubtful], "name")
+    assert f"turned by {estimate.angle_to(estimate.alternatives[0]):.0f} degrees" in page and "One of two" in page
     figure = _two_poses_figure(estimate)
     titles = [axis.get_title() for axis in figure.axes]
     assert titles[0] == f"probability {estimate.confidence:.2f}"

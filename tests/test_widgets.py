@@ -8,11 +8,9 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from synthetic_views import level_camera
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.best_view import VIEW_SELECTORS
 from zsp_lite.errors import InputError
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import cyclical_distances, match, similarity
@@ -23,7 +21,7 @@ pytest.importorskip("ipywidgets", reason="widgets are optional: pip install ipyw
 matplotlib.use("agg")
 
 from tools import widget_examples as examples  # noqa: E402
-from zsp_lite.widgets import alignment, common, features, matching, metrics, verified, views  # noqa: E402
+from zsp_lite.widgets import alignment, common, features, matching  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -46,8 +44,6 @@ def values_of(control) -> list:
 @pytest.mark.parametrize("name", [name for name in examples.WIDGETS if name != "label_poses"])
 def test_every_control_changes_the_picture_and_going_back_restores_it(name):
     widget = examples.WIDGETS[name]()
-    if name == "best_view":
-        widget.controls["views"].value = 1  # of all views, the first does not matter
     before, caption = widget.picture.value, widget.caption.value
     assert before[:4] == b"\x89PNG" and caption
     for control in widget.controls.values():
@@ -143,33 +139,7 @@ def test_matches_are_compared_with_the_ground_truth(sim, matcher):
     assert f"{(~truth.valid[at]).sum()} without ground truth" in widget.caption.value
 
 
-# best view
-
-
-@pytest.mark.parametrize("score", VIEW_SELECTORS)
-def test_the_caption_names_the_view_with_the_best_score_of_those_offered(score, monkeypatch):
-    build = views.best_view
-    monkeypatch.setattr(views, "best_view", lambda *passed: (build(*passed), passed))
-    widget, (_, _, pairs, _, angles) = examples.best_view()
-    values = np.array([VIEW_SELECTORS[score](one) for one in pairs])
-    widget.controls["score"].value = score
-    for count, first in ((4, 1), (2, 2), (1, 3)):
-        widget.controls["views"].value, widget.controls["first"].value = count, first
-        best = max([(first - 1 + i * 4 // count) % 4 for i in range(count)], key=lambda i: values[i])
-        assert f"selects view {best + 1}, {angles[best]:.0f}°" in widget.caption.value
-
-
-def test_cameras_on_a_circle_are_on_a_circle_from_above():
-    cameras = [level_camera(degrees) for degrees in np.arange(0, 360, 45)]
-    ring, other = views.viewpoints_from_above(cameras, level_camera(20, 40).centre[None])
-    turns = np.degrees(np.unwrap(np.arctan2(*ring.T[::-1])))
-    # Counter-clockwise in the world is counter-clockwise in the plot, for any axes of the plane.
-    assert np.allclose(np.diff(turns), 45) and np.allclose(np.linalg.norm(ring, axis=1), 1)
-    from_first = np.degrees(np.arctan2(*other[0][::-1])) - turns[0]
-    assert np.isclose((from_first + 180) % 360 - 180, 20)
-
-
-# alignment, hypotheses and metrics
+# alignment
 
 
 def test_the_caption_agrees_with_ransac():
@@ -197,52 +167,3 @@ def test_the_caption_agrees_with_least_squares():
     fit = umeyama(source, source + np.outer(np.arange(9) == 8, [3.0, 0, 0]))
     assert f"rotation changes by {rotation_error(fit.R, np.eye(3)):.1f}°" in widget.caption.value
     assert f"to {fit.scale:.2f}" in widget.caption.value
-
-
-def test_hypotheses_have_their_score_and_probability_and_every_point_is_counted_once():
-    solution, targets = examples.sample_solution()
-    widget = verified.ranked_hypotheses(solution, targets)
-    assert widget.controls["rank"].max == len(solution.hypotheses)
-    for rank, one in enumerate(solution.hypotheses, 1):
-        widget.controls["rank"].value = rank
-        assert f"Hypothesis {rank} of {len(solution.hypotheses)}" in widget.caption.value
-        assert f"score {one.score:.1f}, probability {one.confidence:.0%}" in widget.caption.value
-    counts = widget.caption.value.split("target view 1: ")[1].rstrip(".")
-    assert sum(int(part.split()[0]) for part in counts.split(", ")) == len(solution.scene.reference_points)
-
-
-def test_order_probabilities_agree_with_a_simulation_and_stand_in_the_caption():
-    rng = np.random.default_rng(0)
-    a, b = rng.binomial(50, 0.4, 200_000), rng.binomial(50, 0.5, 200_000)
-    assert np.allclose(metrics.order_probabilities(50, 0.4, 0.5), [np.mean(b > a), np.mean(b < a)], atol=0.004)
-    widget = metrics.measured_accuracy()
-    widget.controls["pairs"].value, widget.controls["gain"].value = 1000, 4
-    above, below = (100 * share for share in metrics.order_probabilities(1000, 0.46, 0.5))
-    assert f"above it in {above:.0f} % of all benchmarks, below it in {below:.0f} %" in widget.caption.value
-
-
-def rectangle(width):
-    """The outline of a rectangle 2 long, in the plane z = 0."""
-    s = np.linspace(-1, 1, 201)
-    sides = [(s, width + 0 * s), (s, -width + 0 * s), (1 + 0 * s, width * s), (-1 + 0 * s, width * s)]
-    return np.vstack([np.column_stack([*side, 0 * s]) for side in sides])
-
-
-def test_a_rectangle_coincides_after_a_half_turn_and_a_square_after_a_quarter():
-    angles = np.array([0, 45, 90, 135, 180, 270])
-    flat, square = (metrics.rotated_distance(rectangle(width), rectangle(width), angles) for width in (0.5, 1.0))
-    assert np.allclose(flat[[0, 4]], 0, atol=1e-9) and (flat[[1, 2, 3, 5]] > 0.1).all()
-    assert np.allclose(square[[0, 2, 4, 5]], 0, atol=1e-9) and (square[[1, 3]] > 0.1).all()
-    # A point at +x, rotated by 90 degrees about z, is at +y.
-    moved = metrics.rotated_distance(np.array([[1.0, 0, 5]]), np.array([[0.0, 1, 5]]), np.array([90]))
-    assert np.isclose(moved[0], 0)
-    widget = metrics.symmetry_rotation({"rectangle": rectangle(0.5), "square": rectangle(1.0)})
-    widget.controls["angle"].value, widget.controls["cloud"].value = 90, "square"
-    assert "rotation error 90°" in widget.caption.value and "distance 0.00" in widget.caption.value
-
-
-def test_the_bars_are_the_shares_of_pairs_within_the_threshold():
-    widget = metrics.accuracy_threshold({"first": np.array([5.0, 20, 40, 170]), "second": np.array([50.0, 60])})
-    widget.controls["threshold"].value = 55
-    assert [bar.get_width() for bar in widget.figure.axes[0].patches] == [75, 50]
-    assert "Within 55°: first 75 %, second 50 %" in widget.caption.value

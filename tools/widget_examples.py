@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,22 +12,18 @@ import torch
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.demo import demo_pairs
 from zsp_lite.estimates import match_points
 from zsp_lite.labelling.session import Labelling
 from zsp_lite.matching import key_similarities, match, similarity
-from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.samples import sample_data
 from zsp_lite.synthetic.ground_truth import GroundTruthPair, ground_truth_pair
-from zsp_lite.verified import Solution, VerifiedSolver
 from zsp_lite.views import View, extract_views
 from zsp_lite.viz.plots import match_pixels
 from zsp_lite.widgets import alignment as alignment_widgets
-from zsp_lite.widgets import features, labelling, masks, matching, metrics, verified, views
+from zsp_lite.widgets import features, labelling, masks, matching
 
 if TYPE_CHECKING:
     from ipywidgets import VBox
@@ -48,14 +43,6 @@ def sample_views() -> tuple[View, View]:
     """Return the views of `sample_pair`."""
     reference, target = extract_views(_backbone(), [sample_pair().reference, sample_pair().target])
     return reference, target
-
-
-@cache
-def sample_solution() -> tuple[Solution, tuple[View, ...]]:
-    """Solve a sample pair of toy trucks with three target views; returns the solution and the views."""
-    dataset = Co3D(sample_data())
-    reference, targets, pairs = _matched(dataset, demo_pairs(dataset, n_targets=3)[-1], "verified")
-    return VerifiedSolver().solve(reference, targets, pairs), tuple(targets)
 
 
 def attention() -> "VBox":
@@ -93,20 +80,6 @@ def matches() -> "VBox":
     return matching.matches(*sample_views(), sim, sample_pair().cells, sample_pair().valid)
 
 
-def best_view() -> "VBox":
-    """`views.best_view` on a sample object and four views of another."""
-    dataset = Co3D(sample_data())
-    pair = replace(demo_pairs(dataset)[0], target_frames=(0, 6, 12, 18))
-    reference, targets, pairs = _matched(dataset, pair)
-    labels = read_labels(dataset.root, pair.category)
-    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
-    cameras = [view.frame.camera for view in targets]
-    poses = np.stack([relative_pose(first, reference.frame.camera, second, camera) for camera in cameras])
-    centre = second.trans @ np.linalg.inv(first.trans) @ np.append(reference.frame.camera.centre, 1)
-    positions = views.viewpoints_from_above(cameras, centre[None, :3])
-    return views.best_view(reference, targets, pairs, positions, rotation_error(np.eye(3), poses[:, :3, :3]))
-
-
 def ransac_settings() -> "VBox":
     """`alignment.ransac_settings` on a sample pair."""
     pair = sample_views()
@@ -119,29 +92,6 @@ def one_outlier() -> "VBox":
     """`alignment.one_outlier` on random points."""
     points = np.random.default_rng(0).normal(size=(12, 3))
     return alignment_widgets.one_outlier(points, points)
-
-
-def measured_accuracy() -> "VBox":
-    """`metrics.measured_accuracy`, which needs no data."""
-    return metrics.measured_accuracy()
-
-
-def accuracy_threshold() -> "VBox":
-    """`metrics.accuracy_threshold` on three methods."""
-    rng = np.random.default_rng(0)
-    return metrics.accuracy_threshold({name: rng.uniform(0, most, 500) for name, most in zip("abc", (60, 120, 180))})
-
-
-def symmetry_rotation() -> "VBox":
-    """`metrics.symmetry_rotation` on a plane and a cross."""
-    x = np.linspace(-1, 1, 400)
-    plane = np.column_stack([x, 0.1 * x, 0 * x])
-    return metrics.symmetry_rotation({"plane": plane, "cross": np.vstack([plane, plane[:, [1, 0, 2]] * [-1, 1, 1]])})
-
-
-def ranked_hypotheses() -> "VBox":
-    """`verified.ranked_hypotheses` on a sample pair."""
-    return verified.ranked_hypotheses(*sample_solution())
 
 
 def box_to_mask() -> "VBox":
@@ -171,8 +121,7 @@ def label_poses() -> "VBox":
 WIDGETS: dict[str, Callable[[], "VBox"]] = {
     build.__name__: build
     for build in (
-        attention, similarities, saliency, cycle, matches, best_view, ransac_settings, one_outlier,
-        measured_accuracy, accuracy_threshold, symmetry_rotation, ranked_hypotheses, box_to_mask, label_poses,
+        attention, similarities, saliency, cycle, matches, ransac_settings, one_outlier, box_to_mask, label_poses,
     )
 }  # fmt: skip
 
@@ -180,10 +129,3 @@ WIDGETS: dict[str, Callable[[], "VBox"]] = {
 @cache
 def _backbone() -> Backbone:
     return load_backbone("zsp-tiny", "cpu")
-
-
-def _matched(dataset: Co3D, pair: Pair, solver: str = "paper"):
-    """Load a pair and match its reference with every target view, as a solver needs it."""
-    method, (reference, targets) = ZeroShotPose(_backbone(), solver=solver), dataset.load_pair(pair)
-    reference, *targets = method.views([reference, *targets])
-    return reference, targets, method.match_views(reference, targets)

@@ -30,6 +30,7 @@ from zsp_lite.viz import plots
 
 PHOTOGRAPH_CREDIT = "Photograph and depth: Middlebury stereo data 2014 (Scharstein et al.), from scikit-image."
 PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
+_FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}
 _POINTS = 1500
 _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
 
@@ -49,16 +50,8 @@ class PhotographResult:
     axes: Float[np.ndarray, "3 3"]  # columns: front, left and up of the photographed motorcycle, as estimated
     cloud: Float[np.ndarray, "n 3"]  # point cloud of the synthetic motorcycle, aligned with the photographed one
     along: Float[np.ndarray, " n"]  # position of each point of the cloud, from the rear (0) to the front (1)
-
-    @property
-    def front_error(self) -> float:
-        """Angle in degrees between the estimated front and the front judged by eye, which may be wrong by 10."""
-        return _angle(self.axes[:, 0], PHOTOGRAPH_FRONT)
-
-    @property
-    def up_error(self) -> float:
-        """Angle in degrees between the estimated top and the normal of the floor."""
-        return _angle(self.axes[:, 2], PHOTOGRAPH_UP)
+    front_error: float  # degrees between the estimated front and the front judged by eye, which may be wrong by 10
+    up_error: float  # degrees between the estimated top and the normal of the floor
 
 
 def run_photograph(
@@ -90,16 +83,17 @@ def run_photograph(
             camera, to_photograph = estimate.target_camera, estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R
             cloud, along = to_photograph.apply(camera.to_camera(points)), pose.to_box(points)[:, 0]
-            yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along)
+            errors = _angle(axes[:, 0], PHOTOGRAPH_FRONT), _angle(axes[:, 2], PHOTOGRAPH_UP)
+            yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors)
 
 
 def photograph_rows(results: Sequence[PhotographResult]) -> list[tuple[str, str, str, str, str]]:
     """Format each result: foreground, solver, errors and confidence (see `PHOTOGRAPH_COLUMNS`)."""
     rows = []
     for result in results:
-        confidence = result.estimate.confidence
+        confidence = "–" if result.estimate.confidence is None else f"{result.estimate.confidence:.2f}"
         errors = f"{result.front_error:.0f}°", f"{result.up_error:.0f}°"
-        rows.append((_foreground(result), result.solver, *errors, "–" if confidence is None else f"{confidence:.2f}"))
+        rows.append((_FOREGROUNDS[result.foreground], result.solver, *errors, confidence))
     return rows
 
 
@@ -153,11 +147,7 @@ def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray
 
 def _title(result: PhotographResult) -> str:
     errors = f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
-    return f"{_foreground(result)}, {result.solver} solver\n{errors}"
-
-
-def _foreground(result: PhotographResult) -> str:
-    return {"mask": "mask", "saliency": "own saliency"}[result.foreground]
+    return f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n{errors}"
 
 
 def _angle(first: np.ndarray, second: np.ndarray | tuple[float, ...]) -> float:

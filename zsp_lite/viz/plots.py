@@ -217,18 +217,6 @@ def draw_matches(
     return drawn
 
 
-def draw_curves(axis: Axes, curves: Mapping[str, tuple[ArrayLike, ArrayLike]], joined: bool = True) -> None:
-    """Draw curves (x, y) that differ in colour, line and marker, each with its name for the legend.
-
-    Only their points are drawn if they are not `joined`.
-    """
-    for (name, (x, y)), colour, line, marker in zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS)):
-        if joined:
-            axis.plot(x, y, line, marker=marker if len(x) <= _MARKED else None, color=colour, label=name, markersize=5)
-        else:
-            axis.scatter(x, y, 50, colour, marker=marker, edgecolors="black", linewidths=0.4, label=name)
-
-
 def show_curves(x: ArrayLike, curves: Mapping[str, ArrayLike], **labels: Any) -> Figure:
     """Show curves over x; `labels` is what `Axes.set` takes, such as xlabel, ylabel and ylim."""
     return show_panels({"": {name: (x, y) for name, y in curves.items()}}, size=(7, 3.5), **labels)
@@ -243,12 +231,19 @@ def show_panels(
 ) -> Figure:
     """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one legend.
 
-    `size` is the width of the figure and the height of a row; `labels` is what `Axes.set` takes.
+    Curves differ in colour, line and marker. `size` is the width of the figure and the height of a row; `labels` is
+    what `Axes.set` takes.
     """
     width = size[0] / min(columns or len(panels), len(panels))
     figure, axes = _panels(len(panels), columns, width, size[1])
     for axis, (title, curves) in zip(axes, panels.items()):
-        draw_curves(axis, curves, joined)
+        styles = zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS))
+        for (name, (x, y)), colour, line, marker in styles:
+            style = {"marker": marker if len(x) <= _MARKED else None, "markersize": 5}
+            if joined:
+                axis.plot(x, y, line, color=colour, label=name, **style)
+            else:
+                axis.scatter(x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name)
         axis.set(title=title, **labels)
     _legend(figure, axes[0])
     return figure
@@ -420,25 +415,10 @@ def draw_axes(
     for name, colour, end, near in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
         if min(near, depth[0]) <= 0:
             continue
-        axis.annotate(
-            "",
-            end,
-            pixels[0],
-            zorder=6,
-            annotation_clip=False,
-            arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0},
-        )
-        axis.text(
-            *end,
-            name,
-            color=colour,
-            fontsize=_FONT,
-            weight="bold",
-            zorder=7,
-            ha="center",
-            va="center",
-            path_effects=_OUTLINE,
-        )
+        arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
+        axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow)
+        style = {"fontsize": _FONT, "weight": "bold", "ha": "center", "va": "center", "path_effects": _OUTLINE}
+        axis.text(*end, name, color=colour, zorder=7, **style)
     _keep_limits(axis, camera.size)
 
 
@@ -448,6 +428,7 @@ def draw_moved_cloud(
     cloud: Real[np.ndarray, "n 3"],
     poses: Sequence[Sim3],
     names: Sequence[str] | None = ("", "", ""),
+    size: float = 3,
 ) -> None:
     """Draw points of the reference camera's frame, and its axes, over the images of cameras, each with its own pose.
 
@@ -455,7 +436,7 @@ def draw_moved_cloud(
     """
     colours, length = coordinate_colours(cloud), 2 * axis_deviation(cloud)
     for axis, camera, pose in zip(axes, cameras, poses):
-        draw_points(axis, camera, pose.apply(cloud), colours, size=3)
+        draw_points(axis, camera, pose.apply(cloud), colours, size)
         if names is not None:
             draw_axes(axis, camera, pose.apply, cloud.mean(axis=0), length, names)
 

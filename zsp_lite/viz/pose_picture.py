@@ -101,7 +101,10 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     crops = [views[view].frame.camera for view in (chosen, *others)]
     for axis, camera, pose in zip((moved, *small), crops, estimate.propagate(crops)):
         _draw_points(axis, camera, pose.apply(cloud), colours, 5 if axis is moved else 3)
-    draw_coverage(drawing, seen, chosen + 1)
+    drawing.set_title("seen from above: target grey, reference coloured", fontsize=10)
+    _draw_gap(drawing, seen)
+    nearest = f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}"
+    draw_cameras(drawing, seen, chosen + 1, nearest)
     moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
     _draw_from_above(drawing, seen, _some(target_cloud), moved_cloud, colours)
     key.legend(*drawing.get_legend_handles_labels(), loc="center left", fontsize=11, frameon=False, labelspacing=1)
@@ -127,10 +130,18 @@ def _panels(others: int) -> tuple[Figure, list[Axes], list[Axes], Axes, Axes]:
     return figure, large, [*small, *beside], drawing, key
 
 
-def draw_coverage(axis: Axes, seen: Coverage, chosen: int) -> None:
-    """Draw the cameras on a circle around the object, and shade the largest arc without a target camera."""
+def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "reference") -> None:
+    """Draw the target cameras with their numbers, and a star for the reference camera, around the object."""
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
-    axis.set_title("seen from above: target grey, reference coloured", fontsize=10)
+    for number, place in zip(seen.numbers, seen.targets):
+        style = {"color": CHOSEN if number == chosen else BLUE}
+        axis.plot(*place, "o", markersize=11, markeredgecolor="white", **style)
+        axis.text(*(1.23 * place), str(number), ha="center", va="center", fontsize=11, weight="bold", zorder=4, **style)
+    axis.plot(*seen.reference, "*", color=VERMILLION, markersize=20, markeredgecolor="white", label=reference)
+
+
+def _draw_gap(axis: Axes, seen: Coverage) -> None:
+    """Shade the largest arc without a target camera, and draw the arc that the cameras span."""
     begin, end = seen.gap
     several = len(seen.numbers) > 1
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
@@ -139,14 +150,6 @@ def draw_coverage(axis: Axes, seen: Coverage, chosen: int) -> None:
     if several:
         axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=BLUE, linewidth=4))
         axis.plot([], [], color=BLUE, linewidth=4, label=f"the target views span {seen.span:.0f}°")
-    for number, place in zip(seen.numbers, seen.targets):
-        colour = CHOSEN if number == chosen else BLUE
-        axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
-        axis.text(
-            *(1.23 * place), str(number), color=colour, ha="center", va="center", fontsize=11, weight="bold", zorder=4
-        )
-    axis.plot(*seen.reference, "*", color=VERMILLION, markersize=20, markeredgecolor="white",
-              label=f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}")  # fmt: skip
 
 
 def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, moved: np.ndarray, colours: np.ndarray) -> None:

@@ -1,15 +1,10 @@
-"""The reliability of confidences: calibration, ranking, and their diagrams."""
+"""The reliability of confidences: calibration and ranking."""
 
 from dataclasses import dataclass
 
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Bool, Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy.stats import binomtest
-
-from zsp_lite.viz.plots import BLUE
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +20,7 @@ class Reliability:
     count: np.ndarray  # (bins,) number of estimates
     confidence: Float[np.ndarray, " bins"]  # (bins,) mean confidence
     accuracy: Float[np.ndarray, " bins"]  # (bins,) fraction of correct estimates
+    interval: Float[np.ndarray, "2 bins"]  # lower and upper ends of its 95 % interval (Wilson)
 
     def __str__(self) -> str:
         lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]
@@ -53,8 +49,11 @@ def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, "
     accuracy = np.array([correct[part].mean() for part in parts])
     count = np.array([len(part) for part in parts])
     upper_half = order[len(order) // 2 :]
+    ends = [binomtest(int(correct[part].sum()), len(part)).proportion_ci(method="wilson") for part in parts]
+    interval = np.array([[end.low for end in ends], [end.high for end in ends]])
     error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
-    return Reliability(auroc(confidence, correct), error, float(correct[upper_half].mean()), count, mean, accuracy)
+    upper = float(correct[upper_half].mean())
+    return Reliability(auroc(confidence, correct), error, upper, count, mean, accuracy, interval)
 
 
 def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
@@ -65,43 +64,3 @@ def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) 
         return float("nan")
     difference = positive[:, None] - negative
     return float(((difference > 0) + 0.5 * (difference == 0)).mean())
-
-
-def draw_reliability(axis: Axes, measured: Reliability) -> None:
-    """Draw a reliability diagram: accuracy against mean confidence of each bin, with 95 % Wilson intervals.
-
-    Counts stand beside the points, or in the title if they are equal.
-    On the dashed diagonal confidences are calibrated; below it they are too high.
-    """
-    accuracy, count = measured.accuracy, measured.count
-    right = np.rint(accuracy * count).astype(int)
-    ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(right.tolist(), count.tolist())]
-    bars = np.maximum([accuracy - [end.low for end in ends], [end.high for end in ends] - accuracy], 0)
-    axis.plot([0, 1], [0, 1], color="0.4", linestyle="--", label="calibrated")
-    axis.errorbar(
-        measured.confidence, accuracy, bars, fmt="o", color=BLUE, ecolor="0.5", capsize=3, markeredgecolor="black",
-        label="measured",
-    )  # fmt: skip
-    if len(set(count.tolist())) == 1:
-        axis.set_title(f"{count[0]} answers for each point", fontsize=10)
-    else:
-        for x, y, n in zip(measured.confidence, accuracy, count):
-            axis.annotate(str(n), (x, y), (5, -10), textcoords="offset points", fontsize=8, color="0.3")
-    axis.set(xlabel="mean confidence", ylabel="fraction within 30 degrees", xlim=(0, 1.03), ylim=(0, 1.03))
-    axis.set_aspect("equal")
-    axis.legend(loc="upper left", fontsize=9)
-
-
-def show_calibration(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> Figure:
-    """Show a reliability diagram, and the accuracy among the most confident answers against their share."""
-    measured = reliability(confidence, correct, bins=max(2, min(10, len(correct) // 20)))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 4.2), layout="constrained")
-    draw_reliability(left, measured)
-    order = np.argsort(-confidence, kind="stable")
-    number = np.arange(1, len(order) + 1)
-    right.plot(100 * number / len(order), 100 * np.cumsum(correct[order]) / number, color=BLUE, label="surest first")
-    right.axhline(100 * correct.mean(), color="0.4", linestyle="--", label="all answers")
-    right.set(xlabel="share of pairs that are answered (per cent)", ylabel="of these within 30 degrees (per cent)")
-    right.set(xlim=(0, 100), ylim=(0, 103))
-    right.legend(loc="lower left")
-    return figure

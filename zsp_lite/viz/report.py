@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -63,20 +63,6 @@ _TERMS = {
 }
 
 
-@dataclass(frozen=True)
-class StageFigure:
-    """One figure of the page: an image with its alternative text, or HTML that draws it."""
-
-    title: str
-    caption: str
-    notebook: str  # that explains the stage, without its extension
-    image: str | None = None  # a data URI
-    alt: str = ""
-    html: Markup = Markup()
-    wide: bool = False  # spans both columns
-    note: str = ""  # reasons not to trust what is shown, in one line
-
-
 def write_report(
     path: str | Path,
     results: Sequence[PairResult],
@@ -116,14 +102,15 @@ def render_page(
     environment.filters |= {"explain": _explain, "notebook": lambda name: _notebook_link(name, folder)}
     pairs = [
         {
-            "title": result.title,
+            "result": result,
             "rows": table_rows(result),
-            "reference": result.sources[0],
-            "target": result.sources[1],
-            "estimates": result.estimates,
-            "disagreement": result.disagreement,
-            "pictures": pose_pictures(result),
-            "stages": stage_figures(result, f"scene-{index}"),
+            "pictures": {solver: _data_uri(pose_picture(result, solver)) for solver in result.estimates},
+            "both": {
+                solver: _data_uri(_two_poses_figure(estimate))
+                for solver, estimate in result.estimates.items()
+                if estimate.one_of_two
+            },
+            "stages": _stages(result, f"scene-{index}"),
         }
         for index, result in enumerate(results, 1)
     ]
@@ -170,21 +157,9 @@ def _project_url(label: str) -> str | None:
 
 
 def _photograph_section(results: Sequence[PhotographResult]) -> dict:
-    return {
-        "sequence": results[0].sequence,
-        "columns": PHOTOGRAPH_COLUMNS,
-        "rows": photograph_rows(results),
-        "stage": StageFigure(
-            "Estimated directions and aligned point cloud",
-            "Points: the synthetic motorcycle after the estimated pose, from its rear (dark) to its front (bright). "
-            f"{PHOTOGRAPH_CREDIT}",
-            "00_quickstart",
-            _data_uri(photograph_figure(results)),
-            f"A photograph of a motorcycle with the aligned cloud of {results[0].sequence} and arrows to the front, "
-            "left and up, for two foregrounds and two solvers.",
-            wide=True,
-        ),
-    }
+    rows, image = photograph_rows(results), _data_uri(photograph_figure(results))
+    about = {"sequence": results[0].sequence, "credit": PHOTOGRAPH_CREDIT}
+    return about | {"columns": PHOTOGRAPH_COLUMNS, "rows": rows, "image": image}
 
 
 def table_rows(result: PairResult) -> list[tuple[str, ...]]:
@@ -235,86 +210,14 @@ def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
     return path
 
 
-def pose_pictures(result: PairResult) -> list[StageFigure]:
-    """Draw the picture of each solver's estimate, and both poses where its answer is one of two."""
-    pictures = []
-    for solver, estimate in result.estimates.items():
-        sure = "" if estimate.confidence is None else f": confidence {estimate.confidence:.2f}"
-        error = f", rotation error {result.errors[solver]:.1f}°" if solver in result.errors else ""
-        chosen = estimate.view + 1
-        pictures.append(
-            StageFigure(
-                f"{solver} solver{sure}{error}",
-                "The reference's points under the estimated pose, drawn over the target views. Their colour is the "
-                "position along the reference's longest axis: in a correct pose each colour is at the same part of "
-                "both objects. Below, the directions of the cameras from the target object, as seen from above."
-                + (" The score is that of eq. 3; the view with the highest is chosen." if solver == "paper" else ""),
-                "03_best_view" if solver == "paper" else "11_hypotheses_and_evidence",
-                _data_uri(pose_picture(result, solver)),
-                f"The reference, target view {chosen}, and the reference's points in the target views under the pose "
-                f"of the {solver} solver; below, the cameras around the target object from above.",
-                wide=True,
-                note=estimate.note,
-            )
-        )
-        if estimate.one_of_two:
-            angle = estimate.angle_to(estimate.alternatives[0])
-            pictures.append(
-                StageFigure(
-                    f"One of two: both poses of the {solver} solver",
-                    "The solver cannot decide between these two poses, which explain the views about equally well. "
-                    "Arrows: the axes of the reference camera (x right, y down, z forward).",
-                    "11_hypotheses_and_evidence",
-                    _data_uri(_two_poses_figure(estimate)),
-                    f"The same target views with the reference's points under two poses of the {solver} solver: left "
-                    f"the estimate, right its first alternative, turned by {angle:.0f} degrees.",
-                    wide=True,
-                )
-            )
-    return pictures
-
-
-def stage_figures(result: PairResult, scene_id: str) -> list[StageFigure]:
-    """Draw the method's stages for the chosen view of the first solver, in their order.
-
-    `scene_id` is the HTML id of the 3D scene, unique on the page.
-    """
-    estimate, chosen = result.estimate, f"target view {result.estimate.view + 1}"
-    inliers, matches = int(estimate.inliers.sum()), len(estimate.matches)
-    verified = "The verified solver starts from matches of all views; few need to agree with its pose."
-    return [
-        StageFigure(
-            "Saliency",
-            "Attention of the CLS token to the patches. Patches above 0.05 are foreground.",
-            "01_features",
-            _data_uri(_saliency_figure(result)),
-            f"Saliency of the reference and of {chosen} as a colour overlay.",
-        ),
-        StageFigure(
-            "Cyclical distances",
-            "Each patch is mapped to its nearest neighbour in the other image and back (eq. 2). Bright patches return "
-            "close to where they started; uncoloured ones leave the foreground.",
-            "02_cyclical_maps",
-            _data_uri(_cycles_figure(result)),
-            f"Cyclical distance maps between the reference and {chosen}, in both directions.",
-        ),
-        StageFigure(
-            "Correspondences",
-            f"{matches} matches: {inliers} inliers of the pose (solid), {matches - inliers} outliers (dashed). "
-            + ("" if "paper" in result.estimates else verified),
-            "04_umeyama_ransac",
-            _data_uri(matches_of_estimate(estimate, size=2.7)),
-            f"Lines between matched patches of the reference and {chosen}; inliers solid, outliers dashed.",
-        ),
-        StageFigure(
-            "Aligned point clouds",
-            "The reference's points, transformed by the chosen pose, and the target's points, in the frame of "
-            f"{chosen}'s camera. Each camera sees one side of its object. Drag to rotate, drag with the right button "
-            "to move; the buttons above the scene zoom.",
-            "04_umeyama_ransac",
-            html=_scene_html(result, scene_id),
-        ),
-    ]
+def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
+    """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the page."""
+    return {
+        "saliency": _data_uri(_saliency_figure(result)),
+        "cycles": _data_uri(_cycles_figure(result)),
+        "matches": _data_uri(matches_of_estimate(result.estimate, size=2.7)),
+        "scene": _scene_html(result, scene_id),
+    }
 
 
 def _saliency_figure(result: PairResult) -> Figure:

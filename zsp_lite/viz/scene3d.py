@@ -9,28 +9,25 @@ from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 4000  # of both clouds together; more points slow down browsers and enlarge notebooks
 STYLES = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))  # colour, symbol and size of both clouds
-_AXIS_LABELS = {"x": "x (right)", "y": "y (down)", "z": "z (forward)"}
+_AXIS_LABELS = "x (right)", "y (down)", "z (forward)"
 
 
 def aligned_clouds(
     reference: Real[np.ndarray, "n 3"],
     target: Real[np.ndarray, "m 3"],
-    names: tuple[str, str] = ("reference, aligned", "target"),
-    title: str | None = None,
-    seed: int = 0,
     colours: tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]] | None = None,
 ) -> go.Figure:
     """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
 
     A random subset is drawn of each; the clouds differ in colour, if no `colours` are given, and in their markers.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     traces, drawn = [], []
-    for index, (cloud, name, (colour, symbol, size)) in enumerate(zip((reference, target), names, STYLES)):
+    clouds = {"reference, aligned": reference, "target": target}
+    for (name, cloud), own, (colour, symbol, size) in zip(clouds.items(), colours or (None, None), STYLES):
         cloud = np.asarray(cloud, dtype=np.float64)
         if len(cloud) == 0 or not np.isfinite(cloud).all():
             raise InputError(f"point cloud {name!r} of shape {cloud.shape} is empty or not finite")
-        own = None if colours is None else colours[index]
         if len(cloud) > MAX_POINTS // 2:
             kept = np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))
             cloud, own = cloud[kept], None if own is None else own[kept]
@@ -43,31 +40,21 @@ def aligned_clouds(
         marker = {"size": size, "color": colour, "symbol": symbol, "opacity": 0.75}
         traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker))
 
+    # Ranges of equal length, from percentiles, which are robust to outliers.
+    low, high = np.percentile(np.concatenate(drawn), [1, 99], axis=0)
+    middle, half = (low + high) / 2, 0.6 * float((high - low).max())
     axes = {
-        f"{axis}axis": {"title": {"text": _AXIS_LABELS[axis]}, "range": limits, "nticks": 5}
-        for axis, limits in axis_ranges(np.concatenate(drawn)).items()
+        f"{label[0]}axis": {"title": {"text": label}, "range": [float(x - half), float(x + half)], "nticks": 5}
+        for label, x in zip(_AXIS_LABELS, middle)
     }
     camera = {
         "up": {"x": 0, "y": -1, "z": 0},
         "eye": {"x": 1.15, "y": -0.74, "z": -1.9},
         "center": {"x": 0.15, "y": 0.12, "z": 0.1},
     }
-    figure = go.Figure(traces)
-    figure.update_layout(
-        title=title,
+    return go.Figure(traces).update_layout(
         height=440,
-        margin={"l": 0, "r": 0, "t": 40 if title else 0, "b": 10},
+        margin={"l": 0, "r": 0, "t": 0, "b": 10},
         legend={"itemsizing": "constant", "orientation": "h", "x": 0, "y": 0, "bgcolor": "rgba(255,255,255,0.8)"},
         scene={**axes, "aspectmode": "cube", "camera": camera},
     )
-    return figure
-
-
-def axis_ranges(points: Real[np.ndarray, "n 3"]) -> dict[str, list[float]]:
-    """Ranges of equal length for the x, y and z axis.
-
-    The length is 1.2 times the largest range from the 1st to the 99th percentile, which is robust to outliers.
-    """
-    low, high = np.percentile(points, [1, 99], axis=0)
-    half = 0.6 * float((high - low).max())
-    return {axis: [float(middle - half), float(middle + half)] for axis, middle in zip("xyz", (low + high) / 2)}

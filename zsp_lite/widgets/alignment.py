@@ -9,7 +9,7 @@ from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
-from zsp_lite.widgets.common import Widget, interactive_figure, load_package, redrawing, slider, small_text
+from zsp_lite.widgets.common import Widget, interactive_figure, load_package, redrawing, slider
 
 _FARTHEST = 6.0  # that `one_outlier` moves the point, scene units
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -23,11 +23,11 @@ def ransac_settings(
 ) -> Widget:
     """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in both cameras."""
     (source, target), n = points, len(points[0])
-    figure, (*axes, graph) = plt.subplots(1, 3, figsize=(9, 3.1), width_ratios=(1, 1, 1.3), layout="constrained")
+    figure, (*axes, graph) = plt.subplots(1, 3, figsize=(9.6, 3.6), width_ratios=(1, 1, 1.3), layout="constrained")
     for axis, image, title in zip(axes, images, ("reference", "target")):
         draw_image(axis, image)
         axis.set_axis_off()
-        axis.set_title(title, fontsize=9)
+        axis.set_title(title)
     lines = redrawing(draw_matches)
     inside = graph.scatter([], [], s=26, color=BLUE, marker="o", label="inlier")
     outside = graph.scatter([], [], s=26, color="0.45", marker="x", label="outlier")
@@ -35,7 +35,6 @@ def ransac_settings(
     graph.set(xlim=(-1, n), ylim=(0.01, 10), yscale="log", title="residuals")
     graph.set(xlabel="match, sorted by residual", ylabel="residual (scene units)")
     graph.legend(loc="upper left")
-    small_text(graph)
 
     def update(trials: int, threshold: float, seed: int) -> str:
         line.set_ydata([threshold, threshold])

@@ -23,7 +23,6 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -101,15 +100,6 @@ def interactive_figure(
     box = widgets.VBox([row, described, picture, caption])
     box.redraw, box.controls, box.figure, box.picture, box.caption = redraw, dict(controls), figure, picture, caption
     return box
-
-
-def small_text(axis: Axes) -> None:
-    """Give the texts of an axis the size of a panel in a row of several."""
-    axis.tick_params(labelsize=8)
-    axis.title.set_fontsize(9)
-    texts = axis.get_legend().get_texts() if axis.get_legend() else []
-    for text in (axis.xaxis.label, axis.yaxis.label, *texts):
-        text.set_fontsize(8)
 
 
 def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
