@@ -51,7 +51,7 @@ def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
 
 def test_a_second_run_computes_nothing_again_and_says_the_same(run, monkeypatch):
     out, summary = run
-    monkeypatch.setattr("zsp_lite.benchmark.execution.evaluate_pair", None)  # nothing is left to compute
+    monkeypatch.setattr("zsp_lite.benchmark.evaluation.evaluate_pair", None)  # nothing is left to compute
     before = read_run(out)
     assert evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out) == summary
     after = read_run(out)

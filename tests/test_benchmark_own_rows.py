@@ -297,7 +297,7 @@ def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_f
 
     with pytest.raises(InputError, match="keys, .* hold values that are not finite"):
         run_rows(["ours"], tmp_path, backbone=NotANumber(grid=8))
-    with pytest.raises(InputError, match="the run has no finished pair yet"):
+    with pytest.raises(InputError, match="the run has no pair that all its rows have finished"):
         read_run(tmp_path)
 
 

@@ -22,7 +22,8 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.execution import Evaluator, make_chunks, open_workers
+from zsp_lite.benchmark.evaluation import Evaluator
+from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import Problem
@@ -114,7 +115,7 @@ def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_cont
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table) and read_run(tmp_path).summary == summary
     with monkeypatch.context() as context:
-        context.setattr("zsp_lite.benchmark.execution.evaluate_pair", None)  # nothing is left to compute
+        context.setattr("zsp_lite.benchmark.evaluation.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
     more = evaluate(small_folder(), QUICK, ["ours", "oracle-view"], 6, 3, tmp_path)["methods"]
     assert more["ours"] == summary["methods"]["ours"] and more["oracle-view"]["n"] == 12
@@ -211,8 +212,7 @@ def test_unusable_executors_are_refused(monkeypatch):
 
 
 def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
-    found = pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
-    return {pair: rows for pairs in found.values() for pair in pairs}
+    return pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
 
 
 def errors(chunk, backbone, threads=None) -> dict:

@@ -223,7 +223,7 @@ def test_what_is_no_run_is_refused(tmp_path):
         with pytest.raises(InputError, match=f"{packed}.*{told}"):
             read_run(tmp_path)
     packed.write_bytes(gzip.compress(b""))
-    with pytest.raises(InputError, match="no finished pair"):
+    with pytest.raises(InputError, match="no pair that all its rows have finished"):
         read_run(tmp_path)
     settings = (tmp_path / SETTINGS).read_bytes()
     for new in (b"{}", settings.replace(b'"calls"', b'"call"'), settings.replace(b'"targets": 5', b'"targets": "5"')):
@@ -266,8 +266,8 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
 
 def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_path):
     (axis,) = figures.error_distribution(run).axes
-    assert sum(len(points.get_offsets()) for points in axis.collections) == 48
-    assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES, reverse=True)
+    assert sum(len(points.get_offsets()) for points in axis.collections) == 48 + len(CATEGORIES)  # and the medians
+    assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES)
     left, right = figures.accuracy_against_views(run).axes
     line = left.get_lines()[0]
     assert list(line.get_xdata()) == [1, 3, 5, 10, 20]

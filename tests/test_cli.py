@@ -45,7 +45,7 @@ def test_an_unknown_option_is_one_line_and_exit_code_2(command, capsys):
 def test_help_lists_every_command(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    names = "demo estimate benchmark tables compare synth weights data doctor".split()
+    names = "demo estimate align benchmark tables compare synth weights data doctor".split()
     assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
 
 

@@ -1,7 +1,6 @@
 """Labelling by keypoints: labels agree with known ones, sessions survive a restart, bad picks are refused."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.co3d import write_co3d
+from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import write_atomic
 from zsp_lite.labelling import Labelling, align_picks
-from zsp_lite.labelling.guess import _frames, guess_alignment
 from zsp_lite.labelling.session import MAX_RESIDUAL
-from zsp_lite.metrics import rotation_error
 
 
 @pytest.fixture
@@ -220,22 +218,18 @@ def test_the_reference_is_that_of_the_labels_or_the_best_of_the_given_sequences(
     assert Labelling(root, "chair").reference == "b"
 
 
-@pytest.mark.slow
-def test_the_method_proposes_an_alignment_with_a_confidence(tmp_path):
-    """With features that are functions of the object coordinates, the proposal is correct."""
-    from synthetic_views import CoordinateBackbone, look_at, render
-
-    turned = Sim3(1.2, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.array([0.1, 0, 0.05]))
-    placed = {"a": Sim3.identity(), "b": turned}
-    for name, placement in placed.items():
-        directions = [(1, 0.6, 0.4), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4)]
-        frames = [render(look_at(direction, 4.5), placement, name) for direction in directions]
-        sequence = replace(sequence_data(name), frames=frames)
-        write_co3d(tmp_path, "egg", [sequence], quality=100)
-    sim3, confidence = guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "b", references=2, views=4)
-    assert rotation_error(sim3.R, turned.R) < 10 and sim3.scale == pytest.approx(1.2, rel=0.15)
-    assert 0 <= confidence <= 1
-    loaded = [one.name for one in _frames(Co3D(tmp_path), "egg", "b", 4)]
-    assert loaded == [f"b/{number}" for number in range(4)], "all frames where there are no more than asked for"
-    with pytest.raises(InputError, match="no frames of 'c'"):
-        guess_alignment(Co3D(tmp_path), CoordinateBackbone(), "egg", "a", "c")
+def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", 70, degrees=True).as_matrix()
+    for name, trans in (("a", np.eye(4)), ("best", turn)):  # the reference of proposals may be another one
+        write_atomic(root / "label_proposals" / "chair" / f"{name}.json", label_bytes(PoseLabel(trans, name, "a")))
+    labelling = Labelling(root, "chair")
+    assert labelling.reference == "best" and labelling.proposal("b") is None
+    np.testing.assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
+    with pytest.raises(InputError, match="sequence b has 0 of 0 keypoints"):
+        labelling.accept("b")
+    labelling.accept("a")
+    np.testing.assert_allclose(read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12)
+    write_atomic(root / "label_proposals" / "chair" / "b.json", b"{}")
+    with pytest.raises(InputError, match="proposal .*b.json|label .*b.json"):
+        Labelling(root, "chair")

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from zsp_lite.benchmark.statistics import (
     bootstrap_ci,
-    mean_category_median,
+    figures_of,
     object_draws,
     pair_draws,
     paired_test,
-    summarise,
 )
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, rotation_error
@@ -102,14 +101,14 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
 
 
 def test_equal_errors_have_no_spread():
-    summary = summarise([20.0] * 5)
+    summary = figures_of([20.0] * 5)
     assert summary == {
         "n": 5, "median": 20, "acc30": 100, "acc15": 0,
         "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0, "auc30": 100 * (1 - 20 / 30),
     }  # fmt: skip
     # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30 counts nowhere.
-    assert summarise([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)
-    assert summarise([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
+    assert figures_of([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)
+    assert figures_of([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
 
 
 PAIRS = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
@@ -161,12 +160,12 @@ def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
 
 
 def test_the_mean_of_category_medians_is_over_categories():
-    errors, categories = np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)], ["x"] * 6 + ["y"] * 6
+    errors, categories = np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)], np.repeat(["x", "y"], 6)
     weights = object_draws(PAIRS * 2, categories)
-    found, interval = mean_category_median(errors, categories, weights)
-    assert found == 20
+    found = figures_of(errors, weights, categories)
+    assert found["mean_category_median"] == 20
     medians = [(10 + median(errors[6:], row)) / 2 for row in weights[:, 6:]]
-    assert interval == pytest.approx(tuple(np.percentile(medians, [2.5, 97.5])))
+    assert found["mean_category_median_ci"] == pytest.approx(np.percentile(medians, [2.5, 97.5]))
 
 
 def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():

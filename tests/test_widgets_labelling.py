@@ -1,6 +1,7 @@
 """The labelling widget without a browser: clicks are sent as messages, and every change is on disk at once."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -156,17 +157,29 @@ def test_undo_reverts_picks_moves_and_redo(labelling):
 
 
 def test_a_guess_gives_keypoints_which_can_be_undone(labelling, monkeypatch):
-    guess = Sim3(1.3, TURN, np.full(3, 2.0) + 0.001), 0.8
-    monkeypatch.setattr("zsp_lite.labelling.guess.guess_alignment", lambda *_: guess)
+    guess = SimpleNamespace(between=lambda *_: Sim3(1.3, TURN, np.full(3, 2.0) + 0.001))
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: guess)
     box = label_poses(labelling, backbone=object())
     assert box.buttons["guess"].disabled
     click_all(box, labelling, "reference", "best")
     box.buttons["next"].click()
     box.buttons["guess"].click()
-    assert "confidence 80%" in message(box) and box.controls["overlay"].value
+    assert "Alignment proposed" in message(box) and box.controls["overlay"].value
     np.testing.assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
     box.buttons["undo"].click()
     assert len(labelling.picks("a")) == 0
+
+
+def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelling):
+    proposal = Sim3(1.0, TURN, np.zeros(3))
+    labelling.proposal = lambda sequence: proposal
+    box = label_poses(labelling)
+    box.buttons["next"].click()
+    assert "proposal is laid over" in message(box) and box.controls["overlay"].value
+    first = box.controls["sequence"].value
+    box.buttons["accept"].click()
+    np.testing.assert_allclose(read_labels(labelling.root, labelling.category)[first].trans[:3, :3], TURN, atol=1e-9)
+    assert box.controls["sequence"].value != first and not box.buttons["accept"].disabled
 
 
 def test_skip_and_next_go_through_the_open_sequences_and_the_slider_chooses_a_point(labelling):

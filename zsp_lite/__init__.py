@@ -18,6 +18,7 @@ Read the files in this order:
     metrics      rotation errors, medians and accuracies
     demo         one pair of each category, from data folder to pose error
     own_objects  one pair of your own, from files to files
+    category     all objects of a category in one frame, by the verified solver
 
     data         CO3D folders, frames, cameras, depth, labels, pairs
     backbones    vision transformers and how to load them

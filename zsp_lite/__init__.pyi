@@ -2,11 +2,13 @@
 # ruff: noqa: I001
 
 from zsp_lite import (
+    align as align,
     alignment as alignment,
     backbones as backbones,
     baselines as baselines,
     benchmark as benchmark,
     best_view as best_view,
+    category as category,
     choices as choices,
     cli as cli,
     data as data,
@@ -32,6 +34,7 @@ from zsp_lite import (
     viz as viz,
     widgets as widgets,
 )
+from zsp_lite.align import align_category as align_category
 from zsp_lite.alignment import Sim3 as Sim3
 from zsp_lite.backbones import checkpoints as checkpoints, facets as facets, huggingface as huggingface, vit as vit
 from zsp_lite.backbones.backbone import Backbone as Backbone

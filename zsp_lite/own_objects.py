@@ -173,9 +173,10 @@ def estimate_pose(
         estimates = {name: _in_units(one, *scales, flags) for name, one in solved.items()}
         result = PairResult(
             f"{first.name} to {second.name}", (first.describe([position]), second.describe(positions)), frame,
-            tuple(frames), estimates, _errors(first, second, frame, frames, estimates),
-            masks=(first.mask, second.mask), backbone=getattr(model, "name", str(backbone)),
+            tuple(frames), estimates, {}, masks=(first.mask, second.mask),
+            backbone=getattr(model, "name", str(backbone)),
         )  # fmt: skip
+        result = replace(result, errors=known_errors(first, second, result, estimates))
         if out is not None:
             write_pair(result, out)
     return result
@@ -320,8 +321,8 @@ def _open_image(
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 
 
-def _errors(
-    first: Source, second: Source, reference: Frame, targets: Sequence[Frame], estimates: dict[str, PoseEstimate]
+def known_errors(
+    first: Source, second: Source, result: PairResult, estimates: dict[str, PoseEstimate]
 ) -> dict[str, float]:
     """Compute rotation errors if both are labelled sequences of one category; {} otherwise."""
     one, other = (source.path.resolve() for source in (first, second))
@@ -330,7 +331,7 @@ def _errors(
     labels = read_labels(one.parent.parent, one.parent.name)
     if not {one.name, other.name} <= set(labels):
         return {}
-    return label_errors(estimates, [labels[one.name], labels[other.name]], reference, targets)
+    return label_errors(estimates, [labels[one.name], labels[other.name]], result.reference, result.targets)
 
 
 def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Evaluate rows on one pair: estimates, their errors and their cost (paper sec. 5.1)."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.benchmark.methods import Method
+from zsp_lite.benchmark.methods import Method, make_extractors
 from zsp_lite.benchmark.own import describe_failure
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.data.co3d import Pair
-from zsp_lite.data.labels import PoseLabel, relative_pose
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
@@ -25,6 +26,25 @@ from zsp_lite.synthetic.recording import read_poses
 FAILED = 180.0
 _MEASURED = ("symmetric_error", "translation", "scale", "failed")  # details must not stand in for them
 Poses = Float[np.ndarray, "n 4 4"]
+
+
+class Evaluator:
+    """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
+
+    def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int | None = None):
+        """Make the extractors; `threads` are torch's in feature extraction."""
+        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+        self._dataset, self._methods, self._threads = Co3D(root), methods, threads
+        self._extractors, self._store = make_extractors(loaded, methods), None
+
+    def lines(self, chunk: Sequence[tuple[Pair, list[str]]]) -> Iterator[dict[str, Any]]:
+        """Evaluate the pairs of a chunk, all of one category (see `evaluate_pair`)."""
+        category = chunk[0][0].category
+        if self._store is None or self._store.category != category:
+            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
+            self._labels = read_labels(self._dataset.root, category)
+        for pair, names in chunk:
+            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
 
 
 def evaluate_pair(

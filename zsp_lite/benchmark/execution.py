@@ -11,19 +11,15 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from contextlib import contextmanager
 from itertools import groupby, islice
 from multiprocessing import active_children, get_context, parent_process
-from multiprocessing.connection import wait as wait_for
 from typing import Any
+from uuid import uuid4
 
 import cloudpickle
 import cv2
 from threadpoolctl import threadpool_limits
 
-from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.evaluation import evaluate_pair
-from zsp_lite.benchmark.methods import Method, make_extractors
-from zsp_lite.benchmark.store import FrameStore, torch_threads
-from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels
+from zsp_lite.benchmark.store import torch_threads
+from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
@@ -31,30 +27,6 @@ CHUNK_SIZE = 16  # pairs
 MOST_WORKERS = 4096  # also of threads
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
-
-
-class Evaluator:
-    """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
-
-    def __init__(
-        self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int | None = None,
-        extractors: Mapping[str, Any] | None = None,
-    ):  # fmt: skip
-        """Make the extractors from `backbone`, if they are not given; `threads` are torch's in feature extraction."""
-        if extractors is None:
-            backbone = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-            extractors = make_extractors(backbone, methods)
-        self._dataset, self._methods, self._threads, self._extractors = Co3D(root), methods, threads, extractors
-        self._store: FrameStore | None = None
-
-    def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
-        """Evaluate the pairs of a chunk (see `evaluate_pair`)."""
-        category = chunk[0][0].category
-        if self._store is None or self._store.category != category:
-            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
-            self._labels = read_labels(self._dataset.root, category)
-        for pair, names in chunk:
-            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
@@ -76,13 +48,16 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Evaluator],
+    make: Callable[[], Any],
     chunks: Sequence[Chunk],
     executor: Executor | None,
     workers: int,
     save: Callable[[list[dict[str, Any]]], None],
 ) -> None:
-    """Evaluate chunks with what `make` makes; `save` gets the lines of each, or of each pair in this process."""
+    """Evaluate chunks with an `evaluation.Evaluator` or what else `make` makes, by its method `lines`.
+
+    `save` gets the lines of each chunk, or of each pair where this process evaluates them.
+    """
     if executor is None:
         evaluator = make()
         with one_thread():
@@ -90,7 +65,7 @@ def evaluate_chunks(
                 save([line])
         return
     # cloudpickle: methods and backbones that are defined in a notebook travel by value.
-    pickled, waiting, running = cloudpickle.dumps(make), iter(chunks), set[Future]()
+    pickled, waiting, running = cloudpickle.dumps((uuid4(), make)), iter(chunks), set[Future]()
     try:
         while True:
             # Two chunks per worker keep it busy; more would fill queues with copies of the backbone.
@@ -117,9 +92,9 @@ _worker = threading.local()  # an executor's workers may be threads
 
 
 def _evaluate_chunk(make: bytes, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps its evaluator for the next one."""
+    """Evaluate a chunk in a worker, which keeps its evaluator for the next one of the same call."""
     if getattr(_worker, "make", None) != make:
-        _worker.evaluator, _worker.make = cloudpickle.loads(make)(), make
+        _worker.evaluator, _worker.make = cloudpickle.loads(make)[1](), make
     with one_thread():
         return list(_worker.evaluator.lines(chunk))
 
@@ -171,7 +146,7 @@ def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
-        wait_for([parent_process().sentinel])
+        parent_process().join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

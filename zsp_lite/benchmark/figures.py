@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.tables import own_rows, read_paper_tables
 from zsp_lite.choices import METRICS
-from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
-
-_COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, "#56B4E9", "#CC79A7", "#000000")
+from zsp_lite.viz.plots import COLOURS, show_dots, show_panels
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
@@ -21,36 +19,22 @@ def error_distribution(run: Run, row: str = "ours") -> Figure:
 
     A second cluster near 180 degrees consists of confusions of front and back.
     """
-    by_category = sorted(run.row(row).groupby("category")["error"], reverse=True)
-    figure, axis = plt.subplots(figsize=(7, 0.9 + 0.32 * len(by_category)), layout="constrained")
-    jitter = np.random.default_rng(0)
-    for height, (_, errors) in enumerate(by_category):
-        axis.scatter(errors, height + jitter.uniform(-0.28, 0.28, len(errors)), s=9, alpha=0.55, color=BLUE, lw=0)
-        axis.plot([errors.median()] * 2, [height - 0.38, height + 0.38], color=VERMILLION, lw=2)
-    axis.set_yticks(range(len(by_category)), [category for category, _ in by_category])
-    axis.set(xlim=(-3, 183), ylim=(-0.6, len(by_category) - 0.4), xlabel="rotation error (degrees)")
-    axis.set_xticks(range(0, 181, 30))
-    axis.set_title(f'Errors of "{row}" by category; the bar is the median', fontsize=10)
-    axis.grid(axis="x", alpha=0.3)
-    return figure
+    groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
+    labels = {"xlabel": "rotation error (degrees)", "xlim": (-3, 183), "xticks": range(0, 181, 30)}
+    return show_dots({row: groups}, title=f'Errors of "{row}" by category; the bar is the median', **labels)
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     """Draw the cumulative distribution of the errors, one line per row; by default of seven, first one's own."""
-    names = list(rows or dict.fromkeys([*own_rows(run.summary), *run.summary["methods"]]))[: len(_COLOURS)]
-    figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
-    for index, name in enumerate(names):
+    names = list(rows or dict.fromkeys([*own_rows(run.summary), *run.summary["methods"]]))[: len(COLOURS)]
+    curves = {}
+    for name in names:
         errors = np.sort(run.row(name)["error"])
-        share = 100 * np.arange(len(errors) + 1) / len(errors)
-        style = {"color": _COLOURS[index], "ls": ("-", "--", "-.", ":")[index % 4]}
-        axis.step(np.concatenate([[0], errors]), share, where="post", label=name, **style)
-    for threshold in (15, 30):
-        axis.axvline(threshold, color="0.7", lw=1, zorder=0)
-    axis.set(xlim=(0, 180), ylim=(0, 100), xticks=range(0, 181, 30))
-    axis.set(xlabel="rotation error (degrees)", ylabel="pairs with at most this error (%)")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, loc="lower right")
-    return figure
+        shares = 100 * np.arange(len(errors) + 1) / len(errors)
+        curves[name] = np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1]  # a step at every error
+    labels = {"xlabel": "rotation error (degrees)", "ylabel": "pairs with at most this error (%)"}
+    labels |= {"xlim": (0, 180), "ylim": (0, 100), "xticks": (0, 15, 30, 60, 90, 120, 150, 180)}
+    return show_panels({"": curves}, size=(6.5, 4), **labels)
 
 
 def accuracy_against_views(run: Run) -> Figure | None:
@@ -73,7 +57,7 @@ def accuracy_against_views(run: Run) -> Figure | None:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
     for place, (axis, metric) in enumerate(zip(axes, ("acc30", "acc15"), strict=True)):
         for index, (row, found) in enumerate(drawn.items()):
-            colour, ends = _COLOURS[index % len(_COLOURS)], np.array([one[f"{metric}_ci"] for one in found.values()])
+            colour, ends = COLOURS[index % len(COLOURS)], np.array([one[f"{metric}_ci"] for one in found.values()])
             axis.fill_between(list(found), *ends.T, color=colour, alpha=0.18, lw=0)
             values = [one[metric] for one in found.values()]
             axis.plot(list(found), values, "os^Dv"[index % 5] + "-", color=colour, label=row)

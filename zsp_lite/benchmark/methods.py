@@ -83,6 +83,8 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings=_VERIFIED),
     "verified-mask": Method(settings=_VERIFIED | _MASK),
+    # Sees all other objects of the category, too, without labels.
+    "category": Method(solve=baseline_rows.category),
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {

@@ -44,10 +44,6 @@ class Row(Protocol):
                 torch.cosine_similarity(feature, target.features.global_feature, dim=0) for target in problem.targets
             ]
             return np.eye(3), int(np.argmax(cosines))
-
-        evaluate(data, "zsp-tiny", {"ours": "ours", "most similar": most_similar}, pairs=10)
-
-    or, on the command line, `zsp-lite benchmark --methods ours,my_module:most_similar`.
     """
 
     def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:

@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark import execution
+from zsp_lite.benchmark.evaluation import Evaluator
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, resolve
-from zsp_lite.benchmark.runs import Call, Settings, add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.runs import Call, ResultLine, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
@@ -61,7 +62,7 @@ def evaluate(
     check_integer("targets", targets, 1)
     rows, dataset = resolve(methods), Co3D(data)
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
-    row_pairs = pairs_of_rows(dataset, rows, numbers, targets)
+    work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     extractors = make_extractors(loaded, rows)
     for row in rows.values():
@@ -80,31 +81,29 @@ def evaluate(
             calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
         )  # fmt: skip
         with open_run(out, settings, allow_other_version):
-            setup = str(Path(data).resolve()), rows, backbone, max(1, get_num_threads() // workers)
-            make = partial(execution.Evaluator, *setup, extractors=None if pool else extractors)
+            sent, threads = backbone if pool else loaded, max(1, get_num_threads() // workers)
+            make = partial(Evaluator, str(Path(data).resolve()), rows, sent, threads)
             known = {(row, line.pair) for line in read_lines(out) for row in line.results}
-            asked = [(pair, name) for name, found in row_pairs.items() for pair in found]
-            todo: dict[Pair, list[str]] = {}
-            for pair, name in asked:
-                if (name, pair.key) not in known:
-                    todo.setdefault(pair, []).append(name)
-            evaluate_pairs(out, make, todo, len({pair for pair, _ in asked}), pool, workers)
+            new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
+            todo = {pair: names for pair, names in new.items() if names}
+            evaluate_pairs(out, make, todo, len(work), pool, workers)
             summary = read_run(out).summary
             write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
     return summary
 
 
 def evaluate_pairs(
-    out: str | Path, make: Callable[[], Any], todo: Mapping[Pair, list[str]], total: int, pool: Any, workers: int
-) -> None:
-    """Evaluate the rows of pairs, and add what is found to a run's folder at once; a progress bar counts to `total`."""
+    out: str | Path, make: Callable[[], Any], todo: Mapping[Pair, list[str]], total: int, pool: Any, workers: int,
+    kind: type = ResultLine,
+) -> None:  # fmt: skip
+    """Evaluate pairs, and add what is found, lines of a `kind`, to a run at once; a progress bar counts to `total`."""
     size = max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
     # Hidden outside a terminal, and where the user wants to hear warnings only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
     with tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar:
 
         def save(lines: list[dict[str, Any]]) -> None:
-            add_lines(out, lines)
+            add_lines(out, lines, kind)
             bar.update(len(lines))
 
         execution.evaluate_chunks(make, execution.make_chunks(todo, size), pool, workers, save)
@@ -112,19 +111,20 @@ def evaluate_pairs(
 
 def pairs_of_rows(
     dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
-) -> dict[str, list[Pair]]:
-    """Return the pairs that each row is evaluated on: the same for all rows of as many target views."""
+) -> dict[Pair, list[str]]:
+    """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as many target views."""
     known = dataset.categories()
     unknown = sorted(set(numbers) - set(known))
     if unknown or not numbers:
         raise InputError(f"{dataset.root}: no categories {unknown or ''}, found {', '.join(known) or 'none'}")
     for category, number in numbers.items():
         check_integer(f"pairs of {category}", number, 1)
-    found = {
-        n_targets: [pair for category, n in numbers.items() for pair in category_pairs(dataset, category, n, n_targets)]
-        for n_targets in {row.targets or targets for row in rows.values()}
-    }
-    return {name: found[row.targets or targets] for name, row in rows.items()}
+    work: dict[Pair, list[str]] = {}
+    for n_targets in {row.targets or targets for row in rows.values()}:
+        names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
+        for category, n in numbers.items():
+            work |= dict.fromkeys(category_pairs(dataset, category, n, n_targets), names)
+    return work
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:

@@ -69,7 +69,7 @@ class _Result(msgspec.Struct):
     failed: str = ""
 
 
-class _Line(msgspec.Struct):
+class ResultLine(msgspec.Struct):
     pair: _Key
     results: dict[str, _Result]
     timings: dict[str, float] = {}
@@ -140,11 +140,11 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
 
 
-def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
+def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
     """Add the results of pairs to run.jsonl; InputError if they could not be read again."""
     lines = list(lines)
     try:
-        msgspec.convert(lines, list[_Line])
+        msgspec.convert(lines, list[kind])
         with open(Path(out) / LINES, "ab") as file:
             file.write(msgspec.json.Encoder().encode_lines(lines))
     except (OSError, ValueError, msgspec.ValidationError) as error:  # ValueError: a text that is not Unicode
@@ -162,9 +162,9 @@ def read_texts(out: str | Path) -> Iterator[tuple[bytes, str]]:
         yield text, f"{what} {path}, line {number}"
 
 
-def read_lines(out: str | Path) -> list[_Line]:
+def read_lines(out: str | Path) -> list[ResultLine]:
     """Read the results of the finished pairs of a run's folder."""
-    return [decode_json(text, _Line, where) for text, where in read_texts(out)]
+    return [decode_json(text, ResultLine, where) for text, where in read_texts(out)]
 
 
 def read_run(out: str | Path) -> Run:
@@ -184,31 +184,19 @@ def read_run(out: str | Path) -> Run:
     finished = table.groupby([views, "problem"])["row"].transform("nunique")
     table = table[finished == table.groupby(views)["row"].transform("nunique")]
     if table.empty:
-        raise InputError(f"{out}: the run has no finished pair yet")
-    places = {
-        "row": {name: n for n, name in enumerate(rows)},
-        "category": {name: n for n, name in enumerate(categories)},
-    }
-    order = ["row", "category", "problem", "pair"]
-    table = table.sort_values(order, key=lambda column: column.map(places.get(column.name, lambda name: name)))
+        raise InputError(f"{out}: the run has no pair that all its rows have finished")
+    kinds = {"row": pd.CategoricalDtype(rows), "category": pd.CategoricalDtype(categories)}
+    table = table.astype(kinds).sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(kinds, object))
     timings = pd.DataFrame([line.timings for line in lines]).median()
     return Run(settings, table.reset_index(drop=True), {str(stage): float(s) for stage, s in timings.items()})
 
 
 def compare(first: Run, second: Run, rows: Sequence[str] | None = None) -> dict[str, dict[str, Any]]:
-    """Compare rows of two runs on the pairs that both have evaluated.
+    """Compare rows of two runs, by default every row that both have, on the pairs that both have evaluated.
 
-    Args:
-        first: Run A.
-        second: Run B.
-        rows: "A:B" for row A of the first and B of the second run, or "A"; by default every row that both runs have.
-
-    Returns:
-        By "A:B", the number of pairs "n", "acc30" and "median" of A and of B, and `statistics.paired_difference`: the
-        figures of B minus those of A.
-
-    Raises:
-        InputError: If a row is unknown, or there is no common row or pair.
+    Rows are texts "A:B", for row A of the first and B of the second run, or "A". Returned are by row the number of
+    pairs "n", "acc30" and "median" of both, and `statistics.paired_difference`, the second minus the first. InputError
+    if a row is unknown, or there is no common row or pair.
     """
     of_first, of_second = (run.table["row"].unique() for run in (first, second))
     if rows is None:

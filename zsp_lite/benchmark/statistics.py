@@ -5,6 +5,7 @@ this project. Draws are weights: a row for each bootstrap replicate, a column fo
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -32,12 +33,6 @@ def object_draws(
     intervals are too wide: the estimated variance is then up to three times the true one. Every category keeps its
     total weight. Pairs of a category with fewer than three objects are resampled as if they were independent: the
     spread between objects cannot be estimated from two.
-
-    Args:
-        objects: The two objects (reference, target) of each of the n pairs.
-        categories: The category of each pair; the draws of one do not depend on the others. None for one category.
-        resamples: Number of replicates.
-        seed: Seed of the draws; equal pairs and seeds give equal weights.
     """
     objects = np.asarray(objects, dtype=str)
     categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
@@ -69,43 +64,40 @@ def bootstrap_ci(
 ) -> tuple[float, float]:
     """Compute the 95 % percentile bootstrap interval of a statistic.
 
-    Args:
-        errors: (n,).
-        statistic: Maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
-            `lambda errors, weights: accuracy(errors, 30, weights)` do.
-        weights: From `object_draws`; None for `pair_draws(n)`, which treats pairs as independent.
+    The statistic maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
+    `lambda errors, weights: accuracy(errors, 30, weights)` do. Weights are those of `object_draws`; by default of
+    `pair_draws(n)`, which treats pairs as independent.
     """
     errors = np.asarray(errors, np.float64)
     return _interval(statistic(errors, pair_draws(len(errors)) if weights is None else weights))
 
 
-def summarise(errors: ArrayLike, weights: Draws | None = None) -> dict:
+def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.ndarray | None = None) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see `bootstrap_ci`).
 
     "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back; "auc30" the area
-    under the curve of accuracy against the threshold from 0 to 30 degrees, in percent.
+    under the curve of accuracy against the threshold from 0 to 30 degrees, in percent; "mean_category_median", if
+    categories (n,) are given, the paper's average of medians.
     """
     errors = np.asarray(errors, np.float64)
-    weights = pair_draws(len(errors)) if weights is None else weights
     figures = {
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
     }
-    summary = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    summary |= {f"{name}_ci": list(bootstrap_ci(errors, figure, weights)) for name, figure in figures.items()}
+    if categories is not None:
+        figures["mean_category_median"] = partial(mean_category_median, categories)
+    found = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
+    found |= {f"{name}_ci": list(bootstrap_ci(errors, figure, weights)) for name, figure in figures.items()}
     above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
-    return summary | {"above150": float(above150), "auc30": float(auc30)}
+    return found | {"above150": float(above150), "auc30": float(auc30)}
 
 
-def mean_category_median(
-    errors: ArrayLike, categories: Sequence[str] | np.ndarray, weights: Draws
-) -> tuple[float, tuple[float, float]]:
-    """Compute the mean of the categories' medians, the paper's average of medians, with its 95 % interval."""
-    errors, categories = np.asarray(errors, np.float64), np.asarray(categories, dtype=str)
+def mean_category_median(categories: np.ndarray, errors: np.ndarray, weights: Draws | None = None) -> np.ndarray:
+    """Compute the mean of the categories' medians of errors (n,)."""
     members = [categories == category for category in np.unique(categories)]
-    replicates = np.mean([median(errors[one], weights[:, one]) for one in members], axis=0)
-    return float(np.mean([median(errors[one]) for one in members])), _interval(replicates)
+    medians = [median(errors[one], None if weights is None else weights[:, one]) for one in members]
+    return np.asarray(np.mean(medians, axis=0))
 
 
 def paired_difference(
@@ -129,12 +121,8 @@ def paired_test(
     The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
     small; the interval and the p value of `paired_difference` with `object_draws` are the ones to report.
 
-    Args:
-        first: (n,) errors in degrees.
-        second: (n,) errors of the same pairs in the same order.
-        threshold: A pair is solved if its error is below it, in degrees.
-        weights: From `object_draws`; None treats pairs as independent.
-        seed: Seed of the permutation test, which is exact for up to 13 pairs.
+    Errors are in degrees, (n,), of the same pairs in the same order; a pair is solved below the threshold. The
+    permutation test is exact for up to 13 pairs.
 
     Returns:
         {"accuracy_gain": second - first in percentage points, "accuracy_gain_ci": its 95 % bootstrap interval,

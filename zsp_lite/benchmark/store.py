@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,18 +28,11 @@ class FrameStore:
     """
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
-        """Make an empty store.
-
-        Args:
-            dataset: Folder in CO3D's layout.
-            category: Category of the frames.
-            extractors: Feature extractors by name.
-            threads: Threads of torch during feature extraction; None leaves them as they are.
-        """
+        """Make an empty store; `threads` are torch's during feature extraction, None leaves them as they are."""
         self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
         self.timings: dict[str, list[float]] = {}
-        self._frames: dict[FrameKey, dict[Any, Any]] = {}  # the crop, and what has been computed from it by name
         self.lasting: dict[Any, Any] = {}  # what was computed for a sequence or for the whole category
+        self._kept = lru_cache(CAPACITY)(self._read)
         self._subject, self._shared = (), dict[tuple, Any]()
 
     def full_frame(self, key: FrameKey) -> Frame:
@@ -102,15 +96,10 @@ class FrameStore:
         yield
         self.timings.setdefault(stage, []).append(round(time.perf_counter() - start, 5))
 
-    def _kept(self, key: FrameKey) -> dict[Any, Any]:
-        kept = self._frames.pop(key, None)
-        if kept is None:
-            with self.timed("reading"):
-                kept = {"crop": object_crop(self.full_frame(key), crop_size(self.extractors.get("backbone")))}
-        self._frames[key] = kept  # the last used is the last in the dictionary
-        if len(self._frames) > CAPACITY:
-            del self._frames[next(iter(self._frames))]
-        return kept
+    def _read(self, key: FrameKey) -> dict[Any, Any]:
+        """Read a frame: its crop, to which is added by name what is computed from it."""
+        with self.timed("reading"):
+            return {"crop": object_crop(self.full_frame(key), crop_size(self.extractors.get("backbone")))}
 
 
 @contextmanager

@@ -15,8 +15,8 @@ REFERENCE = "ours"  # the row that all others are compared with
 def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
-    "methods" has by row, over all pairs and "per_category", the figures of `statistics.summarise`, the paper's
-    "mean_category_median", and where they are known the medians "translation" and "scale" and "symmetric_acc30".
+    "methods" has by row, over all pairs and "per_category", the figures of `statistics.figures_of`, and where they are
+    known the medians "translation" and "scale" of the pairs that have them, and "symmetric_acc30".
     "against" compares every row of the same problems with "ours": the row's figure minus that of "ours" (see
     `statistics.paired_difference`). Intervals and p values come from resampled objects.
     """
@@ -27,14 +27,11 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         objects = (*row["reference"], *row["target"])
         if objects not in draws:
             draws[objects] = draws_of(row)
-        errors, drawn, categories = row["error"].to_numpy(), draws[objects], row["category"].to_numpy()
-        average, interval = statistics.mean_category_median(errors, categories, drawn)
-        methods[name] = statistics.summarise(errors, drawn) | {
-            "mean_category_median": average,
-            "mean_category_median_ci": list(interval),
+        errors, drawn, categories = row["error"].to_numpy(), draws[objects], row["category"].to_numpy(str)
+        methods[name] = statistics.figures_of(errors, drawn, categories) | {
             "failed": int((row["failed"] != "").sum()),
             "per_category": {
-                category: statistics.summarise(errors[members], drawn[:, members])
+                category: statistics.figures_of(errors[members], drawn[:, members])
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip

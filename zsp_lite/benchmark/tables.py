@@ -9,7 +9,7 @@ there is also the row ROW of a run with 5 target views.
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,6 @@ from zsp_lite.io.files import write_atomic
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "published on CO3D (other data)"
 NOTE = "Med. err.: mean of the categories' medians. Intervals: 95 %, bootstrap over objects."
-NOTES = {
-    "table_1": "ICP, ICP+BV, SIFT and SWaV use the true object mask, the other rows do not. SWaV and PoseContrast need "
-    "their published checkpoints. The paper trained PoseContrast on ObjectNet3D, without its evaluation categories.",
-    "table_a_targets": "There are published pairs for N = 1, 3, 5, 20 and 50; those for N = 10 are sampled.",
-}
 _PUBLISHED_NOTE = (
     "Published figures are the paper's, on CO3D with DINO ViT-S/8: other data, and another backbone unless the run "
     "says otherwise."
@@ -75,8 +70,22 @@ class Table:
 
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
-    """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    return [all_rows(summary, metrics), *paper_tables(summary), *(by_category(summary, metric) for metric in PAPER)]
+    """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`).
+
+    Rows that see other objects of the category have a table of their own and stand in no other.
+    """
+    seeing = [name for name in summary["methods"] if re.fullmatch(r"category(-n\d+)?", name)]
+    kinds = [
+        {name: row for name, row in summary["methods"].items() if (name in seeing) == yes} for yes in (False, True)
+    ]
+    alone, others = (summary | {"methods": kind} for kind in kinds)
+    tables = []
+    if alone["methods"]:
+        tables = [all_rows(alone, metrics), *paper_tables(alone), *(by_category(alone, metric) for metric in PAPER)]
+    if seeing:
+        found = all_rows(others, metrics)
+        tables.append(replace(found, name="with_others", title="With other unlabelled objects of the category"))
+    return tables
 
 
 def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> Table:
@@ -178,7 +187,7 @@ def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
         rows[line["label"]] = cells + ([Cell(one) for one in line["published"]] or [None] * len(spec["published"]))
     compact = [one for one in columns if len(groups) == 1 or one[1] == METRICS["acc30"]][:3]
     columns += [(PUBLISHED, title) for title in spec["published"]]
-    note = [NOTE, _PUBLISHED_NOTE if spec["published"] else "", NOTES.get(spec["name"], "")]
+    note = [NOTE, _PUBLISHED_NOTE if spec["published"] else "", spec.get("note", "")]
     return Table(spec["name"], spec["title"], columns, rows, " ".join(filter(None, note)), compact)
 
 

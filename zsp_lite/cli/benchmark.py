@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, workers_options
 
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
@@ -43,8 +43,7 @@ metrics_option = click.option(
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
-@click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine.")
-@click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes.")
+@workers_options
 @metrics_option
 @click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both.")
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
@@ -68,8 +67,7 @@ def benchmark(
     numbers = dict.fromkeys(categories or labelled_categories(dataset), pairs)
     if list_pairs:
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
-        every = list(dict.fromkeys(pair for found in asked.values() for pair in found))
-        print(f"Written: {write_questions(list_pairs, dataset, every)}, {len(every)} pairs")
+        print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
     summary = evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
     _write_reports(out, out, metrics)
@@ -111,8 +109,9 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_tables
 
-    paper = tables.paper_tables(summary) if with_paper else []
-    print_tables([tables.all_rows(summary, metrics), *paper, tables.by_category(summary, most=_ROWS_SHOWN)])
+    found = [one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")]
+    short = [one for one in found if with_paper or one.name in ("all_rows", "with_others")]
+    print_tables([*short, tables.by_category(summary, most=_ROWS_SHOWN)])
 
 
 @click.command(epilog=examples("tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"))

@@ -53,6 +53,7 @@ def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) ->
             raise click.UsageError(f"--{name.replace('_', '-')} does not go with {by}")
 
 
+replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
 seed_option = click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 
 
@@ -71,3 +72,9 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(backbone=name if config == BackboneConfig(name) else config, **others)
 
     return with_backbone
+
+
+def workers_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --workers and --executor."""
+    cluster = click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes.")
+    return click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine.")(cluster(command))

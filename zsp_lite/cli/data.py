@@ -9,12 +9,11 @@ from typing import Any
 
 import click
 
-from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options
+from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options, replace_option
 
 _PROBLEMS_SHOWN = 5  # of a category
 _CHECK_COLUMNS = ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk")
 root_option = click.option("--root", type=PATH, required=True, help="Data folder.")
-replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
 
 
 @click.group(no_args_is_help=False, epilog=examples("data check path/to/co3d", "data import --help"))

@@ -13,10 +13,13 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
         "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
         "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",
+        "estimate path/to/scan path/to/other_scan --helpers path/to/third_scan path/to/fourth_scan",
     )
 )
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
+@click.argument("others", type=PATH, nargs=-1, metavar="")
+@click.option("--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects of the category.")
 @click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
 @click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
 @click.option("--targets", type=COUNT, default=5, help="Number of target views, evenly spaced.")
@@ -29,7 +32,9 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
-def estimate(reference, target, solver, reference_frame, targets, not_upright, as_json, backbone, out, **given) -> None:
+def estimate(
+    reference, target, others, helpers, solver, reference_frame, targets, not_upright, as_json, backbone, out, **given
+) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder of a capture (see
@@ -46,6 +51,9 @@ def estimate(reference, target, solver, reference_frame, targets, not_upright, a
     --depth-unit  of an image, or of a capture given as lists: 0.001 for millimetres, 1 for metres
     --depth       16-bit PNG or .npy, registered to the colours
 
+    --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
+    front from back, all objects together mostly can.
+
     The pose maps points of the reference camera to points of the camera of the chosen target view. OUT gets
     report.html and point clouds: target.ply, and aligned_SOLVER.ply, the reference after the pose. Where the verified
     solver cannot decide between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both
@@ -55,12 +63,20 @@ def estimate(reference, target, solver, reference_frame, targets, not_upright, a
 
     from zsp_lite.backbones.load import load_backbone
     from zsp_lite.io.locks import writing
-    from zsp_lite.own_objects import estimate_pose, open_pair, write_pair
+    from zsp_lite.own_objects import estimate_pose, open_pair, open_source, write_pair
 
+    if others and not helpers:
+        raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
         sources = open_pair(reference, target, given)
-        model = load_backbone(backbone)
-        found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model, upright=not not_upright)
+        model, upright = load_backbone(backbone), not not_upright
+        if helpers:
+            from zsp_lite.align import estimate_with_helpers
+
+            sources += [open_source(path) for path in (*helpers, *others)]
+            found = estimate_with_helpers(sources, model, reference_frame, targets, upright)
+        else:
+            found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model, upright=upright)
         files = write_pair(found, out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))

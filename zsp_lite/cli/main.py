@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import click
 
+from zsp_lite.cli.align import align
 from zsp_lite.cli.benchmark import benchmark, compare, tables
 from zsp_lite.cli.common import examples
 from zsp_lite.cli.data import data
@@ -31,7 +32,7 @@ def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (demo, estimate, benchmark, tables, compare, synth, data):
+for command in (demo, estimate, align, benchmark, tables, compare, synth, data):
     cli.add_command(command)
 data.add_command(download)
 

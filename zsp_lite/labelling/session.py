@@ -1,7 +1,8 @@
 """Labelling session of a category, stored on disk after every change.
 
 ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks; ROOT/class_labels/CATEGORY/SEQ.json holds
-the accepted labels in the format of the published code.
+the accepted labels in the format of the published code; ROOT/label_proposals/CATEGORY/SEQ.json, in the same format,
+what `zsp-lite align --propose` proposes.
 """
 
 from collections.abc import Sequence
@@ -15,9 +16,9 @@ from jaxtyping import Float, Real
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_folder, read_labels, rigid_label, write_label
+from zsp_lite.data.labels import PoseLabel, label_folder, parse_label, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError, check_choice, check_integer, check_magnitude, real_array
-from zsp_lite.io.files import plain_name, read_json, write_atomic
+from zsp_lite.io.files import plain_name, read_bytes, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
@@ -104,6 +105,8 @@ class Labelling:
         self.reference = next(iter(references), best)
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
+        proposals = sorted((self.root / "label_proposals" / self.category).glob("*.json"))
+        self._proposals = {path.stem: parse_label(read_bytes(path, "proposal"), path).trans for path in proposals}
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -175,6 +178,13 @@ class Labelling:
             taken.append(int(distance.argmin()))
         self.put(sequence, cloud[taken])
 
+    def proposal(self, sequence: str) -> Sim3 | None:
+        """Return the proposed similarity from the world of the reference to that of a sequence; None without one."""
+        if not {self.reference, self._known(sequence)} <= self._proposals.keys():
+            return None
+        trans = self._proposals[sequence] @ np.linalg.inv(self._proposals[self.reference])
+        return Sim3(1.0, trans[:3, :3], trans[:3, 3])
+
     def put(self, sequence: str, points: Sequence[Point] | Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
         """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints.
 
@@ -230,6 +240,8 @@ class Labelling:
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
         """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference, the identity.
 
+        Without picks on the sequence, the label is the proposal.
+
         Returns:
             The label file of the sequence.
 
@@ -238,9 +250,10 @@ class Labelling:
                 confirmed.
         """
         alignment, picked = self.alignment(sequence), len(self.picks(sequence))
+        sim3 = alignment.sim3 if alignment else None if picked else self.proposal(sequence)
         if sequence == self.reference:
             problem = "is the reference: its label is the identity and comes by itself"
-        elif alignment is None:
+        elif sim3 is None:
             problem = f"has {picked} of {len(self.names)} keypoints, expected all, at least {MIN_KEYPOINTS}"
         else:
             problem = "" if confirmed else self.doubt(sequence)
@@ -249,7 +262,7 @@ class Labelling:
             raise InputError(f"sequence {sequence} {problem}")
         # A label has no scale: it moves the centre of the reference as the alignment does.
         centre = self.cloud(self.reference)[0].mean(axis=0)
-        label = rigid_label(alignment.sim3, centre, sequence, self.reference)
+        label = rigid_label(sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
         path = write_label(self.root, self.category, label)
         self._save(sequence)

@@ -35,7 +35,7 @@ Cell = Sequence[int] | np.ndarray  # (row, col)
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 CHOSEN = ORANGE
 # Of several curves or groups of points in one figure, in this order and then again.
-COLOURS = BLUE, ORANGE, GREEN, VERMILLION
+COLOURS = BLUE, ORANGE, GREEN, VERMILLION, "#56B4E9", "#CC79A7", "#000000"
 _LINES = "-", "--", "-.", ":"
 _MARKERS = "os^DvP*X"
 _CLOUD_MARKERS = "oxs^"  # crosses let discs below them be seen

@@ -32,6 +32,9 @@ def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> Wid
     return _LabellingWidget(labelling, backbone).panel.box
 
 
+_PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints, or skip."
+
+
 class _LabellingWidget:
     """The actions of the widget, each of which returns the message to show, and what it displays after each."""
 
@@ -102,18 +105,19 @@ class _LabellingWidget:
 
     def guess(self) -> str:
         labelling, sequence = self.labelling, self.current
-        self.panel.show_message("Estimating the alignment. This takes some seconds.")
-        from zsp_lite.backbones.load import load_backbone
-        from zsp_lite.labelling.guess import guess_alignment
+        if (sim3 := labelling.proposal(sequence)) is None:
+            self.panel.show_message("Estimating the alignment. This takes some seconds.")
+            from zsp_lite.align import align_category
+            from zsp_lite.backbones.load import load_backbone
 
-        self.backbone = self.backbone or load_backbone()
-        sim3, confidence = guess_alignment(
-            labelling.dataset, self.backbone, labelling.category, labelling.reference, sequence
-        )
+            self.backbone = self.backbone or load_backbone()
+            both = labelling.reference, sequence
+            found = align_category(labelling.dataset, labelling.category, self.backbone, both)
+            sim3 = found.between(*both)
         with self._undoable(sequence):
             labelling.guess(sequence, sim3)
         self.controls["overlay"].value = True
-        return f"Alignment proposed, confidence {confidence:.0%}. Check it: correct single keypoints, or redo all."
+        return "Alignment proposed. Check it: correct single keypoints, or redo all."
 
     def accept(self) -> str:
         """Write the label; one in doubt only if accept is pressed twice in a row."""
@@ -132,13 +136,15 @@ class _LabellingWidget:
 
     def next(self) -> str:
         """Go to the next open sequence."""
-        if len(self.labelling.names) < MIN_KEYPOINTS:
+        following = self._next_open(self.current)
+        if len(self.labelling.names) < MIN_KEYPOINTS and not self._proposed(following):
             self.controls["sequence"].value = self.labelling.reference
             return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
-        following = self._next_open(self.current)
         is_open = any(row.state == OPEN for row in self.labelling.progress())
         self.controls["sequence"].value = following
-        return f"Now {following}." if is_open else "No sequence is open."
+        self.controls["overlay"].value |= self._proposed(following)
+        now = f"Now {following}. {_PROPOSED if self._proposed(following) else ''}".strip()
+        return now if is_open else "No sequence is open."
 
     def rename(self) -> str:
         index, name = self.controls["keypoint"].value, self.controls["name"].value.strip()
@@ -195,6 +201,10 @@ class _LabellingWidget:
         following = rows[index + 1 :] + rows[:index]
         return next((row.sequence for row in following if row.state == OPEN), sequence)
 
+    def _proposed(self, sequence: str) -> bool:
+        """Whether a proposal for a sequence waits for confirmation."""
+        return not len(self.labelling.picks(sequence)) and self.labelling.proposal(sequence) is not None
+
     def _instruction(self) -> str:
         """Return what the user can do next."""
         labelling, names = self.labelling, self.labelling.names
@@ -205,6 +215,8 @@ class _LabellingWidget:
             missing = MIN_KEYPOINTS - len(names)
             more = f"at least {missing} more" if missing > 0 else "enough; add more, or go on with next"
             return f"Click a point of the reference that all objects of the category have: {len(names)} so far, {more}."
+        if self._proposed(self.current):
+            return _PROPOSED
         if picked < len(names):
             return f"Click the right cloud: keypoint {picked + 1}, {names[picked]}."
         if (alignment := labelling.alignment(self.current)) is None:
@@ -224,7 +236,8 @@ class _LabellingWidget:
         controls["overlay"].disabled = aligned is None
         chosen = None if controls["keypoint"].value == NEW_KEYPOINT else controls["keypoint"].value
         controls["name"].disabled = not self.on_reference and chosen is None
-        panel.buttons["accept"].disabled = alignment is None
+        waiting = not self.on_reference and self._proposed(self.current)
+        panel.buttons["accept"].disabled = alignment is None and not waiting
         panel.buttons["skip"].disabled = self.on_reference
         panel.buttons["guess"].disabled = self.on_reference or len(names) < MIN_KEYPOINTS
         panel.show_progress(rows, self.current)
@@ -259,17 +272,20 @@ class _LabellingWidget:
             menu.options, menu.value = options, chosen
 
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
-        """Return the reference cloud in the world of the sequence, by its keypoints or by an imported label."""
+        """Return the reference cloud in the world of the sequence, by its keypoints, its label, or a proposal."""
         if self.on_reference:
             return None
         cloud = self.labelling.cloud(self.labelling.reference)[0]
         if alignment is not None:
             return alignment.sim3.apply(cloud)
         labels = read_labels(self.labelling.root, self.labelling.category)
-        if self.current not in labels or len(self.labelling.picks(self.current)):
+        if len(self.labelling.picks(self.current)):
             return None
-        trans = labels[self.current].trans
-        return cloud @ trans[:3, :3].T + trans[:3, 3]
+        if self.current in labels:
+            trans = labels[self.current].trans
+            return cloud @ trans[:3, :3].T + trans[:3, 3]
+        proposal = self.labelling.proposal(self.current)
+        return None if proposal is None else proposal.apply(cloud)
 
     def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
         """Send a cloud to a canvas, unless it is shown already."""

@@ -1,0 +1,111 @@
+"""A category in one frame, from a folder to labels: the run, what is written, one's own pair with helpers."""
+
+import json
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from benchmark_folder import SEQUENCES, SlowBackbone, small_folder
+
+from zsp_lite import align
+from zsp_lite.align import align_category, estimate_with_helpers, write_labels
+from zsp_lite.cli import main as cli
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.errors import InputError
+from zsp_lite.labelling.session import Labelling
+from zsp_lite.metrics import rotation_error
+from zsp_lite.own_objects import estimate_pose, open_source
+
+BACKBONE = SlowBackbone(grid=8, _seconds=0)
+A, B, C = SEQUENCES
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("align")
+    return out, align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=out)
+
+
+def turns(root, names=SEQUENCES):
+    labels = read_labels(root, "lump")
+    return {(a, b): labels[b].trans[:3, :3] @ labels[a].trans[:3, :3].T for a, b in permutations(names, 2)}
+
+
+def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written_say_the_same(run, tmp_path):
+    _, found = run
+    write_labels(found, tmp_path, "lump")
+    written = turns(tmp_path)
+    for pair, true in turns(small_folder()).items():
+        assert rotation_error(found.between(*pair).R, true) < 15
+        np.testing.assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
+    with pytest.raises(InputError, match="would be replaced by other content"):
+        write_labels(replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump")
+
+
+def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_path, monkeypatch):
+    out, whole = run
+    lines = (out / "run.jsonl").read_text().splitlines(keepends=True)
+    assert len(lines) == 3 * 6
+    (tmp_path / "run.json").write_text((out / "run.json").read_text())
+    (tmp_path / "run.jsonl").write_text("".join(lines[:14]) + lines[14][:30])
+    found = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=2)
+    assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
+    monkeypatch.setattr(align, "hypotheses", None)  # nothing is left to compute
+    again = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path)
+    for one in (found, again):
+        assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
+            name: pose.sim3.matrix.tolist() for name, pose in whole.objects.items()
+        }
+    with pytest.raises(InputError, match="holds a run with targets 3, this is 2"):
+        align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
+
+
+def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
+    def fail(problem):
+        if C in (problem.pair.reference_sequence, problem.pair.target_sequence) or everything:
+            raise InputError("no pose")
+        return solve(problem)
+
+    solve, everything = align.hypotheses, False
+    monkeypatch.setattr(align, "hypotheses", fail)
+    assert list(align_category(Co3D(small_folder()), "lump", BACKBONE, SEQUENCES, targets=3).objects) == [A, B]
+    everything = True
+    with pytest.raises(InputError, match="none of 18 pairs determines a pose"):
+        align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3)
+
+
+def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(run, tmp_path, monkeypatch, capsys):
+    root, out = tmp_path / "data", tmp_path / "out"
+    root.symlink_to(small_folder(), target_is_directory=True)
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: run[1])
+    assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
+    assert "lump: 3 objects in one frame" in capsys.readouterr().out
+    assert (out / "report.html").read_text().count("<img") == 1
+    objects = json.loads((out / "alignment.json").read_text())["objects"]
+    np.testing.assert_allclose(objects[B]["world_to_frame"], run[1].objects[B].sim3.matrix)
+    labelling = Labelling(root, "lump", SEQUENCES, reference=A)
+    assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
+
+
+def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
+    def misled(first, second, *rest, **settings):
+        found = estimate_pose(first, second, *rest, **settings)
+        if (first.name, second.name) != (A, B):
+            return found
+        one = found.estimates["verified"]
+        best = one.hypotheses[0]
+        wrong = replace(best, sim3=replace(best.sim3, R=best.sim3.R @ np.diag([-1.0, -1.0, 1.0])))
+        hypotheses = replace(wrong, confidence=0.6), replace(best, confidence=0.4)
+        return replace(found, estimates={"verified": replace(one, sim3=wrong.sim3, hypotheses=hypotheses)})
+
+    monkeypatch.setattr(align, "estimate_pose", misled)
+    sources = [open_source(small_folder() / "lump" / name) for name in SEQUENCES]
+    found = estimate_with_helpers(sources, BACKBONE, targets=3)
+    assert found.errors["verified"] < 15 and found.estimates["verified"].hypotheses[1].confidence < 0.5
+
+
+def test_paths_after_the_pair_belong_to_helpers(capsys):
+    assert cli.main(["estimate", "a", "b", "c"]) == 2
+    assert "1 more paths, expected these after --helpers" in capsys.readouterr().err

@@ -1,0 +1,120 @@
+"""A category in one frame: pairs of frames, recovery of known poses, equivariance, probabilities."""
+
+import time
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+from synthetic_views import CoordinateBackbone
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.category import PairHypotheses, category_pairs, synchronise, world_hypotheses
+from zsp_lite.data.annotations import FrameKey
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_labels
+from zsp_lite.errors import InputError
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose
+
+seeds = st.integers(0, 2**32 - 1)
+HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+PROBABILITIES = np.array([0.6, 0.25, 0.05, 0.03])
+
+
+def similarity(rng):
+    return Sim3(np.exp(0.3 * rng.normal()), Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+
+
+def problem(seed: int, n: int = 6, steps: int = 5, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypotheses]]:
+    """Make n poses and hypotheses of n * steps pairs; the half turn comes first in the share `flipped` of the pairs."""
+    rng = np.random.default_rng(seed)
+    truth, pairs = [similarity(rng) for _ in range(n)], []
+    ends = [(a, (a + step) % n) for step in 1 + rng.permutation(n - 1)[:steps] for a in range(n)]
+    wrong = set(rng.permutation(len(ends))[: int(flipped * len(ends))].tolist())
+    for k, (a, b) in enumerate(ends):
+        right_and_turned = [truth[b].inverse() @ truth[a], truth[b].inverse() @ HALF_TURN @ truth[a]]
+        sim3s = (*right_and_turned[:: -1 if k in wrong else 1], similarity(rng), similarity(rng))
+        pairs.append(PairHypotheses(f"{a:03d}", f"{b:03d}", sim3s, PROBABILITIES, rng.normal(size=3)))
+    return truth, pairs
+
+
+@settings(max_examples=3)
+@given(seeds)
+def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of_the_pairs(seed):
+    truth, pairs = problem(seed, flipped=0.1)
+    alignment, again = synchronise(pairs), synchronise(pairs[::-1])
+    scale = np.exp(np.mean(np.log([one.scale for one in truth])))  # the mean log scale of the found poses is zero
+    for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
+        expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
+        np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=1e-3)
+        assert np.array_equal(one.sim3.matrix, again.objects[name].sim3.matrix)
+    assert len(alignment.disagreements) == 3 and min(alignment.disagreements.values()) > 150
+
+
+@settings(max_examples=3)
+@given(seeds)
+def test_a_turn_of_one_world_turns_the_pose_of_its_object_only(seed):
+    _, pairs = problem(seed)
+    turn, same, moved = similarity(np.random.default_rng(seed + 1)), Sim3.identity(), []
+    for one in pairs:
+        before, after = turn.inverse() if one.reference == "002" else same, turn if one.target == "002" else same
+        sim3s = tuple(after @ sim3 @ before for sim3 in one.sim3s)
+        moved.append(replace(one, sim3s=sim3s, centre=before.inverse().apply(one.centre)))
+    first, second = synchronise(pairs).objects, synchronise(moved).objects
+    for name in first:
+        expected = first[name].sim3 @ turn.inverse() if name == "002" else first[name].sim3
+        assert rotation_error(second[name].sim3.R, expected.R) < 0.1
+        assert second[name].probability == pytest.approx(first[name].probability, abs=1e-3)
+
+
+def test_one_hundred_objects_are_aligned_from_four_hundred_pairs_of_three_frames_within_ten_seconds():
+    truth, pairs = problem(0, n=100, steps=4, flipped=0.03)
+    start = time.process_time()
+    frames = np.stack([one.sim3.R @ true.R.T for one, true in zip(synchronise(3 * pairs).objects.values(), truth)])
+    assert time.process_time() - start < 10
+    assert np.mean(rotation_error(frames[:, None], frames) < 30) > 0.95
+
+
+def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn():
+    _, pairs = problem(3)
+    before = synchronise(pairs).objects["004"]
+    for k in [k for k, one in enumerate(pairs) if "004" in (one.reference, one.target)][:4]:  # of ten: half turn first
+        pairs[k] = replace(pairs[k], sim3s=tuple(pairs[k].sim3s[m] for m in (1, 0, 2, 3)))
+    after = synchronise(pairs).objects["004"]
+    assert after.probability < before.probability - 0.1 and after.turn > 170
+    assert after.alternative_probability > before.alternative_probability + 0.1
+    np.testing.assert_allclose(after.alternative.apply(after.centre), after.sim3.apply(after.centre), atol=1e-6)
+
+
+@pytest.mark.parametrize(("n", "per_object"), [(2, 1), (11, 10), (12, 6), (40, 6)])
+def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
+    names = Mock(Co3D, frame_list=lambda category: [FrameKey(f"{k:02d}", f) for k in range(n) for f in range(12)])
+    pairs = category_pairs(names, "cup", None, None, 4, seed=1)
+    assert pairs == category_pairs(names, "cup", None, None, 4, seed=1)
+    ends = np.array([[int(one.reference_sequence), int(one.target_sequence)] for one in pairs])
+    assert len(ends) == 3 * n * per_object and len(np.unique(ends, axis=0)) == n * per_object
+    assert connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)), connection="strong")[0] == 1
+    assert sorted(one.reference_frame % 12 // 4 for one in pairs[:3]) == [0, 1, 2]
+    assert len({number for one in pairs[:3] for number in one.target_frames}) == 12
+
+
+def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoids):
+    pair = category_pairs(ellipsoids, "ellipsoid", ["b", "a"], 1, 3, seed=0)[0]
+    estimate = ZeroShotPose(CoordinateBackbone(), solver="verified").estimate(*ellipsoids.load_pair(pair))
+    found, label = world_hypotheses(pair, estimate), read_labels(ellipsoids.root, "ellipsoid")["b"].trans
+    assert rotation_error(found.sim3s[0].R, label[:3, :3]) < 10
+    assert np.linalg.norm(found.sim3s[0].apply(found.centre) - label[:3, :3] @ found.centre - label[:3, 3]) < 0.2
+
+
+def test_too_few_frames_and_pairs_that_do_not_connect_all_objects_are_refused(ellipsoids):
+    with pytest.raises(InputError, match="has 7 frames, expected at least 8"):
+        category_pairs(ellipsoids, "ellipsoid", None, None, 8, seed=1)
+    pair = problem(0)[1][0]
+    with pytest.raises(InputError, match="connect 2 of 4"):
+        synchronise([pair, replace(pair, reference="x", target="y")])

@@ -1,0 +1,237 @@
+"""A whole category in one frame, and one's own pair with the help of others.
+
+The pairs of a category go through the executors of the benchmark and are stored in the folder of a run.
+"""
+
+import json
+import logging
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from torch import get_num_threads
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.backbones.load import BackboneConfig, load_backbone
+from zsp_lite.benchmark.baseline_rows import hypotheses
+from zsp_lite.benchmark.execution import Chunk, open_workers
+from zsp_lite.benchmark.identity import environment, fingerprint, library_version
+from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.run import evaluate_pairs
+from zsp_lite.benchmark.runs import Call, Settings, open_run, read_texts
+from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.category import (
+    SAME_ANGLE,
+    CategoryAlignment,
+    PairHypotheses,
+    category_pairs,
+    synchronise,
+    world_hypotheses,
+)  # fmt: skip
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.labels import label_bytes, rigid_label
+from zsp_lite.data.published import write_all
+from zsp_lite.errors import InputError
+from zsp_lite.estimates import PairResult
+from zsp_lite.features import FeatureExtractor
+from zsp_lite.io.files import decode_json, write_atomic
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.own_objects import Source, estimate_pose, known_errors
+
+logger = logging.getLogger(__name__)
+
+
+class _Line(msgspec.Struct):
+    """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
+
+    pair: str
+    centre: list[float]
+    matrices: list[list[list[float]]]
+    probabilities: list[float]
+
+
+class PairSolver:
+    """Finds the hypotheses of pairs; frames and features are kept from chunk to chunk."""
+
+    def __init__(self, root: str, backbone: Any, threads: int | None = None):
+        """Open the data; `backbone` is one, or what `load_backbone` takes."""
+        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+        self._dataset, self._extractors, self._threads = Co3D(root), {"backbone": loaded}, threads
+        self._store: FrameStore | None = None
+
+    def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
+        """Find the hypotheses of the pairs of a chunk."""
+        for pair, _ in chunk:
+            if self._store is None or self._store.category != pair.category:
+                self._store = FrameStore(self._dataset, pair.category, self._extractors, self._threads)
+            try:
+                found = hypotheses(Problem(pair, self._store))
+            except InputError:  # the views determine no pose
+                yield {"pair": pair.key, "centre": [], "matrices": [], "probabilities": []}
+                continue
+            matrices, probabilities = [one.matrix.tolist() for one in found.sim3s], found.probabilities.tolist()
+            centre = found.centre.tolist()
+            yield {"pair": pair.key, "centre": centre, "matrices": matrices, "probabilities": probabilities}
+
+
+def align_category(
+    dataset: Co3D,
+    category: str,
+    backbone: FeatureExtractor | str | BackboneConfig = "zsp-tiny",
+    sequences: Sequence[str] | None = None,
+    pairs: int | None = None,
+    targets: int = 5,
+    out: str | Path | None = None,
+    executor: Executor | str | int = 1,
+) -> CategoryAlignment:
+    """Align all objects of a category in one frame, without labels (see `category`).
+
+    Pairs whose views determine no pose are left out. A run in OUT is continued: pairs that it has are not solved again.
+
+    Args:
+        dataset: Data set.
+        category: Name of the category.
+        backbone: Backbone, or what `load_backbone` takes.
+        sequences: Names of the sequences, one per object; None for all of the category.
+        pairs: Objects that each object is the reference of; None for all others, or from twelve objects on, for six.
+        targets: Target frames per pair of frames; each pair of objects becomes three of these.
+        out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
+        executor: Number of processes; "dask://HOST:PORT"; or any `Executor`.
+
+    Raises:
+        InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
+            of them, or OUT holds another run.
+    """
+    chosen = {pair.key: pair for pair in category_pairs(dataset, category, sequences, pairs, targets, seed=0)}
+    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+    with (
+        tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
+        open_workers(executor) as (pool, workers),
+    ):
+        settings = Settings(
+            data=str(dataset.root).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
+            library=[library_version()], methods={"alignment": "hypotheses of the verified solver"}, labels={},
+            origins={category: "sampled"},
+            calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
+        )  # fmt: skip
+        with open_run(folder, settings):
+            known = {line.pair for line in _read(folder)}
+            todo = {pair: ["alignment"] for key, pair in chosen.items() if key not in known}
+            sent = backbone if pool else loaded
+            make = partial(PairSolver, str(dataset.root.resolve()), sent, max(1, get_num_threads() // workers))
+            evaluate_pairs(folder, make, todo, len(chosen), pool, workers, _Line)
+        lines = {line.pair: line for line in _read(folder)}
+    found = [_pair_hypotheses(pair, lines[key]) for key, pair in chosen.items() if lines[key].matrices]
+    if not found:
+        raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
+    for name in sorted({pair.reference_sequence for pair in chosen.values()} - {one.reference for one in found}):
+        if name not in {one.target for one in found}:
+            logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
+    return synchronise(found)
+
+
+def _read(out: str | Path) -> list[_Line]:
+    return [decode_json(text, _Line, where) for text, where in read_texts(out)]
+
+
+def _pair_hypotheses(pair: Pair, line: _Line) -> PairHypotheses:
+    sim3s = []
+    for matrix in np.array(line.matrices):
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        sim3s.append(Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3]))
+    names, numbers = (pair.reference_sequence, pair.target_sequence), (line.probabilities, line.centre)
+    return PairHypotheses(*names, tuple(sim3s), *map(np.array, numbers))
+
+
+def estimate_with_helpers(
+    sources: Sequence[Source], backbone: FeatureExtractor, reference_frame: int | None = None, targets: int = 5,
+    upright: bool = True,
+) -> PairResult:  # fmt: skip
+    """Estimate the pose between the first two of one's own objects; the others settle what these two cannot.
+
+    Others are unlabelled objects of the category. Of the hypotheses for the first two, the one that agrees with the
+    alignment of all objects comes first. An image alone is the reference of pairs only.
+    """
+    names, found, remembering = [f"{k} {one.name}" for k, one in enumerate(sources)], {}, _Remembering(backbone)
+    for a, b in permutations(range(len(sources)), 2):
+        if sources[b].format != "image" or (a, b) == (0, 1):
+            number = reference_frame if a == 0 else None
+            found[a, b] = estimate_pose(
+                sources[a], sources[b], "verified", number, targets, backbone=remembering, upright=upright
+            )
+    pairs = {
+        (a, b): world_hypotheses(Pair("", names[a], 0, names[b], ()), one.estimates["verified"])
+        for (a, b), one in found.items()
+    }
+    alignment = synchronise(list(pairs.values()))
+    result, estimate = found[0, 1], found[0, 1].estimates["verified"]
+    between = alignment.between(names[0], names[1]).R
+    angles = [float(rotation_angle(one.R, between)) for one in pairs[0, 1].sim3s]
+    chosen = int(np.argmin(angles))
+    if angles[chosen] > SAME_ANGLE:
+        flags = (*estimate.flags, "no hypothesis agrees with the other objects: they were not used")
+        return replace(result, estimates={"verified": replace(estimate, flags=flags)})
+    sure = min(alignment.objects[name].probability for name in names[:2])
+    first, *others = [estimate.hypotheses[chosen], *(one for k, one in enumerate(estimate.hypotheses) if k != chosen)]
+    rest = sum(one.confidence for one in others) or 1.0
+    others = [replace(one, confidence=(1 - sure) * one.confidence / rest) for one in others]
+    hypotheses = (replace(first, confidence=sure), *others)
+    settled = replace(estimate, sim3=first.sim3, view=first.view, hypotheses=hypotheses)
+    estimates = {"verified": settled}
+    return replace(result, estimates=estimates, errors=known_errors(*sources[:2], result, estimates))
+
+
+class _Remembering:
+    """A backbone that computes the features of an image once."""
+
+    def __init__(self, backbone: FeatureExtractor):
+        self._backbone, self._known = backbone, {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backbone, name)
+
+    def __call__(self, images: Sequence[np.ndarray]) -> list[Any]:
+        names = [image.tobytes() for image in images]
+        new = {name: image for name, image in zip(names, images) if name not in self._known}
+        self._known |= dict(zip(new, self._backbone(list(new.values())) if new else ()))
+        return [self._known[name] for name in names]
+
+
+def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
+    """Write the poses of all objects in the common frame to OUT/alignment.json."""
+    objects = {
+        name: {
+            "world_to_frame": one.sim3.matrix.tolist(),
+            "probability": round(one.probability, 4),
+            "alternative": None if one.alternative is None else one.alternative.matrix.tolist(),
+            "alternative_probability": round(one.alternative_probability, 4),
+        }
+        for name, one in found.objects.items()
+    }
+    pairs = [{"pair": pair, "degrees": round(angle, 2)} for pair, angle in found.disagreements.items()]
+    text = json.dumps({"objects": objects, "disagreements": pairs}, indent=1)
+    write_atomic(Path(out) / "alignment.json", text.encode())
+    return Path(out) / "alignment.json"
+
+
+def write_labels(
+    found: CategoryAlignment, root: str | Path, category: str, kind: str = "class_labels", replace: bool = False
+) -> Path:
+    """Write the alignment as pose labels to ROOT/KIND/CATEGORY/, in the format of the published code.
+
+    The first object is the reference. Without `replace`, InputError if one exists with other content.
+    """
+    reference, folder = next(iter(found.objects)), Path(root) / kind / category
+    centre, labels = found.objects[reference].centre, {}
+    for name in found.objects:
+        labels[name] = rigid_label(found.between(reference, name), centre, name, reference)
+    write_all({folder / f"{name}.json": label_bytes(label) for name, label in labels.items()}, replace)
+    return folder

@@ -1,0 +1,300 @@
+r"""All objects of a category in one common frame, without labels: synchronisation of the hypotheses of many pairs.
+
+The verified solver gives a few hypotheses for each ordered pair (a, b) of objects: similarities from the world of a to
+that of b, with probabilities. One pair often cannot tell the front from the back; all pairs, each seen from several
+sides, mostly can (Birdal et al., Synchronizing probability measures on rotations, CVPR 2020). Sought is a similarity
+x -> s_i Q_i x + t_i from the world of each object i to a common frame. Hypothesis h of a pair, of rotation H_h, agrees
+with the rotations if Q_a = Q_b H_h. With \theta_h the angle between the two, they maximise
+
+    \sum_{pairs} \log(\epsilon + \sum_h p_h \exp(\kappa (\cos\theta_h - 1))),
+
+the logarithm of a mixture of von Mises-Fisher densities and a uniform one, which limits the cost of a wrong pair.
+
+1. Search: many chains set one object after the other to a rotation that a hypothesis proposes, sampled by its
+   probability given all others (Gibbs sampling; Geman and Geman 1984), at a temperature that falls to zero.
+2. Averaging on the rotation group (Hartley et al., Rotation averaging, IJCV 2013): each rotation in turn becomes the
+   mean of the proposals, weighted by how well they agree (expectation maximisation).
+3. Scales, linear in their logarithms, then translations: least absolute deviations over the hypotheses that agree.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order
+
+from zsp_lite.alignment import Sim3, nearest_rotation
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.errors import InputError
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.io.files import stable_hash
+from zsp_lite.metrics import rotation_angle
+
+KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off counts 1/e, and \epsilon
+SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
+ALL_PAIRS_BELOW, PAIRS_PER_OBJECT, REFERENCES = 12, 6, 3  # see `category_pairs`
+_CHAINS, _TEMPERATURES = 48, (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
+_PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
+_WEAK = 1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
+# Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of three to five objects.
+MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
+
+_Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
+_Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
+_Proposals = Float[np.ndarray, "t d m 3 3"]  # of m hypotheses of each of d pairs of one object
+
+
+@dataclass(frozen=True, eq=False)
+class PairHypotheses:
+    """Candidate similarities from the world of one object to that of another, with their probabilities."""
+
+    reference: str  # name of the object that the similarities start from
+    target: str  # name of the object that they lead to
+    sim3s: tuple[Sim3, ...]  # most probable first
+    probabilities: Float[np.ndarray, " m"]
+    centre: Float[np.ndarray, "3"]  # a point amid the reference object, in its world
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """Pose of one object in the common frame of its category."""
+
+    sim3: Sim3  # from the object's world to the common frame
+    centre: Float[np.ndarray, "3"]  # of the object, in its world
+    probability: float  # that its rotation is within 30 degrees of the one that most objects agree with
+    alternative: Sim3 | None  # next best pose, more than 30 degrees off, all other objects fixed; None without one
+    alternative_probability: float  # that this is the right one
+
+    @property
+    def turn(self) -> float:
+        """Angle in degrees between the pose and its alternative; 0 without one."""
+        return 0.0 if self.alternative is None else float(rotation_angle(self.sim3.R, self.alternative.R))
+
+
+@dataclass(frozen=True, eq=False)
+class CategoryAlignment:
+    """All objects of a category in one frame: that of the first object, with a mean log scale of zero."""
+
+    objects: dict[str, ObjectPose]  # by name, sorted
+    # median angle from the best hypothesis of the pairs (reference, target), where above 30 degrees; largest first
+    disagreements: dict[tuple[str, str], float]
+
+    def between(self, reference: str, target: str) -> Sim3:
+        """Return the similarity from the world of one object to that of another."""
+        return self.objects[target].sim3.inverse() @ self.objects[reference].sim3
+
+
+def category_pairs(
+    dataset: Co3D,
+    category: str,
+    sequences: Sequence[str] | None,
+    per_object: int | None,
+    targets: int,
+    seed: int,
+    references: int = REFERENCES,
+) -> list[Pair]:
+    """Choose the pairs of objects, and their frames, that a category is aligned by.
+
+    Each object is the reference of `per_object` others, or of all; None is all below 12 objects, and 6 from there on.
+    They connect all objects. Each becomes `references` pairs of frames: reference frames are evenly spaced over their
+    sequence, to see several sides of the object, and so are the `targets` target frames of each, from random starts.
+    Frames depend on the two names and the seed only.
+    """
+    numbers: dict[str, list[int]] = {}
+    for key in dataset.frame_list(category):
+        numbers.setdefault(key.sequence_name, []).append(key.frame_number)
+    names = sorted(numbers if sequences is None else set(sequences))
+    if (n := len(names)) < 2:
+        raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
+    for name in names:
+        if (length := len(numbers.get(name, ()))) < (least := max(targets, references)):
+            raise InputError(f"sequence {category}/{name} has {length} frames, expected at least {least}")
+    if per_object is None:
+        per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
+    rng = np.random.default_rng(seed)
+    circle = rng.permutation(n).tolist()
+    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][:per_object]  # the first connects all objects
+    pairs = []
+    for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
+        reference, target = names[a], names[b]
+        rng = np.random.default_rng([seed, stable_hash(f"{category}/{reference}/{target}") >> 1])
+        first, around = sorted(numbers[reference]), sorted(numbers[target])
+        start, target_start = rng.integers(len(first)), rng.integers(len(around))
+        for r in range(references):
+            frame = first[(start + r * len(first) // references) % len(first)]
+            turn = (np.arange(targets) + r / references) / targets  # of the sequence, from its start
+            positions = (target_start + (turn * len(around)).astype(int)) % len(around)
+            pairs.append(Pair(category, reference, frame, target, tuple(around[k] for k in positions)))
+    return pairs
+
+
+def world_hypotheses(pair: Pair, estimate: PoseEstimate) -> PairHypotheses:
+    """Convert the hypotheses of the verified solver, between cameras, to similarities between the two worlds."""
+    view = estimate.reference_view
+    points, known = view.measured_points
+    visible = points[view.known_foreground] if view.known_foreground.any() else points[known]
+    sim3s = []
+    for one in estimate.hypotheses:
+        first, second = (Sim3(1.0, v.frame.camera.R, v.frame.camera.t) for v in (view, estimate.target_views[one.view]))
+        sim3s.append(second.inverse() @ one.sim3 @ first)
+    probabilities = np.array([one.confidence for one in estimate.hypotheses])
+    centre = view.frame.camera.to_world(np.median(visible, axis=0))
+    return PairHypotheses(pair.reference_sequence, pair.target_sequence, tuple(sim3s), probabilities, centre)
+
+
+def synchronise(pairs: Sequence[PairHypotheses], seed: int = 0) -> CategoryAlignment:
+    """Find the similarities from the objects' worlds to one frame that agree best with the hypotheses of all pairs.
+
+    Two objects may have several pairs. The order does not matter. InputError if the pairs do not connect all objects.
+    """
+    pairs = sorted(pairs, key=lambda pair: (pair.reference, pair.target, pair.centre.tolist()))
+    names = sorted({name for pair in pairs for name in (pair.reference, pair.target)})
+    ends = np.array([[names.index(pair.reference), names.index(pair.target)] for pair in pairs])
+    links = coo_array((np.ones(len(ends)), ends.T), (len(names), len(names)))
+    order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
+    if len(order) < len(names):
+        raise InputError(f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all")
+    nodes = _build_nodes(pairs, ends)
+    rotations = _search(nodes, order, np.random.default_rng(seed))
+    scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
+    off = np.array([rotation_angle(rotations[a], rotations[b] @ one.sim3s[0].R) for (a, b), one in zip(ends, pairs)])
+    objects = {}
+    for i, name in enumerate(names):
+        sim3, agreeing = Sim3(scales[i], rotations[i], translations[i]), off[(ends == i).any(axis=1)] < SAME_ANGLE
+        probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
+        alternative = None
+        if turned is not None:  # about the object's centre
+            alternative = Sim3(scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i])
+        objects[name] = ObjectPose(sim3, centres[i], probability, alternative, other)
+    angles = {(names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends}
+    worst_first = sorted((key for key in angles if angles[key] > SAME_ANGLE), key=lambda key: -angles[key])
+    return CategoryAlignment(objects, {key: angles[key] for key in worst_first})
+
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """One object, and what the hypotheses of its pairs say about its rotation."""
+
+    neighbour: Int[np.ndarray, " d"]  # the other object of each pair
+    turn: Float[np.ndarray, "d m 3 3"]  # proposes Q = Q_neighbour @ turn
+    weight: Float[np.ndarray, "d m"]  # probabilities; 0 where padded
+
+    def proposals(self, rotations: _Rotations) -> _Proposals:
+        """Return the rotations that the hypotheses propose."""
+        return rotations[:, self.neighbour][:, :, None] @ self.turn
+
+    def agreement(self, candidates: _Candidates, proposals: _Proposals) -> Float[np.ndarray, "t c d m"]:
+        r"""Return \exp(\kappa (\cos\theta - 1)) of candidates and proposals; \cos\theta = (trace - 1) / 2."""
+        t, c = candidates.shape[:2]
+        trace = candidates.reshape(t, c, 9) @ proposals.reshape(t, -1, 9).swapaxes(1, 2)
+        return np.exp(KAPPA / 2 * (trace - 3)).reshape(t, c, *self.weight.shape)
+
+    def score(self, candidates: _Candidates, proposals: _Proposals) -> Float[np.ndarray, "t c"]:
+        """Return the part of the objective that depends on this object, for candidates of its rotation."""
+        agreement = self.agreement(candidates, proposals)
+        return np.log(np.einsum("tcdm,dm->tcd", agreement, self.weight) + FLOOR).sum(axis=2)
+
+    def mean(self, present: Float[np.ndarray, "t 3 3"], proposals: _Proposals) -> Float[np.ndarray, "t 3 3"]:
+        """Return the mean of the proposals, weighted by the probability that each is the pair's right one."""
+        weight = self.weight * self.agreement(present[:, None], proposals)[:, 0]
+        weight /= weight.sum(axis=2, keepdims=True) + FLOOR
+        return nearest_rotation(np.einsum("tdm,tdmij->tij", weight, proposals))[0]
+
+
+def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) -> list[_Node]:
+    """Sort the hypotheses of e pairs by object."""
+    most = max(len(pair.sim3s) for pair in pairs)
+    rows: list[list[tuple]] = [[] for _ in range(ends.max() + 1)]
+    for (a, b), pair in zip(ends, pairs):
+        turn = np.resize(np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3))  # padded by repetition
+        weight = np.pad(pair.probabilities, (0, most - len(pair.sim3s))).astype(np.float32)
+        rows[a].append((b, turn, weight))
+        rows[b].append((a, turn.swapaxes(1, 2), weight))
+    return [_Node(*(np.array(column) for column in zip(*row))) for row in rows]
+
+
+def _search(nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, "n 3 3"]:
+    """Return the rotations that maximise the objective, relative to the first object's.
+
+    In the given order of the objects, each but the first has a pair with an earlier one.
+    """
+    rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))
+    for k, i in enumerate(order[1:], 1):
+        earlier = np.isin(nodes[i].neighbour, order[:k])
+        known = _Node(nodes[i].neighbour[earlier], nodes[i].turn[earlier], nodes[i].weight[earlier])
+        _sample(known, rotations, int(i), 1.0, rng)
+    for temperature in _TEMPERATURES:
+        for i in rng.permutation(len(nodes)).tolist():
+            _sample(nodes[i], rotations, i, temperature, rng)
+    for _ in range(_AVERAGING_SWEEPS):
+        for i, node in enumerate(nodes):
+            rotations[:, i] = node.mean(rotations[:, i], node.proposals(rotations))
+    scores = [node.score(rotations[:, i, None], node.proposals(rotations)) for i, node in enumerate(nodes)]
+    best = rotations[np.sum(scores, axis=0)[:, 0].argmax()].astype(np.float64)
+    return nearest_rotation(best[0].T @ best)[0]
+
+
+def _sample(node: _Node, rotations: _Rotations, i: int, temperature: float, rng: np.random.Generator) -> None:
+    """Set the rotation of object i, in place, to its present one or one that a hypothesis of a few pairs proposes."""
+    t, some = len(rotations), rng.permutation(len(node.neighbour))[:_PROPOSERS]
+    proposals = node.proposals(rotations)
+    candidates = np.concatenate([rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1)
+    score = node.score(candidates, proposals)
+    score += temperature * rng.gumbel(size=score.shape)  # the largest is then a sample of the softmax
+    rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
+
+
+def _judge(
+    node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int, agreeing: float
+) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
+    """Return the probability of an object's rotation, the best other one, all others fixed, and its probability.
+
+    They are a conditional logit, whose third alternative is that none is right; it is less probable if more of the
+    object's pairs agree. Its pairs err together, so the margin between the scores counts by the root of their number.
+    """
+    proposals = node.proposals(rotations[None])
+    others = proposals.reshape(-1, 3, 3)
+    others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
+    present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[0].tolist()
+    margin = (present - max(scores, default=-np.inf)) / np.sqrt(len(node.neighbour))
+    other, none = np.exp(-MARGIN * margin), np.exp(NONE + NONE_AGREEING * agreeing)
+    best = others[np.argmax(scores)] if scores else None
+    return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
+
+
+def _scales_and_translations(
+    pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"], rotations: Float[np.ndarray, "n 3 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    r"""Fit scales and translations to the hypotheses that agree with the rotations; return the objects' centres too.
+
+    Hypothesis (\lambda, H, \tau) of a pair (a, b) demands \log s_a - \log s_b = \log\lambda. It takes the centre c of
+    a to y = \lambda H c + \tau, which demands t_a - t_b = s_b Q_b y - s_a Q_a c.
+    """
+    a, b = np.repeat(ends, [len(pair.sim3s) for pair in pairs], axis=0).T
+    sim3s = [one for pair in pairs for one in pair.sim3s]
+    c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
+    y = np.stack([one.apply(centre) for one, centre in zip(sim3s, c)])
+    angle = np.radians(rotation_angle(rotations[a], rotations[b] @ np.stack([one.R for one in sim3s])))
+    probability = np.concatenate([pair.probabilities for pair in pairs])
+    weight = probability * (np.exp(KAPPA * (np.cos(angle) - 1)) + _WEAK)
+    incidence = np.eye(len(rotations))[a] - np.eye(len(rotations))[b]
+    scales = np.exp(_least_absolute(incidence, np.log([[one.scale] for one in sim3s]), weight))[:, 0]
+    linear = scales[:, None, None] * rotations
+    shift = np.einsum("kij,kj->ki", linear[b], y) - np.einsum("kij,kj->ki", linear[a], c)
+    t = _least_absolute(incidence, shift, weight)
+    seen = np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]]) * np.r_[weight, weight][:, None]
+    return scales, t - t[0], (seen / seen.sum(axis=0)).T @ np.r_[c, y]
+
+
+def _least_absolute(
+    incidence: Float[np.ndarray, "k n"], difference: Float[np.ndarray, "k e"], weight: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "n e"]:
+    """Minimise sum_k w_k |incidence_k x - difference_k| over x of mean zero, by iteratively reweighted squares."""
+    scaled = weight
+    for _ in range(_REWEIGHTINGS):
+        normal = incidence.T @ (scaled[:, None] * incidence)
+        x = np.linalg.lstsq(normal, incidence.T @ (scaled[:, None] * difference))[0]  # of least norm, so of mean zero
+        scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
+    return x

@@ -1,0 +1,50 @@
+"""The command `align`: a whole category in one frame."""
+
+import click
+
+from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, workers_options
+
+
+@click.command(
+    epilog=examples(
+        "align data_samples --category car --out outputs/cars",
+        "align path/to/co3d --category teddybear --pairs 4 --workers 8 --out outputs/teddybears --propose",
+    )
+)
+@click.argument("data", type=PATH)
+@click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
+@click.option("--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object.")
+@click.option(
+    "--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Objects that each is compared with."
+)
+@click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
+@click.option("--out", type=PATH, default="outputs/align", help="Folder; an existing run is continued.")
+@click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
+@replace_option
+@workers_options
+@backbone_options
+def align(data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor) -> None:
+    """Align all objects of a category in one frame; no label is needed.
+
+    Every object gets a similarity from its world to the common frame, and the probability that its rotation is within
+    30 degrees of the one that most objects agree with. OUT gets them as alignment.json, as pose labels in
+    class_labels/CATEGORY/, which `zsp-lite data labels OUT --root DATA` takes, and as pictures in report.html. With
+    fewer than five objects, or where objects look alike from two sides, some may be turned round against the rest: look
+    at the report.
+    """
+    from zsp_lite.align import align_category, write_alignment, write_labels
+    from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.viz.category_sheet import COLUMNS, object_rows, write_category_report
+
+    dataset = Co3D(data)
+    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers)
+    written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
+    if propose:
+        written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
+    written.append(write_category_report(out / "report.html", found, dataset, category))
+    print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
+    for (first, second), angle in found.disagreements.items():
+        print(f"{first} to {second}: the pair alone says {angle:.0f}° else")
+    for path in written:
+        print(f"Written: {path}")

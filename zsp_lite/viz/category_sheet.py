@@ -1,0 +1,93 @@
+"""Contact sheet of a category: its objects seen by one camera, as scanned and in their common frame."""
+
+from base64 import b64encode
+from collections.abc import Sequence
+from html import escape
+from io import BytesIO
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
+
+from zsp_lite.category import CategoryAlignment
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.io.files import write_atomic
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.views import object_crop
+from zsp_lite.viz.plots import VERMILLION
+
+COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
+DOUBTFUL = 0.8  # an object with a lower probability should be looked at
+_PER_LINE = 10
+
+
+def contact_sheet(
+    dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None, frame: int = 0
+) -> Figure:
+    """Show objects by the frame that is nearest to one camera: in their own worlds above, in the common frame below.
+
+    The camera is that of a frame, by its place, of the most probable object. Doubtful objects are shown in their next
+    best turn, too. At most ten objects are shown.
+    """
+    names = list(names or alignment.objects)[:_PER_LINE]
+    objects = {name: alignment.objects[name] for name in names}
+    surest = max(names, key=lambda name: objects[name].probability)
+    camera = dataset.camera(_frames(dataset, category, surest)[frame]).R
+    common = camera @ objects[surest].sim3.R.T
+    rows = {"as scanned": dict.fromkeys(names, camera)}
+    rows["aligned"] = {name: common @ one.sim3.R for name, one in objects.items()}
+    doubtful = {name: one.alternative for name, one in objects.items() if one.probability < DOUBTFUL}
+    if turned := {name: common @ other.R for name, other in doubtful.items() if other}:
+        rows["or turned"] = turned
+    size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
+    figure, axes = plt.subplots(len(rows), len(names), figsize=size, layout="constrained", squeeze=False)
+    for line, (title, cameras) in zip(axes, rows.items()):
+        line[names.index(next(iter(cameras)))].set_ylabel(title)
+        for axis, name in zip(line, names):
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            if name in cameras:
+                axis.imshow(_nearest(dataset, category, name, cameras[name]))
+    for axis, (name, one) in zip(axes[1], objects.items()):
+        colour = VERMILLION if name in doubtful else "black"
+        axis.set_xlabel(f"{name[:14]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour)
+    return figure
+
+
+def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
+    """Return the lines of the table of objects: name, probability, and the next best turn with its probability."""
+    rows = []
+    for name, one in alignment.objects.items():
+        other = (f"{one.turn:.0f}°", f"{100 * one.alternative_probability:.0f}") if one.alternative else ("", "")
+        flag = "" if one.probability >= DOUBTFUL else " (look)"
+        rows.append((f"{name}{flag}", f"{100 * one.probability:.0f}", *other))
+    return rows
+
+
+def write_category_report(path: str | Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
+    """Write a page with the contact sheet and the table of all objects."""
+    names, body = list(alignment.objects), f"<h1>{escape(category)}</h1>"
+    for start in range(0, len(names), _PER_LINE):
+        figure, data = contact_sheet(dataset, category, alignment, names[start : start + _PER_LINE]), BytesIO()
+        figure.savefig(data, format="png", dpi=100)
+        plt.close(figure)
+        image = b64encode(data.getvalue()).decode()
+        body += f'<img alt="objects as scanned, and aligned" src="data:image/png;base64,{image}">'
+    body += pd.DataFrame(object_rows(alignment), columns=COLUMNS).to_html(index=False, border=0)
+    write_atomic(path, f'<!doctype html><meta charset="utf-8"><title>{escape(category)}</title>{body}'.encode())
+    return Path(path)
+
+
+def _frames(dataset: Co3D, category: str, name: str) -> list:
+    return [one for one in dataset.frames(category, name) if None not in (one.viewpoint, one.mask)]
+
+
+def _nearest(
+    dataset: Co3D, category: str, name: str, rotation: Float[np.ndarray, "3 3"]
+) -> UInt8[np.ndarray, "side side 3"]:
+    """Load the object's crop in the frame whose camera is nearest to a rotation."""
+    frames = _frames(dataset, category, name)
+    angles = rotation_angle(np.stack([dataset.camera(one).R for one in frames]), rotation)
+    return object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb
