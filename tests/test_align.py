@@ -79,9 +79,10 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(run, tmp_path, monkeypatch, capsys):
     root, out = tmp_path / "data", tmp_path / "out"
     root.symlink_to(small_folder(), target_is_directory=True)
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: run[1])
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: run[1])
     assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
-    assert "lump: 3 objects in one frame" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "lump: 3 objects in one frame" in text and "100.0% of 6 ordered pairs are within 30°" in text
     assert (out / "report.html").read_text().count("<img") == 1
     objects = json.loads((out / "alignment.json").read_text())["objects"]
     np.testing.assert_allclose(objects[B]["world_to_frame"], run[1].objects[B].sim3.matrix)

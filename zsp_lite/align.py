@@ -6,7 +6,7 @@ The pairs of a category go through the executors of the benchmark and are stored
 import json
 import logging
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -37,13 +37,13 @@ from zsp_lite.category import (
     world_hypotheses,
 )  # fmt: skip
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import label_bytes, rigid_label
+from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import decode_json, write_atomic
-from zsp_lite.metrics import rotation_angle
+from zsp_lite.metrics import rotation_angle, rotation_error
 from zsp_lite.own_objects import Source, estimate_pose, known_errors
 
 logger = logging.getLogger(__name__)
@@ -91,6 +91,7 @@ def align_category(
     targets: int = 5,
     out: str | Path | None = None,
     executor: Executor | str | int = 1,
+    allow_other_version: bool = False,
 ) -> CategoryAlignment:
     """Align all objects of a category in one frame, without labels (see `category`).
 
@@ -105,6 +106,7 @@ def align_category(
         targets: Target frames per pair of frames; each pair of objects becomes three of these.
         out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
         executor: Number of processes; "dask://HOST:PORT"; or any `Executor`.
+        allow_other_version: Continue a run of another version of the library.
 
     Raises:
         InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
@@ -122,7 +124,7 @@ def align_category(
             origins={category: "sampled"},
             calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
         )  # fmt: skip
-        with open_run(folder, settings):
+        with open_run(folder, settings, allow_other_version):
             known = {line.pair for line in _read(folder)}
             todo = {pair: ["alignment"] for key, pair in chosen.items() if key not in known}
             sent = backbone if pool else loaded
@@ -136,6 +138,12 @@ def align_category(
         if name not in {one.target for one in found}:
             logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
     return synchronise(found)
+
+
+def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> list[float]:
+    """Compute the rotation errors in degrees of all ordered pairs of the objects that have labels."""
+    turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
+    return [float(rotation_error(found.between(a, b).R, turns[b] @ turns[a].T)) for a, b in permutations(turns, 2)]
 
 
 def _read(out: str | Path) -> list[_Line]:

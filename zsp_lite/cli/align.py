@@ -2,7 +2,16 @@
 
 import click
 
-from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, workers_options
+from zsp_lite.cli.common import (
+    COUNT,
+    NAMES,
+    PATH,
+    backbone_options,
+    examples,
+    replace_option,
+    version_option,
+    workers_options,
+)
 
 
 @click.command(
@@ -22,8 +31,11 @@ from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, 
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
 @replace_option
 @workers_options
+@version_option
 @backbone_options
-def align(data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor) -> None:
+def align(
+    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor, **again
+) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
     Every object gets a similarity from its world to the common frame, and the probability that its rotation is within
@@ -32,19 +44,24 @@ def align(data, category, sequences, pairs, targets, out, propose, replace, back
     fewer than five objects, or where objects look alike from two sides, some may be turned round against the rest: look
     at the report.
     """
-    from zsp_lite.align import align_category, write_alignment, write_labels
+    from zsp_lite.align import align_category, label_errors, write_alignment, write_labels
+    from zsp_lite.category import SAME_ANGLE
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.labels import read_labels
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows, write_category_report
 
     dataset = Co3D(data)
-    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers)
+    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers, **again)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     if propose:
         written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
     written.append(write_category_report(out / "report.html", found, dataset, category))
     print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
     for (first, second), angle in found.disagreements.items():
-        print(f"{first} to {second}: the pair alone says {angle:.0f}° else")
+        print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
+    if errors := label_errors(found, read_labels(dataset.root, category)):
+        right = sum(error < SAME_ANGLE for error in errors) / len(errors)
+        print(f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within {SAME_ANGLE:.0f}°.")
     for path in written:
         print(f"Written: {path}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, workers_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, version_option, workers_options
 
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
@@ -45,7 +45,7 @@ metrics_option = click.option(
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
 @workers_options
 @metrics_option
-@click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both.")
+@version_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,

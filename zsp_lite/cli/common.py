@@ -54,6 +54,9 @@ def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) ->
 
 
 replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
+version_option = click.option(
+    "--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."
+)
 seed_option = click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 
 
