@@ -83,7 +83,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
     text = capsys.readouterr().out
     assert "lump: 3 objects in one frame" in text and "100.0% of 6 ordered pairs are within 30°" in text
-    assert (out / "report.html").read_text().count("<img") == 1
+    assert (out / "report.html").read_text().count("<img") == 1 and (out / "objects.jpg").stat().st_size > 1000
     objects = json.loads((out / "alignment.json").read_text())["objects"]
     np.testing.assert_allclose(objects[B]["world_to_frame"], run[1].objects[B].sim3.matrix)
     labelling = Labelling(root, "lump", SEQUENCES, reference=A)

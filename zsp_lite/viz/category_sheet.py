@@ -2,14 +2,13 @@
 
 from base64 import b64encode
 from collections.abc import Sequence
-from html import escape
 from io import BytesIO
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
 from jaxtyping import Float, UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from zsp_lite.category import CategoryAlignment
@@ -52,7 +51,7 @@ def contact_sheet(
                 axis.imshow(_nearest(dataset, category, name, cameras[name]))
     for axis, (name, one) in zip(axes[1], objects.items()):
         colour = VERMILLION if name in doubtful else "black"
-        axis.set_xlabel(f"{name[:14]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour)
+        axis.set_xlabel(f"{name[:16]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour)
     return figure
 
 
@@ -67,16 +66,21 @@ def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
 
 
 def write_category_report(path: str | Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
-    """Write a page with the contact sheet and the table of all objects."""
-    names, body = list(alignment.objects), f"<h1>{escape(category)}</h1>"
+    """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
+    names, sheets = list(alignment.objects), []
     for start in range(0, len(names), _PER_LINE):
         figure, data = contact_sheet(dataset, category, alignment, names[start : start + _PER_LINE]), BytesIO()
-        figure.savefig(data, format="png", dpi=100)
+        figure.savefig(data, format="jpg", dpi=150, pil_kwargs={"quality": 90})
         plt.close(figure)
-        image = b64encode(data.getvalue()).decode()
-        body += f'<img alt="objects as scanned, and aligned" src="data:image/png;base64,{image}">'
-    body += pd.DataFrame(object_rows(alignment), columns=COLUMNS).to_html(index=False, border=0)
-    write_atomic(path, f'<!doctype html><meta charset="utf-8"><title>{escape(category)}</title>{body}'.encode())
+        sheets.append(data.getvalue())
+    page = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
+    text = page.get_template("category.html").render(
+        category=category, columns=COLUMNS, rows=object_rows(alignment),
+        images=[f"data:image/jpeg;base64,{b64encode(sheet).decode()}" for sheet in sheets],
+        doubtful=[name for name, one in alignment.objects.items() if one.probability < DOUBTFUL],
+    )  # fmt: skip
+    write_atomic(Path(path).with_name("objects.jpg"), sheets[0])
+    write_atomic(path, text.encode())
     return Path(path)
 
 
