@@ -140,10 +140,15 @@ def align_category(
     return synchronise(found)
 
 
-def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> list[float]:
-    """Compute the rotation errors in degrees of all ordered pairs of the objects that have labels."""
+def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
+    """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
-    return [float(rotation_error(found.between(a, b).R, turns[b] @ turns[a].T)) for a, b in permutations(turns, 2)]
+    true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
+    alone = [((one.reference, one.target), one.sim3s[0]) for one in found.pairs]
+    together = [(pair, found.between(*pair)) for pair in true]
+    return tuple(
+        [float(rotation_error(sim3.R, true[pair])) for pair, sim3 in some if pair in true] for some in (together, alone)
+    )
 
 
 def _read(out: str | Path) -> list[_Line]:

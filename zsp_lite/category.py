@@ -78,6 +78,7 @@ class CategoryAlignment:
     """All objects of a category in one frame: that of the first object, with a mean log scale of zero."""
 
     objects: dict[str, ObjectPose]  # by name, sorted
+    pairs: tuple[PairHypotheses, ...]  # what it was found from
     # median angle from the best hypothesis of the pairs (reference, target), where above 30 degrees; largest first
     disagreements: dict[tuple[str, str], float]
 
@@ -97,10 +98,9 @@ def category_pairs(
 ) -> list[Pair]:
     """Choose the pairs of objects, and their frames, that a category is aligned by.
 
-    Each object is the reference of `per_object` others, or of all; None is all below 12 objects, and 6 from there on.
-    They connect all objects. Each becomes `references` pairs of frames: reference frames are evenly spaced over their
-    sequence, to see several sides of the object, and so are the `targets` target frames of each, from random starts.
-    Frames depend on the two names and the seed only.
+    Each object is the reference of `per_object` others; None is all below 12 objects, and 6 from there on. Each pair
+    becomes `references` pairs of frames: reference frames are evenly spaced over their sequence, to see several sides,
+    and so are the `targets` target frames, from random starts that depend on the two names and the seed only.
     """
     numbers: dict[str, list[int]] = {}
     for key in dataset.frame_list(category):
@@ -169,8 +169,8 @@ def synchronise(pairs: Sequence[PairHypotheses], seed: int = 0) -> CategoryAlign
             alternative = Sim3(scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i])
         objects[name] = ObjectPose(sim3, centres[i], probability, alternative, other)
     angles = {(names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends}
-    worst_first = sorted((key for key in angles if angles[key] > SAME_ANGLE), key=lambda key: -angles[key])
-    return CategoryAlignment(objects, {key: angles[key] for key in worst_first})
+    worst = {key: angles[key] for key in sorted(angles, key=angles.get, reverse=True) if angles[key] > SAME_ANGLE}
+    return CategoryAlignment(objects, tuple(pairs), worst)
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,8 +60,10 @@ def align(
     print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
-    if errors := label_errors(found, read_labels(dataset.root, category)):
-        right = sum(error < SAME_ANGLE for error in errors) / len(errors)
-        print(f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within {SAME_ANGLE:.0f}°.")
+    errors, alone = label_errors(found, read_labels(dataset.root, category))
+    if errors:
+        right, before = (sum(error < SAME_ANGLE for error in some) / len(some) for some in (errors, alone))
+        print(f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within {SAME_ANGLE:.0f}°;", end=" ")
+        print(f"of the best poses of {len(alone)} pairs of views and objects alone, {before:.1%}.")
     for path in written:
         print(f"Written: {path}")
