@@ -98,13 +98,17 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
         one = found.estimates["verified"]
         best = one.hypotheses[0]
         wrong = replace(best, sim3=replace(best.sim3, R=best.sim3.R @ np.diag([-1.0, -1.0, 1.0])))
-        hypotheses = replace(wrong, confidence=0.6), replace(best, confidence=0.4)
-        return replace(found, estimates={"verified": replace(one, sim3=wrong.sim3, hypotheses=hypotheses)})
+        hypotheses = replace(wrong, confidence=0.6), replace(best, confidence=0.3, mode=1)
+        wrong = replace(one, sim3=wrong.sim3, hypotheses=hypotheses, flags=("one of two", "masks"), one_of_two=True)
+        return replace(found, estimates={"verified": wrong})
 
     monkeypatch.setattr(align, "estimate_pose", misled)
     sources = [open_source(small_folder() / "lump" / name) for name in SEQUENCES]
     found = estimate_with_helpers(sources, BACKBONE, targets=3)
-    assert found.errors["verified"] < 15 and found.estimates["verified"].hypotheses[1].confidence < 0.5
+    one = found.estimates["verified"]
+    assert found.errors["verified"] < 15 and one.confidence > 0.5 and not one.one_of_two
+    assert [other.mode for other in one.hypotheses] == [0, 1] and one.angle_to(one.alternatives[0]) > 100
+    assert "masks" in one.flags
 
 
 def test_paths_after_the_pair_belong_to_helpers(capsys):

@@ -40,11 +40,12 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError
-from zsp_lite.estimates import PairResult
+from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import decode_json, write_atomic
 from zsp_lite.metrics import rotation_angle, rotation_error
 from zsp_lite.own_objects import Source, estimate_pose, known_errors
+from zsp_lite.verified.confidence import modes, reliability_flags
 
 logger = logging.getLogger(__name__)
 
@@ -193,13 +194,27 @@ def estimate_with_helpers(
         flags = (*estimate.flags, "no hypothesis agrees with the other objects: they were not used")
         return replace(result, estimates={"verified": replace(estimate, flags=flags)})
     sure = min(alignment.objects[name].probability for name in names[:2])
-    first, *others = [estimate.hypotheses[chosen], *(one for k, one in enumerate(estimate.hypotheses) if k != chosen)]
-    rest = sum(one.confidence for one in others) or 1.0
-    others = [replace(one, confidence=(1 - sure) * one.confidence / rest) for one in others]
-    hypotheses = (replace(first, confidence=sure), *others)
-    settled = replace(estimate, sim3=first.sim3, view=first.view, hypotheses=hypotheses)
-    estimates = {"verified": settled}
+    estimates = {"verified": _settled(estimate, chosen, sure)}
     return replace(result, estimates=estimates, errors=known_errors(*sources[:2], result, estimates))
+
+
+def _settled(estimate: PoseEstimate, chosen: int, probability: float) -> PoseEstimate:
+    """Put the hypothesis with an index first, with a probability; the others share what is left."""
+    ordered = sorted(estimate.hypotheses, key=lambda one: one is not estimate.hypotheses[chosen])
+    angles = [np.stack([estimate.world_rotation(one) for one in some]) for some in (estimate.hypotheses, ordered)]
+    before, after = (rotation_angle(one[:, None], one) for one in angles)
+    mode = modes(after)
+    rest = sum(one.confidence for k, one in enumerate(ordered) if 0 != mode[k] == k) or 1.0
+    hypotheses = tuple(
+        replace(one, mode=int(m), confidence=(1 - probability) * one.confidence / rest if m else probability)
+        for one, m in zip(ordered, mode)
+    )
+    old, (new, one_of_two) = reliability_flags(estimate.hypotheses, before)[0], reliability_flags(hypotheses, after)
+    flags = (*new, *(flag for flag in estimate.flags if flag not in old))
+    first = hypotheses[0]
+    return replace(
+        estimate, sim3=first.sim3, view=first.view, hypotheses=hypotheses, flags=flags, one_of_two=one_of_two
+    )
 
 
 class _Remembering:
