@@ -43,6 +43,11 @@ def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.
     return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
 
 
+def contents(folder) -> dict[str, bytes]:
+    """The files of a folder by their paths in it."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def edit_json(path, change) -> None:
     """Rewrite a gzipped JSON file with `change` applied to its content."""
     content = json.loads(gzip.decompress(path.read_bytes()))

@@ -12,10 +12,8 @@ class Server:
         self.files = files  # content by path
         self.ranges = []  # Range header of each GET request so far, or None
         self.break_after = None  # the connection is closed after so many bytes of a response
-        self.stall_after = None  # nothing is sent after so many bytes, but the connection stays open
         self.knows_ranges = True  # whether Range headers are honoured
-        self.chunked, self.surplus = False, b""  # whether the length is not sent; sent after the content
-        self.closed = threading.Event()
+        self.chunked = False  # whether the length is not sent
         outer = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -48,12 +46,10 @@ class Server:
                 if not outer.chunked:
                     self.send_header("Content-Length", str(end - start))
                 self.end_headers()
-                limits = [one for one in (outer.break_after, outer.stall_after) if one is not None]
                 self.close_connection = True
+                end = end if outer.break_after is None else min(end, start + outer.break_after)
                 try:
-                    self.wfile.write(content[start : min([end, *(start + one for one in limits)])] + outer.surplus)
-                    if outer.stall_after is not None:
-                        outer.closed.wait()
+                    self.wfile.write(content[start:end])
                 except ConnectionError:  # the client closed the connection before the end
                     return
 
@@ -66,7 +62,5 @@ class Server:
         threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
 
     def close(self) -> None:
-        """End the server and its stalled responses."""
-        self.closed.set()
         self.http.shutdown()
         self.http.server_close()

@@ -85,6 +85,13 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     return Frame(rgb, np.where(hit, high, 0).astype(np.float32), hit.astype(np.float32), camera, name)
 
 
+def around(placement: Sim3, count: int = 7, arc: float = 360, name: str = "{:04d}") -> list[Frame]:
+    """Render views of the object, evenly spaced in an arc of degrees about the vertical through it."""
+    angles = np.radians(np.arange(count) * arc / count)
+    cameras = [look_at(placement.R @ (np.cos(a), np.sin(a), 0.3)) for a in angles]
+    return [render(camera, placement, name.format(k)) for k, camera in enumerate(cameras)]
+
+
 @dataclass(frozen=True)
 class CoordinateBackbone:
     """Fourier features of the object coordinates that are encoded in the colours; black is background."""

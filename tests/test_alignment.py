@@ -30,18 +30,10 @@ def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
 # Sim3
 
 
-@settings(deadline=None)
-@given(seeds, scales)
-def test_a_similarity_after_its_inverse_moves_nothing(seed, scale):
-    sim3 = similarity(seed, scale)
-    assert_same(sim3 @ sim3.inverse(), Sim3.identity())
-    assert_same(sim3.inverse() @ sim3, Sim3.identity())
-
-
-@settings(deadline=None)
 @given(seeds, scales)
 def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
     a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
+    assert_same(a @ a.inverse(), Sim3.identity())
     np.testing.assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
     np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
     homogeneous = np.c_[points, np.ones(len(points))] @ a.matrix.T
@@ -67,24 +59,13 @@ def test_what_is_no_similarity_is_refused(scale, R, t):
 # Umeyama
 
 
-@settings(deadline=None)
 @given(seeds, scales, st.integers(4, 40))
 def test_umeyama_recovers_the_similarity_that_made_the_target(seed, scale, n):
     truth, source = similarity(seed, scale), cloud(seed + 2, n)
     assert_same(umeyama(source, truth.apply(source)), truth, atol=1e-7)
 
 
-def test_umeyama_agrees_with_a_case_worked_out_by_hand():
-    # A unit square in z = 0, turned by 90 degrees about z, doubled, shifted by (1, 2, 3).
-    source = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    target = [[1, 2, 3], [1, 4, 3], [-1, 4, 3], [-1, 2, 3]]
-    sim3 = umeyama(source, target)
-    assert sim3.scale == pytest.approx(2)
-    np.testing.assert_allclose(sim3.R, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(sim3.t, [1, 2, 3], atol=1e-12)
-
-
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds, scales)
 def test_umeyama_is_equivariant_under_similarities_of_source_and_target(seed, scale):
     source, a, b = cloud(seed), similarity(seed + 3, scale), similarity(seed + 5)
@@ -95,7 +76,7 @@ def test_umeyama_is_equivariant_under_similarities_of_source_and_target(seed, sc
     assert_same(umeyama(a.apply(source), target), plain @ a.inverse(), atol=1e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds)
 def test_no_nearby_similarity_fits_better(seed):
     rng = np.random.default_rng(seed)
@@ -111,7 +92,6 @@ def test_no_nearby_similarity_fits_better(seed):
         assert np.square(near.apply(source) - target).sum() >= cost
 
 
-@settings(deadline=None)
 @given(seeds)
 def test_a_mirrored_target_gets_a_rotation_and_not_a_reflection(seed):
     source = cloud(seed)
@@ -138,33 +118,20 @@ def test_torch_tensors_give_the_same_as_numpy_arrays():
 
 line = np.linspace(0, 1, 8)[:, None] * (1.0, 2.0, 3.0)
 rounded = (line + (0.1, 0.7, 5.0)).astype(np.float32)
-not_finite = cloud(0).copy()
-not_finite[3, 1] = np.nan
+not_finite = np.where(cloud(0) == cloud(0)[3, 1], np.nan, cloud(0))
+DEGENERATE = {
+    "two": (cloud(0, 2), cloud(0, 2)), "collinear": (line, line), "equal": (np.ones((5, 3)), np.ones((5, 3))),
+    "target line": (cloud(0, 8), line), "target point": (cloud(0), np.ones((20, 3))),
+    "rounded line": (rounded, cloud(0, 8)), "nan": (not_finite, cloud(0)), "nan target": (cloud(0), not_finite),
+    "lengths": (cloud(0, 5), cloud(0, 6)), "flat": (cloud(0)[:, :2], cloud(0)[:, :2]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("source", "target"),
-    [
-        (cloud(0, 2), cloud(0, 2)),
-        (line, line),
-        (np.ones((5, 3)), np.ones((5, 3))),
-        (cloud(0, 8), line),
-        (cloud(0), np.ones((20, 3))),
-        (rounded, cloud(0, 8)),
-        (not_finite, cloud(0)),
-        (cloud(0), not_finite),
-        (cloud(0, 5), cloud(0, 6)),
-        (cloud(0)[:, :2], cloud(0)[:, :2]),
-    ],
-    ids=[
-        "two", "collinear", "equal", "target line", "target point", "rounded line", "nan", "nan target", "lengths",
-        "flat",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("points", DEGENERATE)
 @pytest.mark.parametrize("solver", [umeyama, ransac])
-def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, source, target):
+def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
     with pytest.raises(InputError) as error:
-        solver(source, target)
+        solver(*DEGENERATE[points])
     assert "\n" not in str(error.value)
 
 
@@ -181,7 +148,7 @@ def contaminated(seed: int, outliers: float = 0.6, n: int = 50):
     return source, target, truth, ~wrong
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds)
 def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
     source, target, truth, right = contaminated(seed)
@@ -212,15 +179,10 @@ def test_ransac_agrees_with_a_loop_over_its_trials():
     assert (inliers == leader).all()
 
 
-@settings(max_examples=20, deadline=None)
-@given(seeds, st.floats(0.5, 2.0))
-def test_ransac_is_equivariant_when_the_threshold_scales_along(seed, scale):
-    source, target, _, _ = contaminated(seed)
-    moved = similarity(seed + 1, scale)
-    plain, inliers = ransac(source, target, seed=1, scale_range=(1e-3, 1e3))
-    other, same = ransac(source, moved.apply(target), 0.2 * scale, seed=1, scale_range=(1e-3, 1e3))
-    assert (inliers == same).all()
-    assert_same(other, moved @ plain, atol=1e-6)
+def test_of_two_motions_with_as_many_inliers_the_closer_fit_wins():
+    source, loose, exact = cloud(0, 40), similarity(1), similarity(2)
+    target = np.concatenate([loose.apply(source[:20] + 0.02 * cloud(1)), exact.apply(source[20:])])
+    assert ransac(source, target)[1].tolist() == [False] * 20 + [True] * 20
 
 
 def test_scales_out_of_range_are_not_considered():
@@ -257,13 +219,6 @@ def test_settings_of_ransac_out_of_range_are_refused(settings):
         ransac(cloud(0), cloud(0), **settings)
     with pytest.raises(InputError, match="at least 4"):
         ransac(cloud(0, 3), cloud(0, 3))
-
-
-def test_a_hopeless_set_still_gives_a_similarity_and_few_inliers():
-    rng = np.random.default_rng(0)
-    sim3, inliers = ransac(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
-    assert np.linalg.det(sim3.R) == pytest.approx(1)
-    assert inliers.sum() < 12
 
 
 def test_every_sample_is_equally_likely():

@@ -193,14 +193,6 @@ def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
 
 
-def test_heads_have_64_channels_unless_the_metadata_tells(tmp_path):
-    torch.save(small_vit(embed_dim=128, num_heads=2).state_dict(), tmp_path / "a.pth")
-    assert load_backbone(tmp_path / "a.pth", "cpu").model.num_heads == 2
-    torch.save(small_vit(embed_dim=48, num_heads=6).state_dict(), tmp_path / "b.pth")
-    with pytest.raises(InputError, match="num_heads"):
-        load_backbone(tmp_path / "b.pth", "cpu")
-
-
 def test_safetensors_bring_their_settings_and_options_override_them(pictures, tmp_path):
     vit = small_vit(num_heads=4)
     half = {key: x.half() for key, x in vit.state_dict().items()}
@@ -234,14 +226,13 @@ def test_the_embedded_backbone_is_found_by_its_name_and_checked(vit, tmp_path, m
     [
         (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
         (
-            lambda w: {k: x for k, x in w.items() if k != "blocks.1.norm1.bias"},
-            r"blocks.1.norm1.bias: expected \(64,\), got none",
+            lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k},
+            r"1.norm1.bias: expected \(64,\), got none",
         ),
+        (lambda w: w | {"norm.weight": torch.zeros(3)}, "norm.weight"),
         (lambda w: w | {"extra": torch.zeros(1)}, "extra: expected none"),
         (lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)}, "blocks.100000000.norm1.bias: expected none"),
-        (lambda w: w | {"norm.weight": torch.zeros(3)}, "norm.weight"),
         (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight: .* not finite floats"),
-        (lambda w: {"fc.weight": torch.zeros(2, 2)}, "DINO layout"),
         (lambda w: [1, 2], "state dict"),
         (lambda w: {"epoch": 3}, "state dict"),
     ],
@@ -250,6 +241,14 @@ def test_other_models_weights_are_refused_naming_what_differs(vit, tmp_path, cha
     torch.save(change(dict(vit.state_dict())), tmp_path / "other.pth")
     with pytest.raises(InputError, match=message):
         load_backbone(tmp_path / "other.pth", "cpu")
+
+
+def test_weights_that_overflow_do_not_verify(tmp_path):
+    vit = small_vit()
+    vit.blocks[1].mlp.fc2.weight.data.fill_(1e38)
+    save_file(vit.state_dict(), tmp_path / "huge.safetensors")
+    with pytest.raises(InputError, match="huge.safetensors: .*not finite"):
+        verify(tmp_path / "huge.safetensors")
 
 
 @pytest.mark.parametrize("key, value", [("num_heads", "four"), ("num_heads", "0"), ("saliency_heads", "7")])
@@ -333,16 +332,6 @@ def test_a_file_that_is_not_the_released_one_is_refused(vit, cache):
         load_backbone("dino_vits16", "cpu")
 
 
-def test_weights_that_overflow_do_not_verify(tmp_path):
-    vit = small_vit()
-    for name, weight in (("fine", 0.1), ("huge", 1e38)):
-        vit.blocks[1].mlp.fc2.weight.data.fill_(weight)
-        save_file(vit.state_dict(), tmp_path / f"{name}.safetensors")
-    verify(tmp_path / "fine.safetensors")
-    with pytest.raises(InputError, match="huge.safetensors: .*not finite"):
-        verify(tmp_path / "huge.safetensors")
-
-
 @pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])
 def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch, address):
     monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
@@ -352,12 +341,3 @@ def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch,
     assert "\n" not in message
     for part in (pretrained.PRETRAINED["dino_vits8"].url, str(cache / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
         assert part in message
-
-
-def test_released_addresses_and_hashes_are_those_that_were_published():
-    folder = "https://dl.fbaipublicfiles.com/dino/dino_deitsmall8_pretrain/"
-    assert pretrained.PRETRAINED["dino_vits8"].url == folder + "dino_deitsmall8_pretrain.pth"
-    assert pretrained.PRETRAINED["dino_vits8"].size == 86_728_949
-    assert {name: r.md5_prefix for name, r in pretrained.PRETRAINED.items()} == {
-        "dino_vits8": "230cd5", "dino_vits16": "cf0f22", "dino_vitb8": "556550", "dino_vitb16": "552daf"
-    }  # fmt: skip

@@ -5,6 +5,7 @@ import pytest
 from co3d_folders import random_camera, seeds
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic_views import level_camera
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, view_span
@@ -15,13 +16,7 @@ SIZE = (480, 640)
 
 
 def view(**changes):
-    values = {
-        "R": np.eye(3),
-        "t": [0, 0, 2],
-        "focal_length": [500, 500],
-        "principal_point": [320, 240],
-        "size": SIZE,
-    }
+    values = {"R": np.eye(3), "t": [0, 0, 2], "focal_length": [500, 500], "principal_point": [320, 240], "size": SIZE}
     return Camera(**(values | changes))
 
 
@@ -61,23 +56,6 @@ def test_a_rounded_rotation_is_replaced_by_the_nearest_rotation():
     np.testing.assert_allclose(short.R, exact.R, atol=1e-4)
     assert Sim3(1.0, short.R @ exact.R.T, np.zeros(3)).scale == 1.0
     np.testing.assert_array_equal(replace(exact, R=exact.R).R, exact.R)
-
-
-@pytest.mark.parametrize(
-    ("intrinsics_format", "focal_length", "principal_point"),
-    [(FORMATS[0], [200, 150], [90, 60]), (FORMATS[1], [100, 150], [95, 60])],
-)
-def test_intrinsics_worked_out_by_hand(intrinsics_format, focal_length, principal_point):
-    camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 1], [2, 3], [0.1, -0.2], (100, 200), intrinsics_format)
-    np.testing.assert_allclose(camera.focal_length, focal_length)
-    np.testing.assert_allclose(camera.principal_point, principal_point)
-
-
-def test_left_and_up_in_pytorch3d_are_small_pixel_coordinates():
-    camera = Camera.from_pytorch3d(np.eye(3), [0, 0, 0], [1, 1], [0, 0], (100, 100))
-    pixel, depth = camera.project(np.array([0.5, 0.5, 1.0]))  # +x is left, +y is up there
-    np.testing.assert_allclose(pixel, [25, 25])
-    assert depth == 1
 
 
 @given(seeds)
@@ -120,13 +98,10 @@ def test_resizing_scales_pixels_and_keeps_depth(seed, height, width):
         ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
         ({"R": 2 * np.eye(3)}, "expected a rotation"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
-        ({"R": np.full((3, 3), np.nan)}, "R holds nan"),
         ({"t": [0, 0, np.inf]}, "t holds inf"),
         ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
         ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
-        ({"principal_point": [np.nan, 0]}, "principal_point holds nan"),
         ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
-        ({"size": (np.inf, 5)}, "image size .* is inf"),
     ],
 )
 def test_invalid_cameras_are_refused(changes, message):
@@ -137,13 +112,7 @@ def test_invalid_cameras_are_refused(changes, message):
 @pytest.mark.parametrize("roll", [0, 1])
 def test_the_span_of_views_is_that_around_the_object(roll):
     def span(*angles):
-        cameras = []
-        for azimuth, height in np.radians(angles):
-            away = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
-            right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
-            R = np.stack([right, np.cross(-away, right), -away])
-            cameras.append(replace(random_camera(), R=R, t=np.array([0, 0, 3]) - R @ [1, 2, 3]).turn(roll))
-        return view_span(cameras, np.array([1.0, 2, 3]))
+        return view_span([level_camera(*angle).turn(roll) for angle in angles], np.array([1.0, 2, 3]))
 
     assert span((40, 20)) == pytest.approx(0, abs=1e-5)
     assert span(*((az, 0) for az in range(0, 73, 18))) == pytest.approx(72)

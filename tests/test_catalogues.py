@@ -1,9 +1,10 @@
-"""The catalogues of models are complete and consistent, and their builder checks what it reads."""
+"""Catalogues of models: complete, consistent, built as they are listed; training, validation and evaluation have no
+concept and no model file in common (`tools/concepts.csv`)."""
 
+import csv
 import hashlib
 import json
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,17 +12,21 @@ from model_files import write_quad
 from PIL import Image
 
 from tools import same_shape
-from tools.ac3d import convert
 from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
 from tools.same_shape import CATALOGUE, copy_same_shape
+from tools.training_categories import TRAINING
+from tools.validation_categories import VALIDATION
 from zsp_lite.backbones.pretrained import WEIGHTS
 from zsp_lite.errors import InputError
+from zsp_lite.samples import REPOSITORY
+from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.meshes import read_mesh
 from zsp_lite.synthetic.models import list_models
 
-TOOLS = Path(__file__).parents[1] / "tools"
+TOOLS = REPOSITORY / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
 TRAINED, CHOSEN_BY = TOOLS / "training.json", TOOLS / "validation.json"
+CATALOGUES = {path.stem: read_catalogue(path).models for path in (ARTISTS, SAMPLES, TRAINED, CHOSEN_BY)}
 ATTRIBUTION = WEIGHTS / "ATTRIBUTION.md"
 
 # A world with one group, moved by 10 along x, of a square turned by a quarter about y; one polyline, one wrong count.
@@ -96,11 +101,13 @@ def test_every_model_of_a_catalogue_has_a_free_licence_and_names_its_author(path
     assert attribution(catalogue).count("https://creativecommons.org/") == links
 
 
-def test_no_file_is_in_two_catalogues():
-    catalogues = [read_catalogue(path).models.values() for path in (ARTISTS, SAMPLES, TRAINED, CHOSEN_BY)]
+def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs():
     for name in (lambda entry: entry.sha256, lambda entry: entry.member or entry.file):
-        files = [name(entry) for models in catalogues for entries in models for entry in entries.values()]
+        files = [name(one) for models in CATALOGUES.values() for entries in models.values() for one in entries.values()]
         assert len(set(files)) == len(files)
+    records = json.loads((REPOSITORY / "data_samples" / "rendered_models.json").read_text())
+    shown = {record["sha256"] for models in records["sequences"].values() for record in models.values()}
+    assert shown == {entry.sha256 for models in CATALOGUES["samples"].values() for entry in models.values()}
 
 
 def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under_their_class(tmp_path, monkeypatch):
@@ -114,8 +121,6 @@ def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under
     (tmp_path / "list.json").write_text('{"training": {"stool": ["chair_kind/oak"]}}')
     monkeypatch.setattr(same_shape, "CATALOGUE", tmp_path / "list.json")
     models = tmp_path / "models"
-    with pytest.raises(InputError, match="no model .*, expected the folder that tools/models.py made of training.json"):
-        copy_same_shape("training", models, tmp_path / "out")
     for name in ("oak", "elm"):
         (models / "chair_kind" / name).mkdir(parents=True)
         (models / "chair_kind" / name / f"{name}.obj").write_text("v 0 0 0")
@@ -123,25 +128,6 @@ def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under
     copy_same_shape("training", models, tmp_path / "out")
     (model,) = list_models(tmp_path / "out")
     assert (model.category, model.name, model.info.front) == ("stool", "oak", "+x")
-
-
-def test_an_ac3d_model_keeps_its_placement_texture_and_opacity(aircraft, tmp_path):
-    out = tmp_path / "out" / "plane.obj"
-    convert(aircraft, out, [aircraft.parent / "liveries"])
-    mesh = read_mesh(out)
-    assert len(mesh.faces) == 2  # a line is no surface
-    assert mesh.vertices.min(0) == pytest.approx([10, -1, -1]) and mesh.vertices.max(0) == pytest.approx([10, 1, 1])
-    assert mesh.uv.max((0, 1)).tolist() == [2, 1]  # the texture repeats twice
-    (material,) = mesh.materials
-    assert material.colour == pytest.approx([1, 0, 0, 0.75], abs=0.01) and material.texture.shape == (8, 8, 4)
-    with pytest.raises(InputError, match="lacks its texture 'paint.rgb'"):
-        convert(aircraft, out)
-    aircraft.write_text(AC3D[:-40])
-    with pytest.raises(InputError, match="is damaged"):
-        convert(aircraft, out, [aircraft.parent / "liveries"])
-    aircraft.write_text("solid")
-    with pytest.raises(InputError, match="does not begin with AC3D"):
-        convert(aircraft, out)
 
 
 def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
@@ -164,7 +150,12 @@ def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
     aircraft_model, sign_model = list_models(out)
     assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D, -x taken as front"
     assert sign_model.info.source == "home 1.0: set/sign/quad.obj" and sign_model.info.author == "Ann"
-    assert len(sign_model.read().faces) == len(aircraft_model.read().faces) == 2
+    mesh = read_mesh(aircraft_model.path)
+    assert len(sign_model.read().faces) == len(mesh.faces) == 2  # a line is no surface
+    assert mesh.vertices.min(0) == pytest.approx([10, -1, -1]) and mesh.vertices.max(0) == pytest.approx([10, 1, 1])
+    assert mesh.uv.max((0, 1)).tolist() == [2, 1]  # the texture repeats twice
+    (material,) = mesh.materials
+    assert material.colour == pytest.approx([1, 0, 0, 0.75], abs=0.01) and material.texture.shape == (8, 8, 4)
     aircraft.write_text(AC3D + " ")
     with pytest.raises(InputError, match="plane.ac .*checksum"):
         build(packages, out, catalogue)
@@ -181,3 +172,39 @@ def test_the_weights_name_every_model_that_they_were_trained_on():
         assert f"**{work.author}**: " in text and " ".join((work.title or name.replace("_", " ")).split()) in text
         assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
     assert f"]({ATTRIBUTION.name})" in (ATTRIBUTION.parent / "MODEL_CARD.md").read_text(encoding="utf-8")
+
+
+with (TOOLS / "concepts.csv").open(newline="") as _file:
+    ROWS = list(csv.DictReader(_file))
+SIDE_OF = {row["name"]: row["side"] for row in ROWS}
+
+
+def test_no_name_is_listed_twice_and_every_side_is_known():
+    assert len(SIDE_OF) == len(ROWS)
+    assert set(SIDE_OF.values()) == {"training", "validation", "evaluation"}
+    assert all(row["name"] and row["concept"] for row in ROWS)
+
+
+def test_no_concept_is_on_two_sides():
+    side_of_concept = {row["concept"]: row["side"] for row in ROWS}
+    assert [row for row in ROWS if row["side"] != side_of_concept[row["concept"]]] == []
+
+
+def test_every_category_is_listed_on_its_side():
+    samples = [path.parent.name for path in (REPOSITORY / "data_samples").glob("*/frame_annotations.jgz")]
+    reserved = "armchair bench bicycle bus car chair motorcycle scooter sofa stool toilet truck van washbasin aircraft"
+    named = {
+        "training": [*TRAINING, *CATALOGUES["training"]],
+        "validation": [*VALIDATION, *CATALOGUES["validation"]],
+        "evaluation": [*CATEGORIES, *samples, *CATALOGUES["artists"], *CATALOGUES["samples"], *reserved.split()],
+    }
+    for side, names in named.items():
+        assert {name: SIDE_OF.get(name) for name in names} == dict.fromkeys(names, side)
+
+
+def test_no_model_for_training_has_the_name_of_an_evaluation_category():
+    reserved = {name for name, side in SIDE_OF.items() if side == "evaluation"}
+    fittings = {"toilet_brush", "toilet_paper_dispenser"}  # of a bathroom; no toilet
+    models = [model for side in ("training", "validation") for names in CATALOGUES[side].values() for model in names]
+    found = {model for model in models if reserved & {*model.split("_")}}
+    assert found == fittings

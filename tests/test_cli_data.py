@@ -1,13 +1,12 @@
 """The commands for data: their output, the files they write, and one line for bad input."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
-from test_importers import METRES, write_lists
+from test_importers import hairdryer_views, write_lists
 
 from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
@@ -16,7 +15,6 @@ from zsp_lite.data.frames import Frame, write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.importers import READERS
 from zsp_lite.importers.convert import ImportResult
-from zsp_lite.synthetic.export import make_sequence
 
 
 @pytest.fixture
@@ -50,13 +48,9 @@ def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
 def test_a_capture_is_imported(root, tmp_path, capsys):
     source = tmp_path / "scan"
     source.mkdir()
-    exact = make_sequence("hairdryer", 0, 8, 3, 64)[1]
-    frames = []
-    for number, view in enumerate(exact.views):
-        camera = replace(view.camera, t=view.camera.t * METRES)
-        mask = view.mask.astype(np.float32)
-        frames.append(Frame(view.rgb, (view.depth * METRES).astype(np.float32), mask, camera, f"{number:04d}"))
-        write_mask(tmp_path / f"masks/{number:04d}.png", mask)
+    frames = hairdryer_views()
+    for frame in frames:
+        write_mask(tmp_path / f"masks/{frame.name}.png", frame.mask)
     write_lists(source, frames)
     arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
     assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
@@ -110,22 +104,3 @@ def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):
     error = capsys.readouterr().err
     assert "(--box TOP,LEFT,HEIGHT,WIDTH)" in error and "(--masks DIR)" in error
     assert not (tmp_path / "mine").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["data"], "Missing command"),
-        (["data", "check", "/nowhere"], "does not exist"),
-        (["data", "labels", "/nowhere", "--root", "."], "holds no class_labels"),
-        (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
-        (["data", "import", "lists", "/nowhere", "--root", "x", "--category", "c", "--sequence", "s"], "rgb.txt"),
-        (["data", "import", "nerfstudio", "x", "--root", "x", "--category", "c", "--sequence", "s", "--depth-unit=2"],
-         "--depth-unit does not go with the format nerfstudio"),
-        (["data", "import", "lists", "x", "--root=x", "--category=c", "--sequence=s", "--box=1,1,9,9", "--masks=m"],
-         "--masks does not go with --box"),
-    ],
-)  # fmt: skip
-def test_bad_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
-    code, error = main(arguments), capsys.readouterr().err
-    assert code == 2 and message in error and len(error.strip().splitlines()) == 1

@@ -1,11 +1,10 @@
 import gzip
-import hashlib
 import json
 import os
 
 import numpy as np
 import pytest
-from co3d_folders import edit_json, sequence_data
+from co3d_folders import contents, edit_json, sequence_data
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
@@ -22,14 +21,6 @@ def root(tmp_path):
 
 def frames_file(root):
     return root / "chair" / "frame_annotations.jgz"
-
-
-def fingerprint(root):
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in root.rglob("*")
-        if path.is_file()
-    }
 
 
 def change_first_frame(root, **changes):
@@ -72,30 +63,12 @@ def test_written_data_is_read_back(tmp_path, intrinsics_format):
 def test_written_files_have_the_layout_of_co3d(root):
     names = {path.name for path in (root / "chair").iterdir()}
     assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
-    inside = {str(path.relative_to(root / "chair/a_1")) for path in (root / "chair/a_1").rglob("*.*")}
-    assert {
-        "images/frame000001.jpg",
-        "masks/frame000001.png",
-        "depths/frame000001.jpg.geometric.png",
-        "depth_masks/frame000001.png",
-        "pointcloud.ply",
-    } <= inside
+    for part in ("images/?.jpg", "masks/?.png", "depths/?.jpg.geometric.png", "depth_masks/?.png", "pointcloud.ply"):
+        assert (root / "chair/a_1" / part.replace("?", "frame000001")).is_file()
     entry = json.loads(gzip.decompress(frames_file(root).read_bytes()))[0]
     assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
     assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}  # v1 has no format
     assert "meta" not in entry
-
-
-def test_each_frame_has_its_own_format_of_intrinsics(tmp_path):
-    old, new = sequence_data("old", frames=1), sequence_data("new", frames=1)
-    write_co3d(tmp_path, "chair", [old], intrinsics_format=V1)
-    write_co3d(tmp_path, "chair", [new], intrinsics_format=V2)
-    dataset = Co3D(tmp_path)
-    for data in (old, new):
-        camera = dataset.load(dataset.frames("chair", data.name)[0]).camera
-        np.testing.assert_allclose(camera.focal_length, data.frames[0].camera.focal_length)
-    assert dataset.frames("chair", "new")[0].viewpoint.intrinsics_format == V2
-    assert "meta" in json.loads(gzip.decompress(frames_file(tmp_path).read_bytes()))[1]
 
 
 def test_writing_together_again_and_one_after_the_other_gives_the_same_bytes(tmp_path):
@@ -103,7 +76,7 @@ def test_writing_together_again_and_one_after_the_other_gives_the_same_bytes(tmp
         write_co3d(tmp_path / name, "chair", [sequence_data("b_2"), sequence_data("a_1")])
     for name in ("b_2", "a_1"):
         write_co3d(tmp_path / "apart", "chair", [sequence_data(name)])
-    assert fingerprint(tmp_path / "together") == fingerprint(tmp_path / "again") == fingerprint(tmp_path / "apart")
+    assert contents(tmp_path / "together") == contents(tmp_path / "again") == contents(tmp_path / "apart")
 
 
 def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):
@@ -155,7 +128,6 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     [
         (lambda frame: frame.pop("sequence_name"), r"frame_annotations\.jgz: .*missing required field `sequence_name`"),
         (lambda frame: frame.pop("image"), r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`"),
-        (lambda frame: frame["image"].pop("size"), r"frame 0 of b_2.*missing required field `size` - at `\$\.image`"),
         (lambda frame: frame["viewpoint"].pop("T"), r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`"),
         (lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]), r"got `null` - at `\$\.viewpoint\.T"),
         (lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"), "Invalid enum value 'pixels'"),
@@ -188,10 +160,6 @@ def test_unknown_folders_categories_sequences_and_frames_are_named(root):
             use("../chair")
     with pytest.raises(InputError, match="no frames of 'c_3'"):
         dataset.frames("chair", "c_3")
-    with pytest.raises(InputError, match="chair/c_3 has no point cloud"):
-        dataset.point_cloud("chair", "c_3")
-    with pytest.raises(InputError, match="chair/a_1 has no frame number 9"):
-        dataset.frame("chair", "a_1", 9)
 
 
 @pytest.mark.parametrize("path", ["../secret.jpg", "chair/../../secret.jpg", "ABSOLUTE", "link/secret.jpg"])
@@ -240,13 +208,7 @@ def test_missing_files_and_files_of_another_size_are_refused(root, part):
 
 
 def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
-    scores = {
-        "good": (2.0, 0.9),
-        "best": (1.3, 1.5),
-        "fair": (2.0, 0.31),
-        "blurred": (1.25, 2),
-        "sparse": (3, 0.3),
-    }
+    scores = {"good": (2.0, 0.9), "best": (1.3, 1.5), "fair": (2.0, 0.31), "blurred": (1.25, 2), "sparse": (3, 0.3)}
     write_co3d(tmp_path, "chair", [sequence_data(name, frames=1) for name in scores])
 
     def score(items):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from co3d_folders import random_camera, seeds
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from zsp_lite.data.cameras import Camera
@@ -40,7 +40,6 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
     np.testing.assert_array_equal(filled[holed > 0], plane[holed > 0])
 
 
-@settings(deadline=None)
 @given(seeds)
 def test_filled_depth_stays_between_the_known_depths(seed):
     rng = np.random.default_rng(seed)
@@ -77,7 +76,6 @@ def patch_depths_one_by_one(depth, grid):
             yield row, col, known[(len(known) - 1) // 4] if len(known) else None
 
 
-@settings(deadline=None)
 @given(seeds)
 def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     rng = np.random.default_rng(seed)
@@ -104,13 +102,6 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     np.testing.assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
     assert (same == known).all() and (measured[known] == points[known]).all() and (measured[1, 2] == 0).all()
-
-
-def test_at_a_silhouette_the_nearer_surface_wins():
-    depth = np.full((8, 8), 9, np.float32)
-    depth[:, :3] = 2  # three of eight columns see the object
-    points, _ = patch_points(depth, frontal((8, 8)), (1, 1))
-    assert points[0, 0, 2] == 2
 
 
 def test_patches_need_not_divide_the_image():

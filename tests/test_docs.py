@@ -1,4 +1,4 @@
-"""README.md, docs/, notebooks' text: links lead somewhere, names exist, commands parse, the README's code runs."""
+"""README.md, docs/, text and drawings of notebooks: links lead somewhere, names exist, commands parse, code runs."""
 
 import importlib.util
 import json
@@ -6,25 +6,29 @@ import re
 import runpy
 import shlex
 from pathlib import Path
+from xml.etree import ElementTree
 
 import click
+import nbformat
 import numpy as np
 import pytest
 
-from tools import command_line
+from tools import command_line, drawings
 from zsp_lite.cli.main import cli, main
 
 REPOSITORY = Path(__file__).parents[1]
+NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 PAGES = [
     REPOSITORY / "README.md",
     *sorted((REPOSITORY / "docs").rglob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
     REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
-    *sorted((REPOSITORY / "notebooks").glob("*.ipynb")),
+    *NOTEBOOKS,
     *sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb")),
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
+SVG = "{http://www.w3.org/2000/svg}"
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
@@ -229,3 +233,34 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     exec(second, names)
     assert names["pose"].confidence is not None and len(names["pose"].matches) > 10
     assert (tmp_path / "outputs/cups-python/report.html").is_file()
+
+
+@pytest.fixture(scope="module")
+def stored() -> dict[str, ElementTree.Element]:
+    return {path.stem: ElementTree.parse(path).getroot() for path in sorted(drawings.FOLDER.glob("*.svg"))}
+
+
+def test_the_stored_drawings_are_those_of_the_script():
+    assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
+    for name, draw in drawings.DRAWINGS.items():
+        assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
+
+
+def test_every_notebook_has_its_place_in_the_method(stored):
+    assert {path.stem[:2] for path in NOTEBOOKS} == set(drawings.HERE)
+    for number in drawings.HERE:
+        texts = ["".join(text.itertext()) for text in stored[f"here_{number}"].iter(f"{SVG}text")]
+        assert sum(words.startswith("you are here") for words in texts) == 1
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_opens_with_its_place_in_the_method(path):
+    title, picture = nbformat.read(path, as_version=4).cells[0].source.split("\n\n")[:2]
+    assert title.startswith("# ") and re.fullmatch(rf"!\[[^]]{{20,}}\]\(figures/here_{path.stem[:2]}\.svg\)", picture)
+
+
+def test_every_drawing_is_described_and_needs_nothing_from_elsewhere(stored):
+    for name, root in stored.items():
+        title, description = root.find(f"{SVG}title").text, root.find(f"{SVG}desc").text
+        assert len(title) > 3 and len(description) > 60, name
+        assert not {f"{SVG}image", f"{SVG}use", f"{SVG}style"} & {element.tag for element in root.iter()}, name

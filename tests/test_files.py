@@ -1,10 +1,11 @@
-"""Limits on files, and one table of bad files: each is refused by one line that names it."""
+"""Files: limits, one table of bad files, each refused by one line that names it, PLY files, one writer per folder."""
 
 import gzip
 import io
-import json
 import os
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
@@ -15,20 +16,19 @@ from co3d_folders import sequence_data
 from safetensors.torch import save
 
 from zsp_lite.backbones.checkpoints import read_checkpoint
+from zsp_lite.cli.main import main
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import read_depth, read_image, read_mask
-from zsp_lite.data.labels import parse_label
-from zsp_lite.data.pairs import parse_published_pairs, read_published_pairs
+from zsp_lite.data.pairs import parse_published_pairs
 from zsp_lite.errors import InputError
-from zsp_lite.importers import READERS
 from zsp_lite.io import images
 from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_name, read_bytes
-from zsp_lite.io.ply import read_ply
+from zsp_lite.io.locks import writing
+from zsp_lite.io.ply import read_ply, write_ply
 
 PICTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
 JPEG, PNG = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png"))
-LABEL = {"trans": np.eye(4).tolist(), "seq": "b", "reference_seq": "a"}
 FRAME = b'{"sequence_name": "a", "frame_number": %d}'
 PLY = "ply\nformat %s 1.0\nelement vertex %d\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
 
@@ -57,20 +57,8 @@ def _ply(count, body: bytes, kind="binary_little_endian") -> bytes:
     return (PLY % (kind, count)).encode() + body
 
 
-def _label(**changes) -> bytes:
-    return json.dumps(LABEL | changes).encode()
-
-
 def _pairs(path):
     return parse_published_pairs(path.read_bytes(), path)
-
-
-def _read_label(path):
-    return parse_label(path.read_bytes(), path)
-
-
-def _capture(path):
-    return READERS["nerfstudio"](path.parent)
 
 
 # Name of the file, its reader, what is wrong with it, its content, part of the message.
@@ -85,27 +73,18 @@ BAD_FILES = [
     ("x.png", read_image, "huge", _huge_png(), "expected at most 67108864 pixels, not 30000 x 30000"),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
     ("frame_annotations.jgz", read_frame_index, "empty", b"", "Input data was truncated"),
-    ("frame_annotations.jgz", read_frame_index, "no gzip", b"text", "not complete gzip data"),
     ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "not complete gzip data"),
     ("frame_annotations.jgz", read_frame_index, "bytes behind", gzip.compress(b"[]") + b"x", "not complete gzip data"),
     ("frame_annotations.jgz", read_frame_index, "bomb", gzip.compress(bytes(GROWTH_ALLOWED + 1), 1), "grow to more"),
     ("frame_annotations.jgz", read_frame_index, "no JSON", gzip.compress(b"[{]"), "JSON is malformed"),
     ("frame_annotations.jgz", read_frame_index, "nested", gzip.compress(b"[" * 100_000), "annotations"),
-    ("frame_annotations.jgz", read_frame_index, "not UTF-8", gzip.compress(b'["\xff"]'), "annotations"),
     ("frame_annotations.jgz", read_frame_index, "another structure", gzip.compress(b"[1, 2]"), "Expected `object`"),
     ("frame_annotations.jgz", read_frame_index, "a frame twice",
      gzip.compress(b"[" + FRAME % 1 + b"," + FRAME % 1 + b"]"), "entries 0 and 1 are both frame 1 of a"),
-    ("b.json", _read_label, "scaled", _label(trans=np.diag([2.0, 2, 2, 1]).tolist()), "expected a rigid transform"),
-    ("b.json", _read_label, "of 1e300", _label(trans=(1e300 * np.eye(4)).tolist()), "trans holds 1e\\+300"),
-    ("b.json", _read_label, "of null", _label(trans=None), "Expected `array`, got `null` - at `\\$.trans`"),
-    ("b.json", _read_label, "a list", b"[]", "Expected `object`, got `array`"),
     ("x.ply", read_ply, "empty", b"", "is not a complete PLY file"),
-    ("x.ply", read_ply, "text", b"text", "is not a complete PLY file"),
-    ("x.ply", read_ply, "part of the header", _ply(1, bytes(12))[:60], "is not a complete PLY file"),
     ("x.ply", read_ply, "cut", _ply(3, bytes(35)), "is not a complete PLY file"),
     ("x.ply", read_ply, "too long", _ply(3, bytes(37)), "is not a complete PLY file"),
     ("x.ply", read_ply, "10^12 points", _ply(10**12, bytes(36)), "is not a complete PLY file"),
-    ("x.ply", read_ply, "a word", _ply(1, b"0 0 red\n", "ascii"), "is not a complete PLY file"),
     ("x.ply", read_ply, "no points", _ply(0, b""), "is not a complete PLY file"),
     ("x.ply", read_ply, "not finite", _ply(1, np.float32([0, np.nan, 0]).tobytes()), "expected finite numbers"),
     ("x.pth", read_checkpoint, "empty", b"", "damaged, or contains more than tensors"),
@@ -118,14 +97,11 @@ BAD_FILES = [
     ("cup.pt", _pairs, "code", _torch([Code()]), "damaged, or contains more than tensors"),
     ("cup.pt", _pairs, "a dictionary", _torch({}), "Expected `array`, got `object`"),
     ("cup.pt", _pairs, "another structure", _torch([{}]), "missing required field `class` - at"),
-    ("transforms.json", _capture, "no frames", b"{}", "missing required field `frames`"),
-    ("transforms.json", _capture, "nested", b"[" * 100_000, "transforms.json"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "name, read, data, message",
-    [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES],
+    "name, read, data, message", [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES]
 )
 def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, name, read, data, message):
     monkeypatch.chdir(tmp_path)
@@ -205,25 +181,92 @@ def test_a_long_message_keeps_its_beginning_and_end():
     assert len(message) < 1000 and message.startswith("begin") and message.endswith("end")
 
 
+POINTS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+COLOURS = np.random.default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
+COLOURS[0] = 0, 128, 255
+
+
+def ply(encoding="binary_little_endian", colours=None, kind="uchar", comment="made here"):
+    """A PLY file of `POINTS`, and of `colours` stored as the PLY type `kind`."""
+    order = ">" if encoding == "binary_big_endian" else "<"
+    code = {"uchar": "u1", "int": "i4", "ushort": "u2", "float": "f4", "double": "f8"}[kind]
+    columns = [(name, f"{order}f4") for name in "xyz"]
+    columns += [(name, order + code) for name in ("red", "green", "blue") if colours is not None]
+    table = np.zeros(len(POINTS), columns)
+    values = POINTS if colours is None else np.concatenate([POINTS.astype(np.float64), colours], axis=1)
+    for (name, _), column in zip(columns, values.T, strict=True):
+        table[name] = column
+    header = f"ply\nformat {encoding} 1.0\ncomment {comment}\nelement vertex {len(table)}\n"
+    header += "".join(f"property {'float' if name in 'xyz' else kind} {name}\n" for name, _ in columns)
+    header += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    text = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
+    return header.encode() + (text.encode() if encoding == "ascii" else table.tobytes())
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cloud.ply"
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_positions_are_read_in_every_encoding(path, encoding):
+    path.write_bytes(ply(encoding))
+    points, colours = read_ply(path)
+    np.testing.assert_array_equal(points, POINTS)
+    assert points.dtype == np.float64 and colours is None
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
 @pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"target_seq_name": "a"}, "a is compared with 1 targets of a"),
-        (
-            {"all_target_id": [3, 4]},
-            "2 targets of b, expected another .*, and as many targets as the name of the folder",
-        ),
-        ({"reference_frame_id": True}, "Expected `int`, got `bool`"),
-    ],
+    ("kind", "scale"),
+    [("uchar", 1), ("int", 1), ("ushort", 257), ("float", 1 / 255), ("float", 1), ("double", 1 / 255), ("double", 1)],
 )
-def test_a_pair_that_cannot_be_evaluated_as_its_set_says_is_refused(tmp_path, change, message):
-    write_co3d(tmp_path, "cup", [sequence_data("a", 3), sequence_data("b", 3)])
-    pair = {"class": "cup", "reference_seq_name": "a", "reference_frame_id": 0, "target_seq_name": "b",
-            "all_target_id": [3]}  # fmt: skip
-    path = tmp_path / "determ_eval/1samples_1tgt/cup.pt"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(_torch([pair]))
-    assert read_published_pairs(path, Co3D(tmp_path))[0].target_frames == (0,)
-    path.write_bytes(_torch([pair | change]))
-    with pytest.raises(InputError, match=message):
-        read_published_pairs(path, Co3D(tmp_path))
+def test_colours_of_every_type_and_range_are_read_as_8_bit(path, encoding, kind, scale):
+    path.write_bytes(ply(encoding, COLOURS * np.float64(scale), kind))
+    colours = read_ply(path)[1]
+    assert colours.dtype == np.uint8
+    np.testing.assert_array_equal(colours, COLOURS)
+
+
+def test_written_data_is_read_back(path):
+    write_ply(path, POINTS, COLOURS, POINTS)
+    np.testing.assert_array_equal(read_ply(path)[0], POINTS)
+    np.testing.assert_array_equal(read_ply(path)[1], COLOURS)
+    with pytest.raises(InputError, match="expected finite"):
+        write_ply(path, np.full((5, 3), np.nan), COLOURS)
+
+
+_HOLD = "import sys; from zsp_lite.io.locks import writing\nwith writing(sys.argv[1]): print(1, flush=True); input()"
+
+
+def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    writer = subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path / "cup")], **pipes)
+    assert writer.stdout.readline()
+    with pytest.raises(InputError, match="cup: another process is writing to it"):
+        write_co3d(tmp_path, "cup", [sequence_data("a", 2)])
+    writer.kill()
+    writer.wait()
+    write_co3d(tmp_path, "cup", [sequence_data("a", 2)])
+    assert len(Co3D(tmp_path).frames("cup", "a")) == 2
+    assert not list((tmp_path / "cup").glob(".*"))
+
+
+def test_a_command_that_writes_a_folder_is_refused_beside_another_writer(tmp_path, capsys):
+    with writing(tmp_path / "out"):
+        assert main(["synth", "--category", "chair", "--out", str(tmp_path / "out")]) == 2
+    assert "another process is writing to it" in capsys.readouterr().err
+
+
+def test_a_folder_is_free_after_an_error(tmp_path):
+    with pytest.raises(ZeroDivisionError), writing(tmp_path):
+        raise ZeroDivisionError
+    with writing(tmp_path), pytest.raises(InputError, match="another process"), writing(tmp_path):
+        pass
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="folder .*file/new cannot be made: not a directory, expected a folder"):
+        with writing(tmp_path / "file/new"):
+            pass

@@ -21,8 +21,7 @@ from zsp_lite.synthetic.sequences import render_sequence
 METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 
-@pytest.fixture(scope="module")
-def views():
+def hairdryer_views():
     """Eight views around a hairdryer, in metres."""
     shape = make_object("hairdryer", 0, 4)
     rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
@@ -32,6 +31,11 @@ def views():
         depth = (view.depth * METRES).astype(np.float32)
         frames.append(Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}"))
     return frames
+
+
+@pytest.fixture(scope="module")
+def views():
+    return hairdryer_views()
 
 
 def to_world(frame):
@@ -88,15 +92,6 @@ def scan(tmp_path, views):
     return READERS["nerfstudio"](tmp_path / "scan")
 
 
-def test_every_format_gives_the_true_cameras(capture, views):
-    assert len(capture) == len(views)
-    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.1 + views[0].camera.to_world(np.array([0, 0, 1.0]))
-    for captured, view in zip(capture, views):
-        (pixels, depth), (expected, expected_depth) = captured.camera.project(points), view.camera.project(points)
-        np.testing.assert_allclose(pixels, expected, atol=2e-3)
-        np.testing.assert_allclose(depth, expected_depth, atol=1e-5)
-
-
 def test_every_format_gives_the_true_depth_in_metres(capture, views):
     for captured, view in zip(capture, views):
         frame = captured.load()
@@ -112,6 +107,8 @@ def test_every_format_gives_the_true_depth_in_metres(capture, views):
 def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
     done = import_capture(scan, tmp_path / "data", "teapot", "mine", max_frames=6)
     dataset = Co3D(tmp_path / "data")
+    (check,) = check_folder(tmp_path / "data", deep=True)
+    assert not check.problems and check.complete == 1
     points, _ = dataset.point_cloud("teapot", "mine")
     assert done.frames == 6 and done.points == len(points) > 500
     assert points.std(axis=0).mean() == pytest.approx(1, rel=1e-3)
@@ -127,31 +124,16 @@ def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
         np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
 
 
-def test_an_imported_capture_is_complete_in_the_check(tmp_path, scan):
-    import_capture(scan, tmp_path / "data", "teapot", "mine")
-    (check,) = check_folder(tmp_path / "data", deep=True)
-    assert not check.problems and check.complete == 1
-
-
 def test_distortion_is_corrected(tmp_path, views):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
-    content = json.loads((folder / "transforms.json").read_text()) | {
-        "k1": 0.12,
-        "k2": -0.03,
-        "p1": 0.002,
-        "p2": -0.001,
-        "k3": 0.02,
-    }
-    (folder / "transforms.json").write_text(json.dumps(content))
+    names, coefficients = ("k1", "k2", "p1", "p2", "k3"), np.array([0.12, -0.03, 0.002, -0.001, 2.0])
+    edited(lambda content: content.update(zip(names, coefficients)))(folder)
     # A distorted image of a grid of dots, projected by OpenCV.
     view, camera = views[0], views[0].camera
     height, width = camera.size
-    wanted = (
-        np.stack(np.meshgrid(np.arange(20, width - 20, 12), np.arange(20, height - 20, 12)), -1).reshape(-1, 2) + 0.5
-    )
+    wanted = np.mgrid[20 : width - 20 : 12, 20 : height - 20 : 12].reshape(2, -1).T + 0.5
     rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
-    coefficients = np.array([0.12, -0.03, 0.002, -0.001, 0.02])
     matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     stored, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
     picture = np.zeros((height, width, 3), np.float32)
@@ -165,18 +147,6 @@ def test_distortion_is_corrected(tmp_path, views):
         patch = loaded[top : top + 9, left : left + 9]
         rows, columns = np.mgrid[top : top + 9, left : left + 9] + 0.5
         assert np.hypot((patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y) < 0.35
-
-
-def test_a_box_in_the_first_picture_finds_the_object_in_all(views):
-    top, left = np.argwhere(views[0].mask > 0).min(0)
-    bottom, right = np.argwhere(views[0].mask > 0).max(0) + 1
-    box = int(top) - 2, int(left) - 2, int(bottom - top) + 4, int(right - left) + 4
-    found = masks_from_box([replace(view, mask=None) for view in views], box)
-    overlaps = [
-        ((one.mask > 0.5) & (view.mask > 0.5)).sum() / ((one.mask > 0.5) | (view.mask > 0.5)).sum()
-        for one, view in zip(found, views)
-    ]
-    assert np.median(overlaps) > 0.75 and min(overlaps) > 0.4, overlaps
 
 
 def test_masks_come_from_files_by_name(tmp_path, views):
@@ -223,22 +193,16 @@ def edited(change):
 @pytest.mark.parametrize(
     ("kind", "damage", "message"),
     [
-        ("nerfstudio", break_file("transforms.json", "{}"), "missing required field `frames`"),
         ("nerfstudio", edited(lambda c: c.update(camera_model="OPENCV_FISHEYE")), "camera_model is 'OPENCV_FISHEYE'"),
         ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: Object missing required field `fl_x`"),
         ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
         ("nerfstudio", edited(lambda c: c["frames"][2].update(file_path="../a.jpg")), "leads out of the data folder"),
         ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
-        ("nerfstudio", edited(lambda c: c.update(depth_unit_scale_factor=-1)), "depth_unit_scale_factor"),
         ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)), "frame 1: pose is"),
         ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
-        ("nerfstudio", edited(lambda c: c["frames"][3].update(k4=-0.01)), "frame 3: .* with k4 = -0.01"),
         ("lists", break_file("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
-        ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][3].__setitem__(0, 1.0)), "frame 1: pose is"),
         ("lists", break_file("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "expected a finite rigid"),
-        ("lists", break_file("poses.txt", 8 * "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1\n"), "line 1: pose is"),
         ("lists", break_file("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
-        ("lists", break_file("intrinsics.txt", "1 2 x\n"), "intrinsics.txt: '1 2 x', expected 3 finite numbers"),
     ],
 )
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
@@ -284,18 +248,13 @@ def test_a_surface_that_one_of_many_frames_saw_is_left_out(views):
     assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()
 
 
-def test_frames_without_overlap_cannot_be_fused(views):
-    apart = [replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])]
-    with pytest.raises(InputError, match="expected overlapping depth maps"):
-        fuse(apart)
-
-
-def test_bad_boxes_and_empty_depth_are_refused(views):
+def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
     with pytest.raises(InputError, match="expected one inside"):
         masks_from_box(views, (0, 0, 5, 9999))
-    blind = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
     with pytest.raises(InputError, match="no known depth on the object"):
-        fuse(blind)
+        fuse([replace(view, depth=np.zeros_like(view.depth)) for view in views])
+    with pytest.raises(InputError, match="expected overlapping depth maps"):
+        fuse([replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])])
 
 
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
@@ -307,19 +266,3 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
     with pytest.raises(InputError, match="mine exists already, expected another sequence name"):
         import_capture(capture, tmp_path / "data", "teapot", "mine")
-
-
-def test_an_interrupted_import_can_be_repeated(tmp_path, scan, views, monkeypatch):
-    data = tmp_path / "data"
-
-    def full(*_):
-        raise OSError("no space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("zsp_lite.data.co3d.write_ply", full)
-        with pytest.raises(OSError, match="no space"):
-            import_capture(scan, data, "teapot", "mine")
-    assert not (data / "teapot" / "sequence_annotations.jgz").exists()
-    import_capture(scan, data, "teapot", "mine")
-    assert len(Co3D(data).frames("teapot", "mine")) == len(views)
-    assert not [path for path in (data / "teapot" / "mine").iterdir() if path.name.startswith(".")]

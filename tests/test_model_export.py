@@ -116,22 +116,6 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
     assert rotation == [-1, 0, 0, 0, -1, 0, 0, 0, 1]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (["--models", "MODELS", "--preset", "paper"], "or --models"),
-        (["--models", "MODELS", "--front", "+y"], "front is +y and up is +y, expected perpendicular axes"),
-        (["--models", "nowhere"], "does not exist"),
-        (["--category", "mouse", "--up", "+z"], "--up does not go with --category"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(tmp_path, capsys, wrong, message):
-    write_wedge(tmp_path / "chair" / "a.obj")
-    given = [str(tmp_path) if one == "MODELS" else one for one in wrong]
-    assert cli.main(["synth", *given, "--out", str(tmp_path / "out")]) == 2
-    assert message in capsys.readouterr().err
-
-
 def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects(tmp_path):
     (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL)
     exec(code, names := {})

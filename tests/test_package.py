@@ -1,14 +1,22 @@
-"""The package's public names, and the examples in its docstrings."""
+"""The package: public names, files, the wheel and its use without the repository, where samples are made."""
 
+import os
+import re
+import shutil
 import subprocess
 import sys
-import tomllib
+import zipfile
+from email.parser import Parser
 from pathlib import Path
 
 import pytest
 
 import zsp_lite
+from zsp_lite import samples
+from zsp_lite.errors import InputError
 
+REPOSITORY = Path(__file__).parents[1]
+FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
 # Attributes of modules and classes that users and outside checks rely on, besides the package's own names.
 PROMISED = """
     vit.VisionTransformer features.log_bin matching.similarity matching.cyclical_distances alignment.umeyama
@@ -33,11 +41,76 @@ def test_the_bare_import_does_not_import_torch():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_every_data_file_of_the_package_is_installed():
-    """Weights, templates, scripts of widgets, and `py.typed`, by which type checkers read the annotations."""
-    package = Path(zsp_lite.__file__).parent
-    settings = tomllib.loads((package.parent / "pyproject.toml").read_text(encoding="utf-8"))
-    patterns = settings["tool"]["setuptools"]["package-data"]["zsp_lite"]
-    installed = {path for pattern in patterns for path in package.glob(pattern) if path.is_file()}
-    files = {path for path in package.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
-    assert package / "py.typed" in files and files == installed
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built from a copy of the repository."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    for folder in ("zsp_lite", "data_samples/class_labels", "notebooks/results"):
+        shutil.copytree(REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in FILES:
+        shutil.copy(REPOSITORY / name, source)
+    code = f"from setuptools import build_meta as b; b.build_wheel({str(out)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
+    (path,) = out.glob("zsp_lite-*.whl")
+    return path
+
+
+def test_the_wheel_has_the_package_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        metadata = next(name for name in names if name.endswith(".dist-info/METADATA"))
+        fields = Parser().parsestr(archive.read(metadata).decode())
+    assert {name.split("/")[0] for name in names} == {"zsp_lite", metadata.split("/")[0]}
+    files = [path for path in (REPOSITORY / "zsp_lite").rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    assert {path.relative_to(REPOSITORY).as_posix() for path in files} <= set(names)
+    assert fields["Name"] == "zsp-lite" and fields["License-Expression"] == "MIT"
+    assert wheel.stat().st_size < 14e6
+
+
+@pytest.mark.slow
+def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
+    """README's first example and the demo, with nothing of the repository on the path; a second call makes nothing."""
+    site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
+    empty.mkdir()
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([*install, str(wheel)], check=True)
+    (example, *_) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    code = (
+        f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n{example}\nassert len(targets) == 5\n"
+        "from zsp_lite.cli.main import main\n"
+        "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny', '--solver', 'paper']))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(site), "ZSP_LITE_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    environment.pop("ZSP_LITE_DATA", None)
+    run = subprocess.run([sys.executable, "-P", "-c", code], cwd=empty, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count("making synthetic samples") == 1
+    assert "Photographed motorcycle" in run.stdout and (empty / "outputs/demo/report.html").is_file()
+    assert [path.name for path in cache.iterdir()] == ["samples"]
+
+
+def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_path, monkeypatch):
+    monkeypatch.setattr(samples, "REPOSITORY", tmp_path / "nowhere")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
+    calls = []
+
+    def export(preset, out):
+        calls.append((preset, sorted(path.name for path in out.glob("made *"))))
+        (out / f"made {len(calls)}").touch()
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("zsp_lite.synthetic.export.export_preset", export)
+    with pytest.raises(KeyboardInterrupt):
+        samples.sample_data()
+    made = tmp_path / "cache" / "samples"
+    assert not made.exists()
+    for _ in range(2):  # the second time they are there
+        assert samples.sample_data() == made
+        assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
+        assert calls == [("demo", []), ("demo", ["made 1"])]
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
+    with pytest.raises(InputError, match="set ZSP_LITE_CACHE to a folder that can be written"):
+        samples.sample_data()

@@ -148,17 +148,19 @@ def test_a_folders_own_pairs_are_found_in_both_layouts(tmp_path, place):
     ("changes", "message"),
     [
         ({"reference_frame_id": 48}, "frame id 48 is not of s1, expected a position in the list of 48 frames"),
-        ({"reference_frame_id": -1}, "frame id -1"),
         ({"reference_frame_id": "3"}, "Expected `int`, got `str` - at `..0..reference_frame_id`"),
         ({"all_target_id": []}, "all_target_id"),
-        ({"all_target_id": 3}, "all_target_id"),
-        ({"all_target_id": torch.tensor(3)}, "all_target_id"),
         ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
         ({"target_seq_name": "s3"}, "is not of s3"),
         ({"class": "sofa"}, "category is 'sofa'"),
+        ({"reference_frame_id": True}, "Expected `int`, got `bool`"),
+        ({"target_seq_name": "s1", "all_target_id": [0, 1, 2]}, "s1 is compared with 3 targets of s1"),
+        ({"all_target_id": [0, 1]}, "as many targets as the name of the folder"),
     ],
 )
 def test_ids_of_other_data_are_refused(dataset, tmp_path, changes, message):
-    path = save(tmp_path / "chair.pt", [item(dataset, **changes)])
+    path = pairs_path(tmp_path, "chair", 1, 3)
+    path.parent.mkdir(parents=True)
+    save(path, [item(dataset, **changes)])
     with pytest.raises(InputError, match=message):
         read_published_pairs(path, dataset)

@@ -1,14 +1,26 @@
-"""The photograph of a motorcycle: depth, mask, directions, and where it comes from."""
+"""The photograph of a motorcycle: depth, mask, directions; and the demo with a rendered stand-in of known pose."""
+
+import json
 
 import numpy as np
 import pytest
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 
-from zsp_lite.data import photograph
+from zsp_lite.cli.demo import MODELS_NOTE
+from zsp_lite.cli.main import main
+from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.geometry import fit_plane
-from zsp_lite.data.photograph import motorcycle_frame
+from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, motorcycle_frame, motorcycle_photograph
+from zsp_lite.errors import InputError
+from zsp_lite.metrics import rotation_error
 from zsp_lite.points import axis_deviation, object_points
+from zsp_lite.viz.photograph import PHOTOGRAPH_CREDIT, photograph_figure, run_photograph
+from zsp_lite.viz.report import render_page
 
+pytestmark = pytest.mark.slow
+
+CANONICAL = look_at((1, 0.5, 0.2)).R  # front, left and up of the object, in the coordinates of `synthetic_views`
 CLEAR_OF_THE_FLOOR = np.s_[450:, :]  # the motorcycle does not reach the lowest rows
 
 
@@ -26,16 +38,6 @@ def frame():
     return motorcycle_frame(rgb, disparity)
 
 
-def test_the_mask_is_one_object_of_the_size_of_a_motorcycle(frame):
-    on = frame.mask > 0
-    points = unproject_depth(frame.depth, frame.camera)[on]
-    assert 0.23 < on.mean() < 0.28 and (frame.depth[on] > 0).all()
-    length, height = np.ptp(points, axis=0)[:2]
-    assert 1.2 < length < 2.2 and 0.7 < height < 1.2  # metres
-    rows, cols = np.nonzero(on)
-    assert 0 < cols.min() and cols.max() < 740 and 0 < rows.min() and rows.max() < 499
-
-
 def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_bench(frame):
     seat, rear_tyre, front_tyre, floor, bench = (240, 230), (320, 135), (370, 675), (470, 300), (160, 100)
     assert [frame.mask[pixel] for pixel in (seat, rear_tyre, front_tyre, floor, bench)] == [1, 1, 1, 0, 0]
@@ -44,12 +46,12 @@ def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_b
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
     floor = frame.depth[CLEAR_OF_THE_FLOOR] > 0
     normal, _ = fit_plane(unproject_depth(frame.depth, frame.camera)[CLEAR_OF_THE_FLOOR][floor], 0.01)
-    assert angle(-np.sign(normal[1]) * normal, photograph.PHOTOGRAPH_UP) < 2
-    assert abs(angle(photograph.PHOTOGRAPH_FRONT, photograph.PHOTOGRAPH_UP) - 90) < 1
+    assert angle(-np.sign(normal[1]) * normal, PHOTOGRAPH_UP) < 2
+    assert abs(angle(PHOTOGRAPH_FRONT, PHOTOGRAPH_UP) - 90) < 1
 
 
 def test_the_photograph_is_scaled_as_scenes_of_co3d_and_is_the_same_at_every_call(frame):
-    first, second = photograph.motorcycle_photograph(), photograph.motorcycle_photograph()
+    first, second = motorcycle_photograph(), motorcycle_photograph()
     assert axis_deviation(object_points(first)) == pytest.approx(1, abs=1e-4)
     unit = axis_deviation(object_points(frame))
     assert unit == pytest.approx(0.22, abs=0.005)  # metres, as the documentation says
@@ -70,16 +72,91 @@ def test_depth_follows_from_the_disparity_by_the_calibration(frame):
     assert unknown.any() and (frame.depth[unknown] == 0).all()
 
 
-def test_a_plane_is_found_among_outliers():
+@pytest.fixture(scope="module")
+def motorcycles(tmp_path_factory):
+    """A synthetic category "motorcycle" with two sequences, elsewhere in their world, and their object poses."""
+    root, sequences, poses = tmp_path_factory.mktemp("motorcycles"), [], {}
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 3))
+    for name in ("second", "first"):
+        frames, colours = around(ELSEWHERE), np.full((400, 3), 128, np.uint8)
+        sequences.append(SequenceData(name, frames, list(range(7)), ELSEWHERE.apply(points), colours))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = ELSEWHERE.R @ CANONICAL, ELSEWHERE.t
+        poses[name] = {"trans": pose.tolist(), "scale": ELSEWHERE.scale, "low": [-1.0] * 3, "high": [1.0] * 3}
+    write_co3d(root, "motorcycle", sequences, quality=98)
+    (root / "motorcycle" / "object_poses.json").write_text(json.dumps(poses))
+    (root / "rendered_models.json").write_text("{}")
+    return Co3D(root)
+
+
+@pytest.fixture(scope="module")
+def photograph():
+    return render(look_at((-0.7, 1, 0.35)), AT_HOME, "photograph")
+
+
+@pytest.fixture(scope="module")
+def results(motorcycles, photograph):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
+        return list(run_photograph(motorcycles, CoordinateBackbone()))
+
+
+def test_with_perfect_features_the_directions_are_those_of_the_object(results, photograph):
+    truth = photograph.camera.R @ CANONICAL
+    for result in results:
+        relative = result.estimate.target_camera.R @ ELSEWHERE.R @ photograph.camera.R.T
+        error = rotation_error(result.estimate.sim3.R, relative)
+        assert error < 12 and rotation_error(result.axes, truth) == pytest.approx(error, abs=1e-4)
+        by_eye = np.array([PHOTOGRAPH_FRONT, PHOTOGRAPH_UP])
+        cosines = (result.axes.T[[0, 2]] * by_eye).sum(axis=1) / np.linalg.norm(by_eye, axis=1)
+        assert np.cos(np.radians([result.front_error, result.up_error])) == pytest.approx(cosines, abs=1e-6)
+
+
+def test_the_aligned_cloud_lies_on_the_photographed_object(results, photograph):
     rng = np.random.default_rng(0)
-    normal, offset = np.array([0.6, 0, 0.8]), 2.0
-    points = rng.uniform(-3, 3, (3000, 3))
-    points[::2] += np.outer(offset - points[::2] @ normal, normal) + rng.normal(0, 0.002, (1500, 3))
-    found, found_offset = fit_plane(points, 0.01)
-    sign = np.sign(found @ normal)
-    assert angle(sign * found, normal) < 0.1 and sign * found_offset == pytest.approx(offset, abs=0.002)
+    expected = photograph.camera.to_camera(rng.uniform(-1, 1, (400, 3)))
+    for result in results:
+        assert np.linalg.norm(result.cloud - expected, axis=1).mean() < 0.3
+        front = expected @ (photograph.camera.R @ CANONICAL)[:, 0]
+        assert np.corrcoef(front, result.along)[0, 1] > 0.999
 
 
-def test_the_plane_of_collinear_points_contains_their_line():
-    normal, offset = fit_plane(np.arange(9.0)[:, None] * np.ones(3), 0.01)
-    assert np.linalg.norm(normal) == pytest.approx(1) and (normal.sum(), offset) == pytest.approx((0, 0), abs=1e-9)
+def test_the_sequence_may_be_given_and_must_exist(motorcycles, photograph, monkeypatch):
+    monkeypatch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
+    assert next(run_photograph(motorcycles, CoordinateBackbone(), "second")).sequence == "second"
+    with pytest.raises(InputError, match="third"):
+        next(run_photograph(motorcycles, CoordinateBackbone(), "third"))
+
+
+def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):
+    assert list(run_photograph(ellipsoids, CoordinateBackbone())) == []
+
+
+def test_the_figure_has_a_panel_per_result_beside_the_object_and_the_directions_by_eye(results):
+    figure = photograph_figure(results)
+    titles = [axis.get_title() for axis in figure.axes]
+    assert len(titles) == 6 and "first" in titles[0] and "by eye" in titles[3]
+    for title, result in zip((titles[1], titles[2], titles[4], titles[5]), results):
+        assert result.solver in title and f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off" in title
+    arrows = [[text.get_text() for text in axis.texts if text.get_text()] for axis in figure.axes]
+    assert arrows == [[], *[["front", "left", "up"]] * 5]
+
+
+def test_the_page_begins_with_the_photograph_and_credits_it(results):
+    page = render_page([], "backbone", photograph=results)
+    assert page.index("Which way does a real motorcycle stand?") < page.index("One pair of each category")
+    assert PHOTOGRAPH_CREDIT in page and "judged by eye" in page and "first" in page
+    assert "real motorcycle" not in render_page([], "backbone")
+
+
+def test_the_demo_begins_with_the_photograph(motorcycles, photograph, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: photograph)
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
+    monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
+    assert main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert text.index("Photographed motorcycle") < text.index("One pair per category")
+    assert text.count("│ verified ") == 2 and "own saliency" in text and MODELS_NOTE in " ".join(text.split())
+    assert "Which way does a real motorcycle stand?" in (tmp_path / "report.html").read_text()

@@ -5,18 +5,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from co3d_folders import contents
 
-from tools.synthetic import SPLITS, main
+from tools.synthetic import SPLITS
 from zsp_lite.alignment import umeyama
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import crop_to_object
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import export
 from zsp_lite.synthetic.assembly import make_shape, surface_spread
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.export import PRESETS, export_categories, make_sequence
-from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.recording import shape_turns
 from zsp_lite.synthetic.sensor import soft_mask
 from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep
@@ -43,10 +42,6 @@ def chairs():
     return [make_sequence("chair", index, FRAMES, SEED, SIZE) for index in range(2)]
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 # Categories
 
 
@@ -55,15 +50,6 @@ def test_the_categories_have_the_names_of_the_paper():
     assert set(PRESETS["demo"].categories) <= set(CATEGORIES)
     builders = [build for split in (*SPLITS.values(), CATEGORIES) for build in split.values()]
     assert len(set(builders)) == len(builders) == len(ALL)  # no category and no code is in two splits
-
-
-def test_the_tool_renders_the_categories_of_a_split(tmp_path, monkeypatch):
-    some = dict(list(SPLITS["validation"].items())[:2])
-    monkeypatch.setitem(SPLITS, "validation", some)
-    main(["validation", "--sequences", "1", "--frames", "1", "--out", str(tmp_path)])
-    made = Co3D(tmp_path)
-    assert sorted(made.categories()) == sorted(some)
-    assert all(len(made.sequences(category)) == 1 for category in some)
 
 
 @pytest.mark.parametrize("category", sorted(ALL))
@@ -77,15 +63,6 @@ def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_them
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
     turned = shapes[3].vertices * [-1, -1, 1]
     assert np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_the_patterns_of_materials_are_colours_and_depend_on_the_seed_alone(seed):
-    points = np.random.default_rng(0).normal(0, 1, (500, 3)).astype(np.float32)
-    for material, again in zip(random_materials(seed), random_materials(seed), strict=True):
-        colours = material.pattern(points)
-        assert colours.min() >= 0 and colours.max() <= 1 and np.ptp(colours, axis=0).max() > 0
-        assert (colours == again.pattern(points)).all() and material.roughness == again.roughness
 
 
 # Sequences
@@ -158,12 +135,7 @@ def test_an_export_reads_back(folder, chairs):
     data = chairs[0][0]
     for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
         frame = dataset.load(annotation)
-        np.testing.assert_allclose(frame.camera.matrix, wanted.camera.matrix, atol=1e-9)
-        np.testing.assert_allclose(frame.camera.K, wanted.camera.K, rtol=1e-9)
         np.testing.assert_allclose(frame.depth, wanted.depth, rtol=1e-3)
-        np.testing.assert_allclose(frame.mask, wanted.mask, atol=0.51 / 255)
-        assert np.abs(frame.rgb.astype(int) - wanted.rgb).mean() < 12  # JPEG
-        assert crop_to_object(frame).rgb.size < frame.rgb.size
 
 
 def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
@@ -185,15 +157,6 @@ def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
     assert np.array_equal(labels[data_a.name].trans, np.eye(4))
 
 
-def test_a_sequence_does_not_depend_on_the_rest_of_the_export(folder, tmp_path):
-    """An export of one category in two steps has the same bytes as in a full export."""
-    export_categories(["toytruck"], tmp_path, 1, FRAMES, SEED, SIZE)
-    export_categories(["toytruck"], tmp_path, 2, FRAMES, SEED, SIZE)
-    whole = {name: data for name, data in files(folder).items() if "toytruck" in name and "determ_eval" not in name}
-    part = {name: data for name, data in files(tmp_path).items() if "toytruck" in name}
-    assert part == whole and len(part) > 50
-
-
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):
     made = []
 
@@ -210,7 +173,7 @@ def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path
     export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
     assert made == [0, "interrupted", 1]
     export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
-    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 def test_bad_arguments_and_folders_with_other_settings_are_input_errors(folder, tmp_path):

@@ -183,6 +183,15 @@ def test_geometry_loss_counts_geometry_only_on_the_object():
     assert geometry_loss(torch.cat([geometry + 5, logit], -1), geometry, inside) > 1
 
 
+def test_the_mean_key_of_the_crops_is_subtracted(renders):
+    model = as_trainee(initial_backbone(renders, 24, 2, 2), 1, renders, 48)
+    batch = sample_batch(renders, np.random.default_rng(7), 4, VIEWS, 48, (0.85, 1.0))
+    with torch.no_grad():
+        keys = model(batch.images).keys
+    assert keys.mean((0, 1)).norm() > 0.1
+    torch.testing.assert_close(model.centred(keys).mean((0, 1)), torch.zeros(24), atol=1e-5, rtol=0)
+
+
 def test_a_few_steps_teach_a_network_where_the_object_is(renders):
     """The summed loss falls on the batch that is trained on, and its terms are those of the single functions."""
     torch.manual_seed(0)
@@ -203,12 +212,3 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
         loss.backward()
         optimiser.step()
     assert last["attention"] < 0.9 * figures["attention"] and last["loss"] < 0.9 * figures["loss"]
-
-
-def test_the_mean_key_of_the_crops_is_subtracted(renders):
-    model = as_trainee(initial_backbone(renders, 24, 2, 2), 1, renders, 48)
-    batch = sample_batch(renders, np.random.default_rng(7), 4, VIEWS, 48, (0.85, 1.0))
-    with torch.no_grad():
-        keys = model(batch.images).keys
-    assert keys.mean((0, 1)).norm() > 0.1
-    torch.testing.assert_close(model.centred(keys).mean((0, 1)), torch.zeros(24), atol=1e-5, rtol=0)

@@ -36,14 +36,8 @@ def oracle(vit: VisionTransformer, images: torch.Tensor):
     for index in range(DEPTH):
         w = {key.removeprefix(f"blocks.{index}."): value for key, value in weights.items()}
         attention = nn.MultiheadAttention(DIM, HEADS, batch_first=True)
-        attention.load_state_dict(
-            {
-                "in_proj_weight": w["attn.qkv.weight"],
-                "in_proj_bias": w["attn.qkv.bias"],
-                "out_proj.weight": w["attn.proj.weight"],
-                "out_proj.bias": w["attn.proj.bias"],
-            }
-        )
+        names = {"in_proj_": "attn.qkv.", "out_proj.": "attn.proj."}
+        attention.load_state_dict({f"{a}{kind}": w[b + kind] for a, b in names.items() for kind in ("weight", "bias")})
         normed = F.layer_norm(x, (DIM,), w["norm1.weight"], w["norm1.bias"], 1e-6)
         projections = F.linear(normed, w["attn.qkv.weight"], w["attn.qkv.bias"]).chunk(3, dim=-1)
         attended, probabilities = attention(normed, normed, normed, average_attn_weights=False)

@@ -6,18 +6,25 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from co3d_folders import sequence_data
 from safetensors.torch import save_file
+from test_importers import write_lists, write_nerfstudio
 
+from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.benchmark.own import read_poses
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import write_co3d
-from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.frames import read_depth, read_image, read_mask
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.pairs import shipped_pairs
+from zsp_lite.data.published import import_labels
+from zsp_lite.importers import READERS
 
 CASES: list["Case"] = []
 
@@ -28,14 +35,7 @@ class Wrong(Exception):
 
 @dataclass(frozen=True)
 class Case:
-    """A call with hostile input.
-
-    Attributes:
-        group: Its class, a line of the table.
-        name: What is hostile.
-        call: Called with the case's own copy of the folder of `prepare`. It must raise InputError, or return `REFUSED`
-            or `RIGHT`.
-    """
+    """A call with the case's own copy of the folder: it must raise InputError, or return `REFUSED` or `RIGHT`."""
 
     group: str
     name: str
@@ -76,7 +76,7 @@ def prepare(folder: Path) -> Path:
     """Write what the cases change, each in its own copy.
 
     data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame as lists and as
-    nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a small network.
+    nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a small network; poses.csv: one pose.
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
@@ -84,14 +84,8 @@ def prepare(folder: Path) -> Path:
         write_label(data, "cup", PoseLabel(np.eye(4), name, "a"))
     if main([*BENCHMARK, "--data", str(data), "--out", str(folder / "out"), "--quiet"]):
         raise Wrong("the benchmark of the prepared data failed")
-    capture = folder / "capture"
-    for part in ("rgb", "depth"):
-        (capture / part).mkdir(parents=True)
-    cv2.imwrite(str(capture / "rgb/0.png"), np.zeros((24, 32, 3), np.uint8))
-    cv2.imwrite(str(capture / "depth/0.png"), np.full((24, 32), 1000, np.uint16))
-    for name, text in LISTS.items():
-        (capture / name).write_text(text)
-    (capture / "transforms.json").write_text(json.dumps(NERFSTUDIO))
+    for write in (write_lists, write_nerfstudio):
+        write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
     y, x = np.mgrid[:64, :64]
     disc = (y - 32) ** 2 + (x - 32) ** 2 < 24**2
     depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
@@ -99,21 +93,43 @@ def prepare(folder: Path) -> Path:
         picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
         for end, image in (("", picture), ("_depth", depth), ("_mask", 255 * disc.astype(np.uint8))):
             cv2.imwrite(str(folder / f"{name}{end}.png"), image)
+    (folder / "poses.csv").write_text(POSES)
     save_file(VisionTransformer(32, 8, 64, 2, 1).state_dict(), folder / "x.safetensors", {"num_heads": "1"})
     return folder
 
 
-BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
-LISTS = {
-    "rgb.txt": "rgb/0.png\n",
-    "depth.txt": "depth/0.png\n",
-    "poses.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n",
-    "intrinsics.txt": "30 0 16\n0 30 12\n0 0 1\n",
-}
-NERFSTUDIO = {
-    "fl_x": 30, "cx": 16, "cy": 12, "w": 32, "h": 24,
-    "frames": [{"file_path": "rgb/0.png", "depth_file_path": "depth/0.png", "transform_matrix": np.eye(4).tolist()}],
+def read_frames(folder: Path):
+    data = Co3D(folder / "data")
+    return [data.load(frame) for frame in data.frames("cup", "a")]
+
+
+def read_capture(layout: str) -> Callable[[Path], object]:
+    return lambda folder: [frame.load() for frame in READERS[layout](folder / "capture")]
+
+
+FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
+PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/run.jsonl"
+# Every reader, with the file that it reads.
+READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "image": ("a.png", lambda folder: read_image(folder / "a.png")),
+    "mask": ("a_mask.png", lambda folder: read_mask(folder / "a_mask.png")),
+    "depth": ("a_depth.png", lambda folder: read_depth(folder / "a_depth.png")),
+    "frame annotations": (FRAMES, read_frames),
+    "sequence annotations": (SEQUENCES, lambda folder: Co3D(folder / "data").sequences("cup")),
+    "point cloud": ("data/cup/a/pointcloud.ply", lambda folder: Co3D(folder / "data").point_cloud("cup", "a")),
+    "label": (LABEL, lambda folder: read_labels(folder / "data", "cup")),
+    "pairs": (PAIRS, lambda folder: shipped_pairs(Co3D(folder / "data"), "cup", 2)),
+    "labels to import": ("new/class_labels/cup/c.json", lambda folder: import_labels(folder / "new", folder / "data")),
+    "checkpoint": ("x.pth", lambda folder: load_backbone(folder / "x.pth", "cpu")),
+    "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
+    "lists": ("capture/rgb.txt", read_capture("lists")),
+    "nerfstudio": ("capture/transforms.json", read_capture("nerfstudio")),
+    "poses": ("poses.csv", lambda folder: read_poses(folder / "poses.csv")),
 }  # fmt: skip
+BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
+POSES = """category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale
+cup,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
+"""
 
 
 def edited(name: str, change: Callable[[object], object]) -> Callable[[Path], object]:
