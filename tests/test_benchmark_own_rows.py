@@ -1,7 +1,6 @@
 """Methods of one's own: what they may be and may return, poses from a file, and how a row is told from another."""
 
 import csv
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,9 +18,9 @@ from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, description, resolve
 from zsp_lite.benchmark.own import kind_of, write_questions
-from zsp_lite.benchmark.problem import Answer, Problem, as_answer
+from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.benchmark.run import category_pairs
-from zsp_lite.benchmark.runs import LINES, read_lines, read_run
+from zsp_lite.benchmark.runs import read_lines, read_run
 from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
@@ -51,11 +50,12 @@ def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("thing", "told"),
     [
-        (3, "a int, which is no function"), (lambda: 0, r"a function of \(\)"), (lambda a, b, c, d: 0, "a, b, c, d"),
-        (lambda one, *, other: 0, r"a function of \(one, \*, other\)"), (ZeroShotPose, "a type, which is no function"),
-        (lambda *all: 0, r"a function of \(\*all\)"), ("benchmark_folder:FRAMES", "a int, which is no function"),
+        (3, "is of type int, expected"), (lambda: 0, r"a function of \(\)"), (lambda a, b, c, d: 0, "a, b, c, d"),
+        (lambda one, *, other: 0, r"a function of \(one, \*, other\)"), (ZeroShotPose, "is of type type, expected"),
+        (lambda *all: 0, r"a function of \(\*all\)"), ("benchmark_folder:FRAMES", "is of type int"),
         ("benchmark_folder:nothing", "has no attribute 'nothing'"), ("nowhere:nothing", "No module named 'nowhere'"),
-        ("./here.py:x", "cannot be imported"), ("nonesuch", "'nonesuch' is unknown"), ("no/such.csv", "no/such.csv"),
+        ("./here.py:x", "cannot be imported"), ("our-bv", "'our-bv' is unknown, close are ours-bv"),
+        ("no/such.csv", "no/such.csv"),
         ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"), ("", "''|no methods"),
     ],
 )  # fmt: skip
@@ -85,7 +85,7 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
     run_rows({"mine": own_method}, tmp_path)
     run_rows({"mine": own_method, "ours": "ours"}, tmp_path)
-    with pytest.raises(InputError, match="holds results with other methods of mine; choose another folder"):
+    with pytest.raises(InputError, match="methods of mine: .*:own_method, not .*<lambda>; choose"):
         run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
@@ -99,9 +99,9 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         found = evaluate_pair(pair, rows, store, read_labels(small_folder(), "lump"))["results"]
         counts = [len(exact(problem.frames()[0].rgb, target.rgb)[0]) for target in problem.frames()[1:]]
         one = found["exact"]
-        assert one["view"] == np.argmax(counts) and one["matches"] == one["inliers"] == max(counts) > 20
+        assert one["view"] == np.argmax(counts) and one["inliers"] == max(counts) > 20
         assert one["error"] < 0.1 and one["scale"] == pytest.approx(1, abs=1e-3) and one["translation"] < 1e-3
-        assert found["one score"]["view"] == 0 and found["one score"]["matches"] == counts[0]
+        assert found["one score"]["view"] == 0 and found["one score"]["inliers"] == counts[0]
 
 
 def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_path):
@@ -114,6 +114,8 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     assert [row["failed"] for row in found.values()] == [0, 1, 0]
     for name in ("none", "uneven"):
         assert read_run(tmp_path).row(name)["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
+    with pytest.raises(InputError, match="scores of matches are negative, expected 0 or more"):  # less than no match
+        run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)
 
 
 COLUMNS = "category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale"
@@ -144,6 +146,13 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
     with pytest.raises(InputError, match="other methods of exact"):
         run_rows([f"exact={rows['exact']}"], tmp_path / "run", 4, 3)
+    with pytest.raises(InputError, match="exact.csv has no pose for any of the 6 pairs"):
+        run_rows([f"exact={rows['exact']}"], tmp_path / "other", 6, 2, "pebble")
+    end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
+    second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
+    (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
+    with pytest.raises(InputError, match="two.csv: 2 target views of the pair lump/.*, expected one"):
+        run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
 
 
 RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
@@ -162,6 +171,7 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
         (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,first,')}", "line 2: .*first"),
         (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation is '0 0', expected 3"),
         (f"{COLUMNS}\nlump,a,0", "line 2: "),
+        (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
     ],
 )  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
@@ -243,31 +253,17 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 
-def test_an_answer_is_a_rotation_with_numbers_and_texts_as_details_or_the_pair_fails(tmp_path):
-    assert json.dumps(dict(as_answer(Answer(np.eye(3), details={"inliers": np.int64(3)})).details)) == '{"inliers": 3}'
+def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can_be_stored(tmp_path):
     rows = {
         "large": lambda problem: Answer(2 * np.eye(3)), "words": lambda problem: "north",
         "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]), "far view": lambda problem: (np.eye(3), 2),
-        "details": lambda problem: Answer(np.eye(3), details={"matches": np.arange(3)}),
     }  # fmt: skip
     assert all(row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values())
-    assert "detail matches of the row is a ndarray" in read_run(tmp_path).row("details")["failed"].iloc[0]
-
-
-def test_details_may_have_any_name_but_do_not_replace_what_is_measured(tmp_path):
-    details = {"error": -1, "view": 9, "seconds": "soon", "failed": "no", "scale": "x", "translation": 7, "mine": 1 / 3}
-    rows = {
-        "mine": lambda problem: Answer(np.eye(3), 1, details=details | {"inliers": 4}),
-        "bare": lambda problem: (np.eye(3), 1),
-    }
-    run_rows(rows, tmp_path)
-    mine, bare = (read_run(tmp_path).row(name).iloc[0] for name in rows)
-    for name in ("error", "view", "failed", "scale", "translation"):
-        assert mine[name] == bare[name] or np.isnan([mine[name], bare[name]]).all()
-    assert mine["inliers"] == 4 and '"mine":0.3333' in (tmp_path / LINES).read_text()
-    for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"text": "\udcff"}):
+    run_rows({"sure": lambda problem: Answer(np.eye(3), inliers=4, confidence=1 / 3)}, tmp_path)
+    assert read_run(tmp_path).row("sure")[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
+    for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}):
         with pytest.raises(InputError, match="run.jsonl cannot be written: "):
-            run_rows({"wrong": lambda problem, wrong=wrong: Answer(np.eye(3), details=wrong)}, tmp_path)
+            run_rows({"wrong": lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
         assert not [line for line in read_lines(tmp_path) if "wrong" in line.results]
 
 
@@ -302,8 +298,9 @@ def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_f
 
 
 def test_groups_are_made_of_rows_and_rows_of_known_features():
-    assert all(resolve(names).keys() == set(names) for names in GROUPS.values())
+    rows = {name: set(resolve(name)) for name in GROUPS}
+    assert all(row in METHODS or row.rpartition("-n")[0] in METHODS for row in set().union(*rows.values()))
     assert all(method.features in EXTRACTORS for method in METHODS.values())
     assert not GROUPS.keys() & METHODS.keys()  # a name is a row or a group, never both
-    assert not {"swav", "posecontrast"} & {name for names in GROUPS.values() for name in names}  # need a checkpoint
+    assert not {"swav", "posecontrast"} & set().union(*rows.values())  # need a checkpoint
     assert list(resolve(["table3", "ours"])) == list(GROUPS["table3"])

@@ -11,7 +11,7 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS
+from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import Problem
 from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_run
@@ -24,7 +24,7 @@ from zsp_lite.pipeline import ZeroShotPose
 
 pytestmark = pytest.mark.slow
 
-ROWS = (*GROUPS["ablations"], "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
+ROWS = (*resolve("ablations"), "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
 
 
 @pytest.fixture(scope="module")

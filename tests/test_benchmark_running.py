@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +26,10 @@ from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import Problem
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows
+from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, compare, read_lines, read_run
 from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.benchmark.tables import every_table
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
@@ -233,20 +233,12 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     assert errors(chunk, backbone, 1) == errors(chunk, backbone, 2)
 
 
-def test_chunks_hold_every_pair_once_and_keep_pairs_together_that_differ_in_the_number_of_views():
+def test_chunks_hold_every_pair_once_and_pairs_beside_each_other_that_share_frames():
     work = {pair: ["ours"] for n in (3, 5) for pair in sample_pairs(Co3D(small_folder()), "lump", 12, n)}
-
-    def question(pair):  # is the same for 3 and 5 target views
-        return pair.target_sequence, pair.reference_sequence, pair.reference_frame
-
     for size in (1, 4, 100):
         chunks = make_chunks(work, size)
         assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
-        assert all(len(chunk) < size + max(Counter(map(question, work)).values()) for chunk in chunks)
-        assert all(len(chunk) >= size for chunk in chunks[:-1])
-        questions = [{question(pair) for pair, _ in chunk} for chunk in chunks]
-        assert sum(map(len, questions)) == len(set().union(*questions))
-        # Frames of a target sequence are read in as few chunks as possible.
+        assert [len(chunk) for chunk in chunks[:-1]] == [size] * (len(chunks) - 1) and len(chunks[-1]) <= size
         targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
         assert targets == sorted(targets)
     assert len(chunks) == 1
@@ -277,8 +269,9 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
     (run / SETTINGS).unlink()
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
-    with pytest.raises(InputError, match="nowhere/run.json cannot be read"):
-        read_run(tmp_path / "nowhere")
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(InputError, match=f"{folder} is not the folder of a benchmark run: it has no run.json"):
+            read_run(folder)
     (tmp_path / LINES).symlink_to("/dev/full")
     with pytest.raises(InputError, match="run.jsonl cannot be written: .*No space left"):
         add_lines(tmp_path, [{"pair": "lump/a:0/b:1", "results": {}}])
@@ -299,22 +292,6 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
 
 def frames_of(**extractors):
     return FrameStore(Co3D(small_folder()), "lump", extractors)
-
-
-def test_frames_are_cropped_at_the_size_that_the_backbone_takes():
-    for backbone, size in ((BACKBONE, 224), (type("Large", (CoordinateBackbone,), {"image_size": 448})(), 448)):
-        frame = frames_of(backbone=backbone).frame(("100_a", 0))
-        assert frame.rgb.shape == (size, size, 3) and frame.camera.size == (size, size)
-
-
-def test_the_points_behind_a_frames_patches_are_computed_once():
-    frames = frames_of(backbone=BACKBONE, other=BACKBONE)
-    first = frames.view("backbone", ("100_a", 0), "saliency")
-    points, measured = first.patch_points, first.measured_points
-    for features, foreground in (("backbone", "mask"), ("other", "mask")):
-        view = frames.view(features, ("100_a", 0), foreground)
-        assert view.patch_points is points and view.measured_points is measured
-    assert frames.view("other", ("100_a", 1), "mask").patch_points is not points
 
 
 def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
@@ -351,19 +328,33 @@ def test_by_default_a_run_is_of_the_categories_that_have_labels(tmp_path):
         run(pairs=1)
 
 
-def test_rows_of_as_many_views_stand_on_the_problems_that_all_of_them_have(tmp_path):
+def test_rows_stand_on_the_problems_of_the_last_call_and_earlier_rows_stay_if_they_have_these(tmp_path):
+    run_rows(["ours", "oracle-view"], tmp_path, 3)
+    assert list(run_rows(["ours-bv", "ours-n1"], tmp_path, 2)) == ["ours", "oracle-view", "ours-bv", "ours-n1"]
+    found = read_run(tmp_path)
+    assert set(found.table.groupby("row").size()) == {2} and found.note == "" and "note" not in found.summary
+    assert found.row("ours").index.equals(found.row("ours-bv").index)
+    assert list(run_rows(["ours", "rootsift"], tmp_path, 4)) == ["ours", "rootsift"]
+    note = "Without oracle-view, ours-bv, ours-n1, which lack pairs of the last call."
+    assert read_run(tmp_path).summary["note"] == note
+    assert all(note in table.note for table in every_table(read_run(tmp_path).summary))
+    assert list(run_rows(["ours-bv"], tmp_path, 1, category="pebble")) == ["ours-bv"]
+
+
+def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
+        context.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(stop))
+        run_rows(["ours", "ours-bv"], tmp_path, 3)
+    write_reports(tmp_path)
+    for name in ("all_rows", "table_a_depth", "categories_acc30"):
+        assert "Not finished: 1 of 3 pairs." in (tmp_path / f"tables/{name}.md").read_text()
+        assert "1 pairs of an unfinished run" in (tmp_path / f"tables/{name}.tex").read_text()
     run_rows(["ours"], tmp_path, 3)
-    run_rows(["ours", "ours-bv", "ours-n1"], tmp_path, 2)
-    table = read_run(tmp_path).table
-    assert table.groupby("row").size().to_dict() == {"ours": 2, "ours-bv": 2, "ours-n1": 2}
-    assert set(table["pair"][table["row"] == "ours"]) == set(table["pair"][table["row"] == "ours-bv"])
-
-
-def test_results_are_of_the_rows_and_categories_of_the_last_call(tmp_path):
-    evaluate(small_folder(), BACKBONE, ["ours", "ours-bv"], {"lump": 2, "pebble": 1}, 2, tmp_path)
-    assert read_run(tmp_path).table.groupby(["row", "category"]).size().to_list() == [2, 1, 2, 1]
-    last, results = run_rows(["ours-bv"], tmp_path, 2), read_run(tmp_path)
-    assert results.summary["methods"] == last
-    assert list(results.table["row"]) == 2 * ["ours-bv"] and set(results.table["category"]) == {"lump"}
-    with pytest.raises(InputError, match="row 'ours' is not in the run, expected one of ours-bv"):
-        results.row("ours")
+    (tmp_path / "tables" / "mine.csv").touch()
+    write_reports(tmp_path)
+    # Tables that the last call has no rows for are removed, and nothing else.
+    assert not list((tmp_path / "tables").glob("table_a_depth*")) and (tmp_path / "tables" / "mine.csv").exists()
+    assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()

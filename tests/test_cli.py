@@ -11,7 +11,7 @@ import click
 import pytest
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite import errors
+from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli import main as cli
@@ -272,3 +272,10 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
             cli.main([*words, *more])
         assert given == [common + last]
         given.clear()
+
+
+def test_a_folder_that_is_no_run_is_one_line_and_the_version_is_told(tmp_path, capsys):
+    assert cli.main(["tables", str(tmp_path)]) == 2
+    assert f"{tmp_path} is not the folder of a benchmark run: it has no run.json" in assert_one_line(capsys)
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"zsp-lite, version {__version__}\n"

@@ -31,14 +31,11 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
 def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
-    monkeypatch.setattr(
-        "zsp_lite.backbones.pretrained.available_backbones", lambda: {"zsp-tiny": None, "dino_vits8": None}
-    )
+    monkeypatch.setattr("zsp_lite.backbones.pretrained.available_backbones", lambda: {"zsp-tiny": None})
     assert main(["doctor"]) == 1
-    python, torch, tiny, reinstall, dino, fetch, cache, choose, last = capsys.readouterr().out.splitlines()
+    python, torch, tiny, reinstall, cache, choose, last = capsys.readouterr().out.splitlines()
     assert python.startswith("ok    Python ") and torch.startswith("ok    torch ")
     assert tiny.startswith("bad   weights zsp-tiny ") and "-> missing: reinstall" in reinstall
-    assert dino.startswith("note  weights dino_vits8 ") and "fetch dino_vits8" in fetch
     assert cache.startswith("note  cache ") and "-> set ZSP_LITE_CACHE" in choose
     assert last == "Missing or broken: weights zsp-tiny."
 

@@ -23,10 +23,9 @@ def updated(text: str) -> str:
         start, run, name, _, end = found.groups()
         summary = read_run(RUNS / run).summary
         (table,) = (one for one in every_table(summary) if one.name == name)
-        cells = table.cells.loc[:, [not re.fullmatch(r"\w+ Acc30", title) for _, title in table.cells.columns]]
-        cells = cells.rename(columns=lambda group: group.removeprefix("this run").removeprefix(": "), level="group")
+        cells = table.cells[[title for title in table.cells if not re.fullmatch(r"(.*: )?\w+ Acc30", title)]]
         title = f"{table.title} ({max(row['n'] for row in summary['methods'].values()):,} pairs)"
-        shown = Table(name, title, list(cells.columns), dict(zip(cells.index, cells.to_numpy().tolist())))
+        shown = Table(name, title, cells)
         return f"{start}{as_markdown(shown)}\n{end}"
 
     return _MARKED.sub(render, text)

@@ -1,4 +1,4 @@
-"""Print the times and the memory that docs/scale.md quotes: `python -m tools.speed`, from the root of the repository.
+"""Print the times that docs/scale.md quotes, and the memory: `python -m tools.speed`, from the root of the repository.
 
 All estimates are of one pair of the sample data with five target views. Times are medians; run it on an idle machine.
 """

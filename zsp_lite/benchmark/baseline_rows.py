@@ -19,17 +19,8 @@ from zsp_lite.errors import InputError
 _K = 50  # number of matches, as in "Ours"
 
 
-def icp(problem: Problem) -> Answer:
-    """Run "ICP" in the first target view; the worlds start where the first cameras of both sequences coincide."""
-    return _icp(problem, 0)
-
-
-def icp_best_view(problem: Problem) -> Answer:
-    """Run "ICP + BV", the same in the best view of the paper's method."""
-    return _icp(problem, problem.estimate().view)
-
-
-def _icp(problem: Problem, view: int) -> Answer:
+def icp(problem: Problem, view: int = 0) -> Answer:
+    """Run "ICP", in the first target view; the worlds start where the first cameras of both sequences coincide."""
     reference, *targets = problem.frames(depth=True)
     sequences = problem.pair.reference_sequence, problem.pair.target_sequence
     dataset, category = problem.store.dataset, problem.store.category
@@ -39,6 +30,11 @@ def _icp(problem: Problem, view: int) -> Answer:
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the initial one, not a fit: {error}")
     return Answer(sim3.R, view, sim3.t, sim3.scale)
+
+
+def icp_best_view(problem: Problem) -> Answer:
+    """Run "ICP + BV", the same in the best view of the paper's method."""
+    return icp(problem, problem.estimate().view)
 
 
 def sift(problem: Problem) -> Answer:
@@ -64,20 +60,17 @@ def category(problem: Problem) -> Answer:
     """Run "category": the pose from the alignment of all objects of the category, which needs no label of any."""
     store, views = problem.store, len(problem.pair.target_frames)
 
-    def others() -> list[PairHypotheses]:
-        found = []
-        for pair in category_pairs(store.dataset, store.category, None, None, views, seed=0):
-            with suppress(InputError):  # the views determine no pose
-                found.append(hypotheses(Problem(pair, store)))
-        return found
-
     own = hypotheses(problem)
     if ("category", views) not in store.lasting:
-        store.lasting["category", views] = others()
+        others: list[PairHypotheses] = []
+        for pair in category_pairs(store.dataset, store.category, None, None, views, seed=0):
+            with suppress(InputError):  # the views determine no pose
+                others.append(hypotheses(Problem(pair, store)))
+        store.lasting["category", views] = others
     alignment = synchronise([*store.lasting["category", views], own])
     first, second = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = second @ alignment.between(own.reference, own.target) @ first.inverse()
-    return Answer(sim3.R, 0, sim3.t, sim3.scale, details={"confidence": alignment.objects[own.target].probability})
+    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
 
 
 def hypotheses(problem: Problem) -> PairHypotheses:

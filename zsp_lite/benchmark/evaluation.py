@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.benchmark.methods import Method, make_extractors
+from zsp_lite.benchmark.methods import METHODS, Method, make_extractors
 from zsp_lite.benchmark.own import describe_failure
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.benchmark.store import FrameStore
@@ -24,7 +24,6 @@ from zsp_lite.synthetic.recording import read_poses
 
 # Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
 FAILED = 180.0
-_MEASURED = ("symmetric_error", "translation", "scale", "failed")  # details must not stand in for them
 Poses = Float[np.ndarray, "n 4 4"]
 
 
@@ -50,12 +49,9 @@ class Evaluator:
 def evaluate_pair(
     pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
 ) -> dict[str, Any]:
-    """Evaluate rows on a pair: a line of the run's results.
+    """Evaluate rows on a pair: a line of the run's results, with the medians of the store's timings.
 
-    Its "results" are by row {"error": degrees, and where they are known "symmetric_error" (up to turns after which both
-    objects look the same), "translation" (error of the object's centre in diameters of the target),
-    "scale" (estimated over labelled, which is 1), "view", "note", "seconds" and the row's details}, or {"error": 180,
-    "failed": the reason} for a row that raises InputError. "timings" are the medians of the store's.
+    A row's result is what `_measure` finds, or {"error": 180, "failed": the reason} if it raises InputError.
     """
     store.timings.clear()
     problem = Problem(pair, store)
@@ -63,25 +59,12 @@ def evaluate_pair(
     reference, *targets = problem.frames()
     # Ground truth from the reference's camera to each target's.
     truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
-    symmetries = _symmetries(problem)
-    results = {name: _evaluate(method, problem, truths, symmetries) for name, method in methods.items()}
+    results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
     timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
     return {"pair": pair.key, "results": results, "timings": timings}
 
 
-def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
-    """Turns in the world of the target after which both objects look the same; None where no renderer knows them."""
-    pair, poses = problem.pair, read_poses(problem.store.dataset.root, problem.pair.category)
-    if not {pair.reference_sequence, pair.target_sequence} <= poses.keys():
-        return None
-    first, second = poses[pair.reference_sequence], poses[pair.target_sequence]
-    turns = [Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in first.turns if turn in second.turns]
-    return np.stack([np.eye(3), *(second.R @ turn @ second.R.T for turn in turns)])
-
-
-def _evaluate(
-    method: Method, problem: Problem, truths: Poses, symmetries: Float[np.ndarray, "s 3 3"] | None
-) -> dict[str, Any]:
+def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         answer = as_answer(method.solve(problem)) if method.solve else _answer(method, problem, truths)
@@ -92,27 +75,46 @@ def _evaluate(
     except InputError as error:
         return {"error": FAILED, "failed": str(error)}
     except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
-        own = getattr(method.solve, "own", method.solve) or method.settings.get("matcher")
-        module = getattr(own, "__module__", None) or type(own).__module__
-        if isinstance(own, str | None) or module.startswith("zsp_lite."):
+        if replace(method, targets=None) in METHODS.values():
             raise
-        raise FatalError(f"method {getattr(own, '__qualname__', own)!r} failed: {describe_failure(error)}") from error
-    result = {"seconds": time.perf_counter() - start, "note": answer.note, "view": int(answer.view)}
-    truth, cameras = truths[answer.view], [frame.camera for frame in problem.frames()]
-    reference, target = cameras[0], cameras[1 + answer.view]
-    result["error"] = float(rotation_error(answer.rotation, truth[:3, :3]))
-    if symmetries is not None:
-        turned = target.R @ symmetries @ target.R.T @ truth[:3, :3]
-        result["symmetric_error"] = float(np.min(rotation_error(answer.rotation, turned)))
-    ends = problem.store.extent(problem.pair.reference_sequence), problem.store.extent(problem.pair.target_sequence)
-    if answer.translation is not None and None not in ends:
-        centre = reference.to_camera(ends[0][0])
-        found = (1.0 if answer.scale is None else answer.scale) * answer.rotation @ centre + answer.translation
-        result["translation"] = float(np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / ends[1][1])
-    if answer.scale is not None:
-        result["scale"] = float(answer.scale)
-    result = {name: value for name, value in answer.details.items() if name not in _MEASURED} | result
+        raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
+    result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
+
+
+def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """Measure an answer: "error" in degrees, and what is known of the others.
+
+    "symmetric_error" is up to turns after which both objects look the same, "translation" the error of the object's
+    centre in diameters of the target, "scale" estimated over labelled, which is 1.
+    """
+    store, pair, result = problem.store, problem.pair, {}
+    for name in ("view", "note", "scale", "inliers", "confidence"):
+        if (value := getattr(answer, name)) is not None:
+            result[name] = value.item() if isinstance(value, np.generic) else value
+    result["error"] = float(rotation_error(answer.rotation, truth[:3, :3]))
+    reference, *targets = (frame.camera for frame in problem.frames())
+    if (symmetries := _symmetries(problem)) is not None:
+        to_camera = targets[answer.view].R
+        turned = to_camera @ symmetries @ to_camera.T @ truth[:3, :3]
+        result["symmetric_error"] = float(np.min(rotation_error(answer.rotation, turned)))
+    ends = store.extent(pair.reference_sequence), store.extent(pair.target_sequence)
+    if answer.translation is not None and None not in ends:
+        (first, _), (_, diameter) = ends
+        centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
+        found = scale * answer.rotation @ centre + answer.translation
+        result["translation"] = float(np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter)
+    return result
+
+
+def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
+    """Turns in the world of the target after which both objects look the same; None where no renderer knows them."""
+    pair, poses = problem.pair, read_poses(problem.store.dataset.root, problem.pair.category)
+    if not {pair.reference_sequence, pair.target_sequence} <= poses.keys():
+        return None
+    first, second = poses[pair.reference_sequence], poses[pair.target_sequence]
+    turns = [Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in first.turns if turn in second.turns]
+    return np.stack([np.eye(3), *(second.R @ turn @ second.R.T for turn in turns)])
 
 
 def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
@@ -127,9 +129,9 @@ def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
     reference, target = estimate.reference_view, estimate.target_views[estimate.view]
     if method.answer == "best view":
         sim3 = view_alignment(reference, target)
-        return Answer(sim3.R, answer.view, sim3.t, sim3.scale, details=answer.details)
+        return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
     if method.answer == "essential matrix":
         found = essential_rotation(reference.frame, target.frame, estimate.matches, reference.features.grid)
         rotation, inliers, note = found
-        return Answer(rotation, answer.view, note=note, details=dict(answer.details) | {"inliers": inliers})
+        return Answer(rotation, answer.view, note=note, inliers=inliers)
     return answer

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from itertools import groupby, islice
+from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from typing import Any
 from uuid import uuid4
@@ -30,39 +30,32 @@ _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
-    """Divide pairs into chunks of one category and about `size` pairs that share frames.
+    """Divide pairs into chunks of one category and at most `size` pairs, which share frames."""
 
-    Pairs that differ only in the number of target views stay together.
-    """
-
-    def question(pair: Pair) -> tuple:
-        return pair.category, pair.target_sequence, pair.reference_sequence, pair.reference_frame
+    def order(pair: Pair) -> tuple:
+        frames = pair.target_sequence, pair.reference_sequence, pair.reference_frame, len(pair.target_frames)
+        return pair.category, *frames, pair.key
 
     chunks: list[Chunk] = []
-    ordered = sorted(work, key=lambda pair: (*question(pair), len(pair.target_frames), pair.key))
-    for (category, *_), members in groupby(ordered, question):
-        if not chunks or len(chunks[-1]) >= size or chunks[-1][0][0].category != category:
+    for pair in sorted(work, key=order):
+        if not chunks or len(chunks[-1]) == size or chunks[-1][0][0].category != pair.category:
             chunks.append([])
-        chunks[-1] += [(pair, work[pair]) for pair in members]
+        chunks[-1].append((pair, work[pair]))
     return chunks
 
 
 def evaluate_chunks(
-    make: Callable[[], Any],
-    chunks: Sequence[Chunk],
-    executor: Executor | None,
-    workers: int,
-    save: Callable[[list[dict[str, Any]]], None],
-) -> None:
+    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, workers: int
+) -> Iterator[list[dict[str, Any]]]:
     """Evaluate chunks with an `evaluation.Evaluator` or what else `make` makes, by its method `lines`.
 
-    `save` gets the lines of each chunk, or of each pair where this process evaluates them.
+    Yields the lines of each chunk, or of each pair where this process evaluates them.
     """
     if executor is None:
         evaluator = make()
         with one_thread():
-            for line in (line for chunk in chunks for line in evaluator.lines(chunk)):
-                save([line])
+            for chunk in chunks:
+                yield from ([line] for line in evaluator.lines(chunk))
         return
     # cloudpickle: methods and backbones that are defined in a notebook travel by value.
     pickled, waiting, running = cloudpickle.dumps((uuid4(), make)), iter(chunks), set[Future]()
@@ -76,12 +69,13 @@ def evaluate_chunks(
             finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             # Failures last: all that has been evaluated is saved before an error ends the run.
             for future in sorted(finished, key=lambda one: one.cancelled() or one.exception() is not None):
-                save(future.result())
+                yield future.result()
     except Exception as error:
         if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
-            fewer = f"run again to continue, with fewer workers than {workers}"
-            reason = "a worker ended abruptly, perhaps out of memory; finished pairs are stored"
-            raise InputError(f"{reason}: {fewer}") from error
+            raise InputError(
+                "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
+                f"with fewer workers than {workers}"
+            ) from error
         raise
     finally:
         for future in running:
@@ -158,11 +152,11 @@ def _dask(address: str) -> Any:
         raise InputError(f"executor is {address!r}, expected a number of processes, dask://HOST:PORT or an Executor")
     try:
         from distributed import Client
-    except ImportError as error:
-        raise InputError(f"executor {address}: needs Dask: pip install dask distributed") from error
-    try:
+
         client = Client(f"tcp://{address.removeprefix('dask://')}", timeout=_DASK_TIMEOUT)
         client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
+    except ImportError as error:
+        raise InputError(f"executor {address}: needs Dask: pip install dask distributed") from error
     except (OSError, ValueError) as error:
         raise InputError(f"executor {address}: no scheduler with workers answers there ({error})") from error
     return client

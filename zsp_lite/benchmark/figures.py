@@ -1,15 +1,16 @@
 """Figures of a run: errors of every pair, error curves, and accuracy against the number of target views."""
 
-import re
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from zsp_lite.benchmark.methods import read_paper_tables
 from zsp_lite.benchmark.runs import Run
-from zsp_lite.benchmark.tables import own_rows, read_paper_tables
+from zsp_lite.benchmark.tables import important_rows, library_row, own_rows, row_name
 from zsp_lite.choices import METRICS
 from zsp_lite.viz.plots import COLOURS, show_dots, show_panels
 
@@ -25,10 +26,9 @@ def error_distribution(run: Run, row: str = "ours") -> Figure:
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
-    """Draw the cumulative distribution of the errors, one line per row; by default of seven, first one's own."""
-    names = list(rows or dict.fromkeys([*own_rows(run.summary), *run.summary["methods"]]))[: len(COLOURS)]
+    """Draw the cumulative distribution of the errors, one line per row; by default of the most important rows."""
     curves = {}
-    for name in names:
+    for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
         shares = 100 * np.arange(len(errors) + 1) / len(errors)
         curves[name] = np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1]  # a step at every error
@@ -42,29 +42,24 @@ def accuracy_against_views(run: Run) -> Figure | None:
 
     The results that the paper published for CO3D are grey.
     """
-    methods, views = run.summary["methods"], run.summary["data"]["targets"]
-    published = next(one["rows"] for one in read_paper_tables() if one["name"] == "table_a_targets")
-    numbers = [int(line["label"].rpartition(" ")[2]) for line in published]
-    names = dict.fromkeys(re.sub(r"-n\d+$", "", name) for name in own_rows(run.summary))
-    drawn = {
-        row: {n: methods.get(f"{row}-n{n}") or (methods.get(row) if n == views else None) for n in numbers}
-        for row in ("ours", "ours-bv", "verified", *names)
-    }
-    drawn = {row: {n: one for n, one in found.items() if one} for row, found in drawn.items()}
-    drawn = {row: found for row, found in drawn.items() if len(found) > 1}
+    published = {line["row"]: line["published"] for spec in read_paper_tables() for line in spec["rows"]}
+    numbers, methods = (1, 3, 5, 10, 20), run.summary["methods"]
+    drawn = {}
+    for name in dict.fromkeys(map(library_row, important_rows(run.summary))):
+        rows = {n: row_name(f"{name}-n{n}", run.summary) for n in numbers}
+        if len(known := {n: methods[row] for n, row in rows.items() if row in methods}) > 1:
+            drawn[name] = known
     if not drawn:
         return None
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
     for place, (axis, metric) in enumerate(zip(axes, ("acc30", "acc15"), strict=True)):
-        for index, (row, found) in enumerate(drawn.items()):
-            colour, ends = COLOURS[index % len(COLOURS)], np.array([one[f"{metric}_ci"] for one in found.values()])
-            axis.fill_between(list(found), *ends.T, color=colour, alpha=0.18, lw=0)
-            values = [one[metric] for one in found.values()]
-            axis.plot(list(found), values, "os^Dv"[index % 5] + "-", color=colour, label=row)
-        # the published columns: Acc30 and Acc15 of each
-        for first, row, look in ((0, "ours-bv", "s:"), (2, "ours", "o--")):
-            values = [line["published"][first + place] for line in published]
-            axis.plot(numbers, values, look, ms=3, color="0.55", label=f"{row}, published on CO3D")
+        for (name, rows), colour, marker in zip(drawn.items(), COLOURS, cycle("os^Dv")):
+            low, high = zip(*(one[f"{metric}_ci"] for one in rows.values()))
+            axis.fill_between(list(rows), low, high, color=colour, alpha=0.18, lw=0)
+            axis.plot(list(rows), [one[metric] for one in rows.values()], f"{marker}-", color=colour, label=name)
+        for name, look in (("ours-bv", "s:"), ("ours", "o--")):
+            values = [published[f"{name}-n{n}"][place - 2] for n in numbers]  # the last two are Acc30 and Acc15
+            axis.plot(numbers, values, look, ms=3, color="0.55", label=f"{name}, published on CO3D")
         axis.set(xlabel="target views N", ylabel=METRICS[metric], xticks=numbers, ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
@@ -72,10 +67,9 @@ def accuracy_against_views(run: Run) -> Figure | None:
 
 
 def write_figures(run: Run, folder: str | Path) -> None:
-    """Write the figures for which the run has rows as PDF and PNG files."""
+    """Write the figures for which the run has rows as PDF and PNG files, and remove others of an earlier call."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    methods = run.summary["methods"]
-    first = [*own_rows(run.summary), *(["ours"] if "ours" in methods else methods)][0]
+    first = [*own_rows(run.summary), *important_rows(run.summary)][0]
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
         figures = {
             "error_distribution": error_distribution(run, first),
@@ -83,7 +77,11 @@ def write_figures(run: Run, folder: str | Path) -> None:
             "accuracy_against_views": accuracy_against_views(run),
         }
         for name, figure in figures.items():
-            if figure is not None:
-                figure.savefig(Path(folder) / f"{name}.pdf", metadata={"CreationDate": None})
-                figure.savefig(Path(folder) / f"{name}.png", dpi=150)
+            pdf, png = Path(folder) / f"{name}.pdf", Path(folder) / f"{name}.png"
+            if figure is None:
+                pdf.unlink(missing_ok=True)
+                png.unlink(missing_ok=True)
+            else:
+                figure.savefig(pdf, metadata={"CreationDate": None})
+                figure.savefig(png, dpi=150)
                 plt.close(figure)

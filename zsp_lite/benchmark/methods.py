@@ -4,9 +4,13 @@ A row is the paper's method with some settings changed, or a function (`solve`).
 results of such functions.
 """
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 from zsp_lite.baselines.posecontrast import load_posecontrast
@@ -44,10 +48,8 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-_MASK = {"foreground": "mask"}
+_MASK, _VERIFIED = {"foreground": "mask"}, {"solver": "verified"}
 _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
-_VERIFIED = {"solver": "verified"}
-
 
 METHODS: dict[str, Method] = {
     "ours": Method(),
@@ -87,48 +89,42 @@ METHODS: dict[str, Method] = {
     "category": Method(solve=baseline_rows.category),
 }
 
-GROUPS: dict[str, tuple[str, ...]] = {
-    "default": ("ours", "ours-bv", "rootsift"),
-    "table1": ("icp", "sift", "icp-bv", "ours-k30", "ours"),
-    "table2": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5)),
-    "table3": ("ours-cyclicaliou", "ours-globalsim", "ours-saliencyiou", "ours"),
-    "views": tuple(f"{row}-n{n}" for row in ("ours-bv", "ours") for n in (1, 3, 5, 10, 20)),
-    "matchers": ("ours-transport", "ours-dualsoftmax", "ours"),
-    "correspondences": (*(f"ours-k{k}-nokmeans" for k in (30, 50, 70)), "ours-k30", "ours", "ours-k70"),
-    "trials": ("ours-trials500", "ours", "ours-trials2000"),
-    "depth": ("ours-nodepth", "ours-bv", "ours"),
-    "published": ("ours", "ours-published"),
-    "verified-views": ("verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"),
+
+@cache
+def read_paper_tables() -> list[dict[str, Any]]:
+    """Read which rows stand in which table of the paper, with its published figures."""
+    return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
+
+
+_CHECKPOINTS = ("swav", "posecontrast")  # rows that are in no group: their checkpoints have to be downloaded
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them.
+GROUPS: dict[str, list[str]] = {"default": ["ours", "ours-bv", "rootsift"]} | {
+    table["group"]: [line["row"] for line in table["rows"] if line["row"] not in _CHECKPOINTS]
+    for table in read_paper_tables() if "group" in table
+}  # fmt: skip
+GROUPS |= {
+    "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
+    "ablations": ["ours", "table3", "matchers", "correspondences", "trials", "depth", "published"],  # at one N
+    "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
+    "all": ["paper", "verified-views", "oracle-view"],
 }
 
 
-def _union(*names: str) -> tuple[str, ...]:
-    """Return the rows of several groups without duplicates."""
-    return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
-
-
-# All ablations of the paper at one number of views, and all its tables. "swav" and "posecontrast" are in no group: they
-# need checkpoints that have to be downloaded.
-GROUPS["ablations"] = _union("ours", "table3", "matchers", "correspondences", "trials", "depth", "published")
-GROUPS["paper"] = _union("ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask")
-# The paper's tables and the rows beyond the paper.
-GROUPS["all"] = _union("paper", "verified-views", "oracle-view")
+def _members(name: str) -> list[str]:
+    """The rows of a group, or the name of a row itself."""
+    return [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
 
 
 def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
-    Args:
-        methods: Names of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
-            "poses.csv", or NAME=one of these; or a mapping from names to these, to `Method`s, or to objects of
-            one's own (see `own.kind_of`).
-
-    Raises:
-        InputError: A name is unknown, a thing cannot be imported or read, or is none of these.
+    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
+    "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own
+    (see `own.kind_of`). InputError if a name is unknown, or a thing cannot be imported or read, or is none of these.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
-        members = [member.partition("=") for name in names for member in GROUPS.get(name, [name])]
+        members = [row.partition("=") for name in names for row in _members(name)]
         methods = {name: meant or name for name, _, meant in members}
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
@@ -144,15 +140,18 @@ def _method(name: str, meant: Any) -> Method:
         if meant.endswith(".csv"):
             return Method("none", solve=read_poses(meant))
         if ":" not in meant:
-            known = ", ".join((*GROUPS, *METHODS))
-            raise InputError(f"method {meant!r} is unknown, expected one of {known}, ROW-nN, module:thing or FILE.csv")
+            close = get_close_matches(meant, [*METHODS, *GROUPS])
+            raise InputError(
+                f"method {meant!r} is unknown{', close are ' if close else ''}{', '.join(close)}; "
+                "`zsp-lite benchmark --list` lists all, NAME=module:thing and NAME=poses.csv are your own"
+            )
         meant = import_object(meant)
     if isinstance(meant, Method):
         return meant
     kind = kind_of(name, meant)
     if kind == "matcher":
         return Method(settings={"matcher": meant})
-    return Method(solve={"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind, lambda own: own)(meant))
+    return Method(solve={"estimator": Estimator, "keypoints": KeypointMatcher, "problem": lambda own: own}[kind](meant))
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
@@ -161,10 +160,8 @@ def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -
 
 
 def description(method: Method) -> str:
-    """Describe a row as text: its extractor, answer, settings, number of views, and its function as "module:name".
-
-    Rows with the same name and different descriptions must not be stored in one run.
-    """
+    """Describe a row as text; rows with the same name and other descriptions are not stored in one run."""
     settings = ", ".join(f"{name}={described(value)}" for name, value in sorted(method.settings.items()))
-    parts = [method.features, method.answer, settings, f"{method.targets} views" if method.targets else ""]
-    return "; ".join(filter(None, [*parts, "" if method.solve is None else described(method.solve)]))
+    views = f"{method.targets} views" if method.targets else ""
+    solve = described(method.solve) if method.solve else ""
+    return "; ".join(filter(None, [method.features, method.answer, settings, views, solve]))

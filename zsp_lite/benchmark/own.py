@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from zsp_lite.baselines.sift import unproject_pixels
 from zsp_lite.benchmark.identity import digest
 from zsp_lite.benchmark.problem import Answer, Problem, as_answer
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.errors import InputError, real_array
+from zsp_lite.errors import FatalError, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 
 KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
@@ -35,14 +35,13 @@ def kind_of(name: str, thing: Any) -> str:
     The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
     InputError if it is none of these.
     """
-    if callable(getattr(thing, "estimate", None)) and not isinstance(thing, type):
+    found = f"of type {type(thing).__name__}"
+    if not isinstance(thing, type) and callable(getattr(thing, "estimate", None)):
         return "estimator"
     if (kind := getattr(thing, "kind", None)) in KINDS:
         return kind
-    found = f"a {type(thing).__name__}, which is no function"
     if callable(thing) and not isinstance(thing, type):
-        found = "a function of unknown arguments"
-        with suppress(TypeError, ValueError):
+        with suppress(TypeError, ValueError):  # some functions of compiled modules have no signature
             signature = inspect.signature(thing.forward if isinstance(thing, nn.Module) else thing)
             found = f"a function of {signature}"
             parameters = signature.parameters.values()
@@ -50,9 +49,8 @@ def kind_of(name: str, thing: Any) -> str:
             if all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed):
                 return KINDS[range(1, 4).index(len(needed))]
     raise InputError(
-        f"method {name!r} is {found}: expected an object with estimate(reference, targets), or a function of a "
-        "problem, of two images, or of similarities and two foregrounds (its attribute `kind`, one of "
-        f"{', '.join(KINDS)}, may say which)"
+        f"method {name!r} is {found}, expected a function of one argument (problem), two (two images) or three "
+        "(similarities, two foregrounds), or an object with estimate(reference, targets)"
     )
 
 
@@ -86,19 +84,19 @@ class Estimator:
 
 @dataclass(frozen=True)
 class KeypointMatcher:
-    """Row of a matcher of keypoints, such as LightGlue, LoFTR or RoMa, followed by RANSAC as in the paper.
-
-    The matcher gets the object crops of the reference and of a target view, (H, W, 3) uint8, and returns points in the
-    first and in the second image, (n, 2) as (x, y) in pixels with pixel centres at half-integers, and a score of each
-    match, (n,), or one of all. The view of the highest sum of scores is the best view.
-    """
+    """Row of a matcher of keypoints in two images, followed by RANSAC; docs/benchmark_your_own.md has its protocol."""
 
     own: Callable[[np.ndarray, np.ndarray], tuple[Any, Any, Any]]
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
         found = [self.own(reference.rgb, target.rgb) for target in targets]
-        view = int(np.argmax([np.sum(real_array("scores of matches", score)) for _, _, score in found]))
+        scores = [real_array("scores of matches", score) for _, _, score in found]
+        if any((one < 0).any() for one in scores):
+            raise FatalError(
+                "scores of matches are negative, expected 0 or more: the view of the highest sum is chosen"
+            )
+        view = int(np.argmax([one.sum() for one in scores]))
         return fit_keypoints(problem, view, *found[view][:2])
 
 
@@ -106,13 +104,12 @@ def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answe
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
-    details = {"matches": len(first), "inliers": 0}
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
         sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
-        return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", details=details)
-    return Answer(sim3.R, view, sim3.t, sim3.scale, "", details | {"inliers": int(inliers.sum())})
+        return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", inliers=0)
+    return Answer(sim3.R, view, sim3.t, sim3.scale, inliers=int(inliers.sum()))
 
 
 @dataclass(frozen=True)
@@ -124,21 +121,23 @@ class StoredPoses:
     _poses: Mapping[tuple, Answer]
 
     def __call__(self, problem: Problem) -> Answer:
-        pair = problem.pair
-        for view, frame in enumerate(pair.target_frames):
-            key = (pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence, frame)
-            if (found := self._poses.get(key)) is not None:
-                return Answer(found.rotation, view, found.translation, found.scale)
-        raise InputError(f"{self.path} has no pose")
+        if not (found := self.of(problem.pair)):
+            raise InputError(f"{self.path} has no pose")
+        if len(found) > 1:
+            raise FatalError(
+                f"poses {self.path}: {len(found)} target views of the pair {problem.pair.key}, expected one"
+            )
+        return found[0]
+
+    def of(self, pair: Pair) -> list[Answer]:
+        """Look up the poses of a pair."""
+        key = (pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence)
+        found = [(view, self._poses.get((*key, frame))) for view, frame in enumerate(pair.target_frames)]
+        return [replace(answer, view=view) for view, answer in found if answer is not None]
 
 
 def read_poses(path: str | Path) -> StoredPoses:
-    """Read a CSV file of poses: a line for each pair.
-
-    Its columns are category, reference_sequence, reference_frame, target_sequence, target_frame, rotation (nine
-    numbers, row by row) and, if they are known, translation (three numbers) and scale; numbers are separated by spaces.
-    The pose leads from camera points of the reference frame to those of the target frame, any of the pair's.
-    """
+    """Read a CSV file of poses, with a line for each pair; docs/benchmark_your_own.md has its columns."""
     data, poses = read_bytes(path, "poses"), {}
     try:
         lines = pd.read_csv(io.BytesIO(data), dtype=str, keep_default_na=False, index_col=False).fillna("")
@@ -150,6 +149,8 @@ def read_poses(path: str | Path) -> StoredPoses:
         try:
             rotation, translation, scale = (_numbers(name, line.get(name, ""), size) for name, size in _POSE.items())
             key = tuple(int(line[name]) if name.endswith("frame") else line[name] for name in _QUESTION)
+            if key in poses:
+                raise ValueError("second pose of the same frames")
             answer = Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0])
             poses[key] = as_answer(answer)
         except ValueError as error:  # an InputError is one, too
@@ -168,26 +169,20 @@ def _numbers(name: str, text: str, size: int) -> np.ndarray | None:
 
 
 def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> Path:
-    """Write pairs as a CSV file for another program: a line for each frame, the reference's of a pair first.
-
-    Paths are those of the image, the depth map (CO3D's 16-bit format, times depth_scale) and the mask in the data
-    folder; empty where there is none. The camera maps x_cam = R @ x_world + t, R row by row, and its intrinsics are in
-    pixels with pixel centres at half-integers.
-    """
+    """Write pairs as a CSV file for another program; docs/benchmark_your_own.md has its columns."""
     lines = []
     for number, pair in enumerate(pairs):
-        ends = [(pair.reference_sequence, pair.reference_frame)]
-        for sequence, frame in [*ends, *((pair.target_sequence, frame) for frame in pair.target_frames)]:
+        targets = [("target", pair.target_sequence, frame) for frame in pair.target_frames]
+        for role, sequence, frame in [("reference", pair.reference_sequence, pair.reference_frame), *targets]:
             found = dataset.frame(pair.category, sequence, frame)
             camera, depth, mask = dataset.camera(found), found.depth, found.mask
-            role = "reference" if (sequence, frame) in ends else "target"
-            line = {"pair": number, "role": role, "category": pair.category, "sequence": sequence, "frame": frame}
-            line |= {"image": found.image.path, "depth": depth and depth.path}
-            line |= {"depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path}
-            line |= dict(
-                zip(("fx", "fy", "cx", "cy"), (*camera.focal_length.tolist(), *camera.principal_point.tolist()))
-            )
-            line |= {name: " ".join(map(repr, getattr(camera, name).ravel().tolist())) for name in ("R", "t")}
-            lines.append(line)
+            (fx, fy), (cx, cy) = camera.focal_length.tolist(), camera.principal_point.tolist()
+            R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (camera.R, camera.t))
+            lines.append({
+                "pair": number, "role": role, "category": pair.category, "sequence": sequence, "frame": frame,
+                "image": found.image.path, "depth": depth and depth.path,
+                "depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path,
+                "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": R, "t": t,
+            })  # fmt: skip
     write_atomic(path, pd.DataFrame(lines).to_csv(index=False).encode())
     return Path(path)

@@ -1,7 +1,7 @@
 """Argument and results of a benchmark row: `Problem` and `Answer`."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.store import FrameKey, FrameStore
+from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
@@ -30,7 +31,8 @@ class Answer:
     translation: Float[np.ndarray, "3"] | None = None  # in the target's unit, if the method estimates it
     scale: float | None = None  # if the method estimates it
     note: str = ""  # warning about the pose; "" for none
-    details: Mapping[str, Any] = field(default_factory=dict)  # numbers and texts to store, such as {"inliers": 12}
+    inliers: int | None = None  # number of matches that agree with the pose
+    confidence: float | None = None  # probability that the rotation error is below 30 degrees
 
 
 class Row(Protocol):
@@ -39,21 +41,15 @@ class Row(Protocol):
     A row that takes the pose of the target view whose global feature is most similar to the reference's:
 
         def most_similar(problem):
-            feature = problem.reference.features.global_feature
-            cosines = [
-                torch.cosine_similarity(feature, target.features.global_feature, dim=0) for target in problem.targets
-            ]
-            return np.eye(3), int(np.argmax(cosines))
+            first, *others = (view.features.global_feature for view in problem.views())
+            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
     """
 
     def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
         """Estimate the pose of the reference object in one of the target views.
 
-        Returns:
-            An Answer, a PoseEstimate, or a Sim3 or a rotation (3, 3), alone (target view 0) or with the view's index.
-
-        Raises:
-            InputError: If there is no pose; the pair counts as failed, with an error of 180 degrees.
+        A Sim3 or a rotation (3, 3) stands alone (target view 0) or with the view's index. InputError says that there is
+        no pose: the pair counts as failed, with an error of 180 degrees.
         """
         ...
 
@@ -61,19 +57,10 @@ class Row(Protocol):
 def as_answer(found: Any) -> Answer:
     """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
-        details = {"matches": len(found.matches), "inliers": int(found.inliers.sum())}
-        if found.confidence is not None:
-            details["confidence"] = round(found.confidence, 4)
-        sim3 = found.sim3
-        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, details)
+        sim3, inliers = found.sim3, int(found.inliers.sum())
+        return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
-        details = {
-            name: value.item() if isinstance(value, np.generic) else value for name, value in found.details.items()
-        }
-        for name, value in details.items():
-            if not isinstance(value, bool | int | float | str | None):
-                raise InputError(f"detail {name} of the row is a {type(value).__name__}, expected a number or a text")
-        return replace(found, rotation=_rotation(found.rotation), details=details)
+        return replace(found, rotation=_rotation(found.rotation))
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
@@ -125,36 +112,35 @@ class Problem:
     ) -> PoseEstimate:
         """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index.
 
-        Estimates that differ in later stages only share the similarities and the matches.
+        Rows that differ in later stages only share the similarities and the matches.
         """
-        keys = tuple(self.keys[1:] if target is None else [self.keys[1 + target]])
+        settings, store = settings or {}, self.store
+        first, *others = self.keys if target is None else (self.keys[0], self.keys[1 + target])
+        method = ZeroShotPose(store.extractors[features], **settings, seed=self.seed)
+        matching = [getattr(method, name) for name in _MATCH_SETTINGS]
 
-        def compute() -> PoseEstimate:
-            method = ZeroShotPose(self.store.extractors[features], **(settings or {}), seed=self.seed)
-            reference, *targets = (self.store.view(features, key, method.foreground) for key in (self.keys[0], *keys))
-            matched = None  # a reference that may stand on its side is matched in four turns
-            if method.upright:
-                matched = [self._match(features, method, key, reference, view) for key, view in zip(keys, targets)]
+        def match(key: FrameKey, reference: View, view: View) -> ViewMatch:
+            @store.timed("similarity")
+            def compare() -> list[Any]:
+                return (similarities if method.binning else key_similarities)(reference.features, [view.features])
+
+            @store.timed("matching")
+            def select() -> ViewMatch:
+                return method.match_views(reference, [view], similarity)[0]
+
+            similarity = self._shared(("similarity", key, features, method.binning), compare)
+            return self._shared(("matches", key, self.seed, features, *matching), select)
+
+        def solve() -> PoseEstimate:
+            reference, *targets = (store.view(features, key, method.foreground) for key in (first, *others))
+            # A reference that may stand on its side is matched in four turns, by the method itself.
+            matched = [match(key, reference, view) for key, view in zip(others, targets)] if method.upright else None
             found = method.estimate_from_views(reference, targets, matched)
             for stage, seconds in found.timings.items():
-                self.store.timings.setdefault(stage, []).append(round(seconds, 5))
+                store.timings.setdefault(stage, []).append(seconds)
             return found
 
-        return self._shared("estimate", keys, self.seed, features, *sorted((settings or {}).items()), make=compute)
+        return self._shared(("estimate", *others, self.seed, features, *sorted(settings.items())), solve)
 
-    def _match(self, features: str, method: ZeroShotPose, key: FrameKey, reference: View, target: View) -> Any:
-        def compare() -> Any:
-            with self.store.timed("similarity"):
-                return (similarities if method.binning else key_similarities)(reference.features, [target.features])
-
-        def match() -> Any:
-            similarity = self._shared("similarity", key, features, method.binning, make=compare)
-            with self.store.timed("matching"):
-                (found,) = method.match_views(reference, [target], similarity)
-            return found
-
-        settings = (getattr(method, name) for name in _MATCH_SETTINGS)
-        return self._shared("matches", key, self.seed, features, *settings, make=match)
-
-    def _shared(self, *name: Any, make: Any) -> Any:
+    def _shared(self, name: tuple, make: Callable[[], Any]) -> Any:
         return self.store.shared((self.keys[0], self.pair.target_sequence), name, make)

@@ -4,6 +4,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,13 @@ from tqdm import tqdm
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.evaluation import Evaluator
+from zsp_lite.benchmark.figures import write_figures
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, resolve
-from zsp_lite.benchmark.runs import Call, ResultLine, Settings, add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.own import StoredPoses
+from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.tables import every_table, write_tables
+from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
@@ -54,7 +59,7 @@ def evaluate(
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
 
     Returns:
-        The content of OUT/summary.json (see `summary.summarise`).
+        The content of OUT/summary.json (see `summary.summarise`); `write_reports` writes tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
@@ -68,6 +73,10 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
+        elif isinstance(row.solve, StoredPoses) and not any(map(row.solve.of, work)):
+            raise InputError(
+                f"{row.solve.path} has no pose for any of the {len(work)} pairs, which --list-pairs writes"
+            )
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
@@ -87,9 +96,28 @@ def evaluate(
             new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
             todo = {pair: names for pair, names in new.items() if names}
             evaluate_pairs(out, make, todo, len(work), pool, workers)
-            summary = read_run(out).summary
-            write_atomic(Path(out) / "summary.json", json.dumps(summary, indent=1).encode())
-    return summary
+    return _write_summary(read_run(out), out)
+
+
+def write_reports(run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN) -> dict:
+    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return the summary.
+
+    `metrics` are the figures of the table of all rows. Tables and figures that an earlier call has written, and which
+    have no rows now, are removed.
+    """
+    found, out = read_run(run), Path(out or run)
+    tables = every_table(found.summary, metrics)
+    for name in {spec["name"] for spec in read_paper_tables()} - {table.name for table in tables}:
+        for path in (out / "tables").glob(f"{name}.*"):
+            path.unlink()
+    write_tables(tables, out / "tables")
+    write_figures(found, out / "figures")
+    return _write_summary(found, out)
+
+
+def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
+    write_atomic(Path(out) / "summary.json", json.dumps(run.summary, indent=1).encode())
+    return run.summary
 
 
 def evaluate_pairs(
@@ -97,16 +125,16 @@ def evaluate_pairs(
     kind: type = ResultLine,
 ) -> None:  # fmt: skip
     """Evaluate pairs, and add what is found, lines of a `kind`, to a run at once; a progress bar counts to `total`."""
-    size = max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
+    chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
     # Hidden outside a terminal, and where the user wants to hear warnings only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    with tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar:
-
-        def save(lines: list[dict[str, Any]]) -> None:
+    with (
+        tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar,
+        closing(execution.evaluate_chunks(make, chunks, pool, workers)) as found,
+    ):
+        for lines in found:
             add_lines(out, lines, kind)
             bar.update(len(lines))
-
-        execution.evaluate_chunks(make, execution.make_chunks(todo, size), pool, workers, save)
 
 
 def pairs_of_rows(

@@ -1,8 +1,7 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
 run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl is what `evaluate_pair`
-returned for a pair; run.jsonl.gz may take its place in a run that is complete. One process writes to a folder; others
-can read it meanwhile. A killed process loses only the line it was writing.
+returned for a pair; run.jsonl.gz may take its place. One process writes to a folder; others can read it meanwhile.
 """
 
 import os
@@ -39,6 +38,7 @@ class Call(msgspec.Struct):
     workers: int
     rows: list[str]
     pairs: dict[str, int]  # by category
+    finished: bool = True
 
 
 class Settings(msgspec.Struct):
@@ -55,7 +55,7 @@ class Settings(msgspec.Struct):
 
 
 class _Result(msgspec.Struct):
-    """What a row found for a pair, as `evaluate_pair` describes it; other members are not part of the table."""
+    """What a row found for a pair (see `evaluate_pair`); other members are not part of the table."""
 
     error: _Degrees
     confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] | None = None
@@ -77,13 +77,14 @@ class ResultLine(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Results of the rows and categories of the last call, as far as they are finished."""
+    """Results of a run on the pairs that the rows of the last call have finished (see `read_run`)."""
 
     settings: Settings
     # A line for each row and pair, by row, category and pair: "row", "category", "pair" (its key), "problem" (the key
     # without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the members of `_Result`.
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
+    note: str = ""  # what is missing
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -92,7 +93,8 @@ class Run:
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
         data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
         data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
-        return {"data": data, "backbone": backbone} | summarise(self.table) | {"timings": dict(self.timings)}
+        note = {"note": self.note} if self.note else {}
+        return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""
@@ -109,16 +111,20 @@ def open_run(out: str | Path, settings: Settings, allow_other_version: bool = Fa
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
         if any(map(os.path.lexists, (out / SETTINGS, out / LINES, packed))):
             settings = _continued(out, settings, allow_other_version)
-        if packed.exists():
-            what = "results of a run"
-            write_atomic(out / LINES, decompress(read_bytes(packed, what), f"{what} {packed}"))
-            packed.unlink()
-        if (out / LINES).exists():
-            # What follows the last complete line is one that a killed process was writing.
-            os.truncate(out / LINES, read_bytes(out / LINES, "results of a run").rfind(b"\n") + 1)
-        write_atomic(out / SETTINGS, msgspec.json.format(msgspec.json.encode(settings), indent=1))
-        add_lines(out, [])  # make the file
+        lines = read_texts(out) if packed.exists() or (out / LINES).exists() else ()
+        write_atomic(
+            out / LINES, b"".join(text + b"\n" for text, _ in lines)
+        )  # unpacked, and without an unfinished line
+        packed.unlink(missing_ok=True)
+        settings.calls[-1].finished = False
+        _write_settings(out, settings)
         yield
+        settings.calls[-1].finished = True
+        _write_settings(out, settings)
+
+
+def _write_settings(out: Path, settings: Settings) -> None:
+    write_atomic(out / SETTINGS, msgspec.json.format(msgspec.json.encode(settings), indent=1))
 
 
 def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
@@ -129,8 +135,10 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
             raise InputError(f"{out} holds a run with {name} {held}, this is {asked}; choose another folder")
     groups = {name: (getattr(before, name), getattr(now, name)) for name in ("methods", "labels", "origins")}
     for name, (held, asked) in groups.items():
-        if changed := [one for one in asked if held.get(one, asked[one]) != asked[one]]:
-            raise InputError(f"{out} holds results with other {name} of {', '.join(changed)}; choose another folder")
+        for one in asked:
+            if (was := held.get(one, asked[one])) != asked[one]:
+                what = f"other {name} of {one}: {was}, not {asked[one]}"
+                raise InputError(f"{out} holds results with {what}; choose another folder")
     if now.library[0] not in before.library and not allow_other_version:
         versions = (f"zsp-lite {one['version']} (commit {one['commit']})" for one in (before.library[-1], *now.library))
         other = "choose another folder, or continue with --allow-other-version"
@@ -168,9 +176,15 @@ def read_lines(out: str | Path) -> list[ResultLine]:
 
 
 def read_run(out: str | Path) -> Run:
-    """Read a run from its folder, also where it was interrupted."""
+    """Read a run from its folder, also where it was interrupted.
+
+    Shown are the pairs that all rows of the last call have finished, and all rows of the folder that have these pairs.
+    Pairs of different numbers of target views are the same if they are the same "problem".
+    """
+    if not (Path(out) / SETTINGS).is_file():
+        raise InputError(f"{out} is not the folder of a benchmark run: it has no {SETTINGS}")
     settings, lines = read_json(Path(out) / SETTINGS, Settings, "settings of a run"), read_lines(out)
-    rows, categories = settings.calls[-1].rows, list(settings.calls[-1].pairs)
+    last = settings.calls[-1]
     results = [
         {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
@@ -178,25 +192,39 @@ def read_run(out: str | Path) -> Run:
     table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
-    table = table[table["row"].isin(rows) & table["category"].isin(categories)]
-    # Rows of as many target views are compared on the problems that all of them have finished.
-    views = table["pair"].str.count(",").rename("views")
-    finished = table.groupby([views, "problem"])["row"].transform("nunique")
-    table = table[finished == table.groupby(views)["row"].transform("nunique")]
-    if table.empty:
+    table["views"] = table["pair"].str.count(",")
+    table = table[table["category"].isin(last.pairs)]
+    finished: dict[int, set[str]] = {}  # by number of target views, the pairs that all rows of the last call have
+    for views, found in table[table["row"].isin(last.rows)].groupby("views"):
+        rows_of_pair = found.groupby("pair")["row"].nunique()
+        finished[views] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
+    problems = set(table["problem"][table["pair"].isin(set[str]().union(*finished.values()))])
+    if not problems:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
-    kinds = {"row": pd.CategoricalDtype(rows), "category": pd.CategoricalDtype(categories)}
+    rows = []
+    for row, found in table.groupby("row"):
+        views = found["views"].iloc[0]
+        of_row, wanted = ("pair", finished[views]) if views in finished else ("problem", problems)
+        table = table[(table["row"] != row) | table[of_row].isin(wanted)]
+        rows += [row] if wanted <= set(found[of_row]) else []
+    table = table[table["row"].isin(rows)].drop(columns="views")
+    rows = [row for row in settings.methods if row in rows]
+    kinds = {"row": pd.CategoricalDtype(rows), "category": pd.CategoricalDtype(list(last.pairs))}
     table = table.astype(kinds).sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(kinds, object))
-    timings = pd.DataFrame([line.timings for line in lines]).median()
-    return Run(settings, table.reset_index(drop=True), {str(stage): float(s) for stage, s in timings.items()})
+    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
+    notes, most = [], max(map(len, finished.values()))
+    if not last.finished:
+        notes.append(f"Not finished: {most} of {sum(last.pairs.values())} pairs.")
+    if hidden := [row for row in settings.methods if row not in rows]:
+        notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
+    return Run(settings, table.reset_index(drop=True), timings, " ".join(notes))
 
 
 def compare(first: Run, second: Run, rows: Sequence[str] | None = None) -> dict[str, dict[str, Any]]:
     """Compare rows of two runs, by default every row that both have, on the pairs that both have evaluated.
 
-    Rows are texts "A:B", for row A of the first and B of the second run, or "A". Returned are by row the number of
-    pairs "n", "acc30" and "median" of both, and `statistics.paired_difference`, the second minus the first. InputError
-    if a row is unknown, or there is no common row or pair.
+    Rows are texts "A:B", for row A of the first and B of the second run, or "A". By row, the number of pairs "n",
+    "acc30" and "median" of both, and `statistics.paired_difference`. InputError if a row or a common pair is missing.
     """
     of_first, of_second = (run.table["row"].unique() for run in (first, second))
     if rows is None:

@@ -17,15 +17,10 @@ from zsp_lite.views import View, crop_size, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
-_POINTS = ("patch_points", "measured_points")  # cached properties of a View
 
 
 class FrameStore:
-    """Frames of one category and their features.
-
-    `timings` are the seconds of every frame that was read ("reading"), of every feature extraction (the extractor's
-    name), and of what else was `timed`.
-    """
+    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage."""
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
         """Make an empty store; `threads` are torch's during feature extraction, None leaves them as they are."""
@@ -50,10 +45,9 @@ class FrameStore:
             extractor = self.extractors[features]
             # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
             with self.timed(features), torch_threads(self.threads):
-                frames = [kept["crop"]]
-                (kept[features],) = (
-                    extractor.describe(frames) if hasattr(extractor, "describe") else extractor([frames[0].rgb])
-                )
+                crop = kept["crop"]
+                found = extractor.describe([crop]) if hasattr(extractor, "describe") else extractor([crop.rgb])
+                (kept[features],) = found
         return kept[features]
 
     def view(self, features: str, key: FrameKey, foreground: str) -> View:
@@ -61,12 +55,7 @@ class FrameStore:
         kept, name = self._kept(key), (features, foreground)
         if name not in kept:
             kept[name] = frame_view(self.frame(key), self.describe(features, key), foreground)
-        view = kept[name]
-        # The 3D points of the patches depend on the crop and the grid alone: all views of the frame share them.
-        for other in kept.values():
-            if isinstance(other, View) and other.features.grid == view.features.grid:
-                vars(view).update({part: vars(other)[part] for part in _POINTS if part in vars(other)})
-        return view
+        return kept[name]
 
     def extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
         """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
@@ -94,7 +83,7 @@ class FrameStore:
         """Add the duration of a block to the `timings` of a stage."""
         start = time.perf_counter()
         yield
-        self.timings.setdefault(stage, []).append(round(time.perf_counter() - start, 5))
+        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
 
     def _read(self, key: FrameKey) -> dict[Any, Any]:
         """Read a frame: its crop, to which is added by name what is computed from it."""

@@ -15,10 +15,9 @@ REFERENCE = "ours"  # the row that all others are compared with
 def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
-    "methods" has by row, over all pairs and "per_category", the figures of `statistics.figures_of`, and where they are
-    known the medians "translation" and "scale" of the pairs that have them, and "symmetric_acc30".
-    "against" compares every row of the same problems with "ours": the row's figure minus that of "ours" (see
-    `statistics.paired_difference`). Intervals and p values come from resampled objects.
+    "methods" has by row, over all pairs and "per_category", what `statistics.figures_of` returns, and where they are
+    known "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
+    `statistics.paired_difference` of each row of the same problems to "ours". All draws resample objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     draws: dict[tuple, Draws] = {}  # rows with the same objects share them

@@ -2,7 +2,6 @@
 
 import logging
 import textwrap
-from pathlib import Path
 
 import click
 
@@ -20,18 +19,14 @@ metrics_option = click.option(
 
 @click.command(
     epilog=examples(
-        "benchmark",
-        "benchmark --data outputs/paper17 --pairs 15 --methods ours,rootsift --out outputs/compared",
+        "benchmark", "benchmark --data outputs/paper17 --pairs 15 --methods ours,rootsift --out outputs/compared",
         "benchmark --list",
     )
-)
+)  # fmt: skip
 @click.option(
-    "--data",
-    type=PATH,
-    envvar="ZSP_LITE_DATA",
-    show_default="$ZSP_LITE_DATA, else data_samples",
+    "--data", type=PATH, envvar="ZSP_LITE_DATA", show_default="$ZSP_LITE_DATA, else data_samples",
     help="Folder in CO3D's layout.",
-)
+)  # fmt: skip
 @backbone_options
 @click.option("--categories", type=NAMES, show_default="all with pose labels", help="Categories.")
 @click.option("--pairs", type=COUNT, default=30, help="Pairs per category.")
@@ -56,7 +51,7 @@ def benchmark(
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
     from zsp_lite.benchmark.own import write_questions
-    from zsp_lite.benchmark.run import evaluate, pairs_of_rows
+    from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.pairs import labelled_categories
     from zsp_lite.samples import sample_data
@@ -69,8 +64,8 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    summary = evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
-    _write_reports(out, out, metrics)
+    evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
+    summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
         _print_summary(summary, metrics, with_paper=len(summary["methods"]) > 3)
@@ -79,6 +74,7 @@ def benchmark(
 
 
 def _list_methods() -> None:
+    """Print the rows, each with its description, then the groups."""
     from zsp_lite.benchmark.methods import GROUPS, METHODS, description
 
     print("Methods (NAME-n3 is the row NAME at 3 target views), then groups\n")
@@ -88,30 +84,14 @@ def _list_methods() -> None:
         print(textwrap.fill(f"{name}: {', '.join(members)}", 100, subsequent_indent="    ", break_on_hyphens=False))
 
 
-def _write_reports(run: Path, out: Path, metrics: list[str]) -> dict:
-    """Write the summary, tables and figures of a run; returns the summary."""
-    import json
-
-    from zsp_lite.benchmark.figures import write_figures
-    from zsp_lite.benchmark.runs import read_run
-    from zsp_lite.benchmark.tables import every_table, write_tables
-    from zsp_lite.io.files import write_atomic
-
-    found = read_run(run)
-    write_atomic(out / "summary.json", json.dumps(found.summary, indent=1).encode())
-    write_tables(every_table(found.summary, metrics), out / "tables")
-    write_figures(found, out / "figures")
-    return found.summary
-
-
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     """Print the tables of a summary, with those of the paper or without."""
     from zsp_lite.benchmark import tables
-    from zsp_lite.cli.terminal import print_tables
+    from zsp_lite.cli.terminal import print_table
 
-    found = [one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")]
-    short = [one for one in found if with_paper or one.name in ("all_rows", "with_others")]
-    print_tables([*short, tables.by_category(summary, most=_ROWS_SHOWN)])
+    paper = tables.paper_tables(summary) if with_paper else []
+    for table in (tables.all_rows(summary, metrics), *paper, tables.by_category(summary, most=_ROWS_SHOWN)):
+        print_table(table)
 
 
 @click.command(epilog=examples("tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"))
@@ -120,7 +100,9 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @metrics_option
 def tables(run, out, metrics) -> None:
     """Write tables and figures of a benchmark run, also of one that goes on."""
-    _print_summary(_write_reports(run, out or run, metrics), metrics, with_paper=True)
+    from zsp_lite.benchmark.run import write_reports
+
+    _print_summary(write_reports(run, out, metrics), metrics, with_paper=True)
 
 
 @click.command(epilog=examples("compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"))
@@ -133,13 +115,12 @@ def compare(run_a, run_b, rows, out) -> None:
 
     RUN_A and RUN_B are folders of runs.
     """
-    from zsp_lite.benchmark.runs import compare as compare_runs
-    from zsp_lite.benchmark.runs import read_run
+    from zsp_lite.benchmark import runs
     from zsp_lite.benchmark.tables import comparison_table, write_tables
-    from zsp_lite.cli.terminal import print_tables
+    from zsp_lite.cli.terminal import print_table
 
-    found = compare_runs(read_run(run_a), read_run(run_b), rows)
+    found = runs.compare(runs.read_run(run_a), runs.read_run(run_b), rows)
     table = comparison_table(found, str(run_a), str(run_b))
-    print_tables([table])
+    print_table(table)
     if out:
         write_tables([table], out)

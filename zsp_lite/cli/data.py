@@ -43,21 +43,19 @@ def print_checks(root: Path, checks: Sequence[Any], deep: bool) -> int:
 
     rows = []
     for check in checks:
-        counts = (check.sequences, check.complete, check.labelled, check.usable, check.pairs, check.frames)
-        rows.append((check.category, check.layout, *(f"{count:,}" for count in counts), decimal(check.size)))
+        counts = (f"{getattr(check, name):,}" for name in _CHECK_COLUMNS[2:-1])
+        rows.append((check.category, check.layout, *counts, decimal(check.size)))
     size = decimal(sum(check.size for check in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)
     for check in checks:
-        lines = []
-        if check.absent:
-            lines.append(f"{check.absent:,} of {check.sequences:,} annotated sequences are not downloaded")
-        if check.labelled > check.usable:
-            lines.append(f"{check.usable} of {check.labelled} labelled sequences can be evaluated")
-        if check.cloudless:
-            lines.append(f"{check.cloudless:,} of {check.sequences:,} sequences have no point cloud")
-        if check.defects:
-            kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
-            lines.append(f"{check.defects.total():,} frames cannot be used ({kinds})")
+        kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
+        counts = [
+            (check.absent, check.sequences, "annotated sequences are not downloaded"),
+            (check.labelled - check.usable, check.labelled, "labelled sequences cannot be evaluated"),
+            (check.cloudless, check.sequences, "sequences have no point cloud"),
+            (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
+        ]
+        lines = [f"{count:,} of {every:,} {what}" for count, every, what in counts if count > 0]
         lines += check.problems[:_PROBLEMS_SHOWN]
         if (more := len(check.problems) - _PROBLEMS_SHOWN) > 0:
             lines.append(f"and {more} more")

@@ -1,43 +1,48 @@
-"""Checks of the installation: packages, weights, cache. Each problem has the command that fixes it."""
+"""The command `doctor`: checks of the installation, each problem with the command that fixes it."""
 
 import os
 import platform
 import sys
 from collections.abc import Iterator
-from typing import NamedTuple
+
+import click
+
+from zsp_lite.cli.common import examples
 
 
-class Check(NamedTuple):
-    """Result of one check."""
+@click.command(epilog=examples("doctor"))
+def doctor() -> int:
+    """Check Python, PyTorch, the weights and the cache, and print a fix for every problem."""
+    failed = []
+    for name, state, found, fix in run_checks():
+        print(f"{state:4}  {name:16}  {found}")
+        if fix:
+            print(f"{'':24}-> {fix}")
+        if state == "bad":
+            failed.append(name)
+    print(f"Missing or broken: {', '.join(failed)}." if failed else "Everything required is installed.")
+    return 1 if failed else 0
 
-    name: str
-    state: str  # "ok", "note" (optional) or "bad"
-    found: str
-    fix: str = ""
 
-
-def run_checks() -> Iterator[Check]:
-    """Run all checks, in the order in which problems should be fixed."""
-    yield Check("Python", "ok", f"{platform.python_version()} on {platform.system()} ({sys.executable})")
+def run_checks() -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, state ("ok", "note" if it is optional, "bad"), what was found, and the fix, first problems first."""
+    yield "Python", "ok", f"{platform.python_version()} on {platform.system()} ({sys.executable})", ""
     try:
         import torch
 
         from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, obtained_by
         from zsp_lite.io.download import cache_folder
     except (ImportError, OSError) as error:
-        fix = f"{sys.executable} -m pip install path/to/zsp-lite"
-        yield Check("packages", "bad", f"cannot be imported: {error}", fix)
+        yield "packages", "bad", f"cannot be imported: {error}", f"{sys.executable} -m pip install path/to/zsp-lite"
         return
     cuda = f"CUDA on {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else "no CUDA (not required)"
-    yield Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads, {cuda}")
-    for name, path in available_backbones().items():
-        if path is None:
-            yield Check(f"weights {name}", "bad" if name == DEFAULT else "note", "no file", obtained_by(name))
-        else:
-            yield Check(f"weights {name}", "ok", f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    yield "torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads, {cuda}", ""
+    path = available_backbones()[DEFAULT]
+    state, fix = ("ok", "") if path else ("bad", obtained_by(DEFAULT))
+    yield f"weights {DEFAULT}", state, f"{path or 'no file'} (all: zsp-lite weights list)", fix
     folder = cache_folder()
     existing = next(one for one in (folder, *folder.parents) if one.exists())
     if existing.is_dir() and os.access(existing, os.W_OK):
-        yield Check("cache", "ok", str(folder))
+        yield "cache", "ok", str(folder), ""
     else:
-        yield Check("cache", "note", f"{folder} cannot be written", "set ZSP_LITE_CACHE to a folder, for downloads")
+        yield "cache", "note", f"{folder} cannot be written", "set ZSP_LITE_CACHE to a folder, for downloads"

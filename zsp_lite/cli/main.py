@@ -12,11 +12,13 @@ from collections.abc import Sequence
 
 import click
 
+from zsp_lite import __version__
 from zsp_lite.cli.align import align
 from zsp_lite.cli.benchmark import benchmark, compare, tables
 from zsp_lite.cli.common import examples
 from zsp_lite.cli.data import data
 from zsp_lite.cli.demo import demo
+from zsp_lite.cli.doctor import doctor
 from zsp_lite.cli.download import download
 from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.synth import synth
@@ -28,11 +30,12 @@ from zsp_lite.errors import InputError
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120, "show_default": True},
     epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr and exit code 2.",
 )
+@click.version_option(__version__)
 def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (demo, estimate, align, benchmark, tables, compare, synth, data):
+for command in (demo, estimate, align, benchmark, tables, compare, synth, data, doctor):
     cli.add_command(command)
 data.add_command(download)
 
@@ -103,19 +106,3 @@ def verify(name) -> None:
 
     load.verify(name)
     print(f"{name}: complete, loads")
-
-
-@cli.command(epilog=examples("doctor"))
-def doctor() -> int:
-    """Check Python, PyTorch, the weights and the cache, and print a fix for every problem."""
-    from zsp_lite.cli.doctor import run_checks
-
-    failed = []
-    for check in run_checks():
-        print(f"{check.state:4}  {check.name:22}  {check.found}")
-        if check.fix:
-            print(f"{'':30}-> {check.fix}")
-        if check.state == "bad":
-            failed.append(check.name)
-    print(f"Missing or broken: {', '.join(failed)}." if failed else "Everything required is installed.")
-    return 1 if failed else 0

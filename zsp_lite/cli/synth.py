@@ -45,18 +45,16 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     from zsp_lite.synthetic.model_export import export_models
 
     sequences, frames, left_out = given["sequences"] or 4, given["frames"] or 24, {}
-    if preset:
-        refuse_options(given, (), "--preset")
-        with writing(out):
+    with writing(out):
+        if preset:
+            refuse_options(given, (), "--preset")
             export_preset(preset, out, seed, progress=tqdm)
-    elif categories:
-        refuse_options(given, ("sequences", "frames"), "--category")
-        with writing(out):
+        elif categories:
+            refuse_options(given, ("sequences", "frames"), "--category")
             export_categories(list(categories), out, sequences, frames, seed, progress=tqdm)
-    else:
-        refuse_options(given, ("frames", "image_size", "front", "up"), "--models")
-        size, front, up = given["image_size"] or 256, given["front"], given["up"]
-        with writing(out):
+        else:
+            refuse_options(given, ("frames", "image_size", "front", "up"), "--models")
+            size, front, up = given["image_size"] or 256, given["front"], given["up"]
             left_out = export_models(models_folder, out, frames, seed, size, front, up, tqdm)
     for key, reason in left_out.items():
         print(f"Left out {key}: {reason}")

@@ -18,29 +18,19 @@ def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
     _print_whole(table)
 
 
-def print_tables(tables: Iterable[Any]) -> None:
-    """Print every `Table` of a benchmark run."""
-    for table in tables:
-        _print_whole(as_rich(table))
-
-
-def as_rich(table: Any) -> RichTable:
-    """Format a `Table` of a benchmark run: intervals below their figures, published figures dim."""
-    from zsp_lite.benchmark.tables import PUBLISHED
-
-    made = RichTable(
-        title=table.title, caption=table.note or None, caption_justify="left", box=SIMPLE_HEAD, pad_edge=False
-    )
+def print_table(table: Any) -> None:
+    """Print a `Table` of a benchmark run: intervals below their figures, published figures dim."""
+    look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
+    made = RichTable(title=table.title, caption=table.note or None, **look)
     longest = max(map(len, table.text.index), default=0)
     made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
-    for group, title in table.text.columns:
-        style = "dim" if group == PUBLISHED else None
-        group = group.replace("this run: ", "").replace("this run", "").replace(" on ", "\non ").replace(" (", "\n(")
-        title = title.replace(" (", "\n(").replace(" Acc30", "\nAcc30")
-        made.add_column(f"{group}\n{title}" if group else title, justify="right", style=style, header_style=style)
+    for title in table.text.columns:
+        style = "dim" if title.startswith("published") else None
+        title = title.replace(": ", "\n").replace(" on ", "\non ").replace(" (", "\n(").replace(" Acc30", "\nAcc30")
+        made.add_column(title, justify="right", style=style, header_style=style)
     for label, *cells in table.text.itertuples():
         made.add_row(label, *(cell.replace(" [", "\n[") for cell in cells))
-    return made
+    _print_whole(made)
 
 
 def _print_whole(table: RichTable) -> None:
