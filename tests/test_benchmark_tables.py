@@ -215,7 +215,7 @@ def test_the_papers_figures_were_copied_right():
 def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(tmp_path):
     result = {"error": 10.0, "symmetric_error": 5.0, "translation": 0.5, "scale": 1.1, "view": 1, "inliers": 9,
               "seconds": 2.0, "note": "flat", "confidence": 0.7}  # fmt: skip
-    results = {"chair/a:3/b.c:0,12": result, "lamp/a:0/b:4": {"error": 180.0, "failed": "no depth"}}
+    results = {"chair/a:3/b.c:0,12": result, "lamp/a:0/b:4,6": {"error": 180.0, "failed": "no depth"}}
     made = write_run(tmp_path, {"mine": results, "last": {}}, ["lamp", "chair", "cup"])
     second, first = made.table.to_dict("records")
     known = {"row": "mine", "pair": "chair/a:3/b.c:0,12", "problem": "chair/a:3/b.c", "category": "chair"}

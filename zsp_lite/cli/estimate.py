@@ -13,7 +13,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
         "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
         "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",
-        "estimate path/to/scan path/to/other_scan --helpers path/to/third_scan path/to/fourth_scan",
+        "estimate data_samples/car/suv data_samples/car/seat_leon --helpers data_samples/car/peugeot_308",
     )
 )
 @click.argument("reference", type=PATH)
