@@ -84,6 +84,12 @@ def test_the_verified_solver_stands_by_number_of_views(tmp_path):
     assert list(next(line for line in left.get_lines() if line.get_label() == "verified").get_xdata()) == [1, 3, 5, 10]
 
 
+def test_a_row_that_sees_other_objects_has_a_table_of_its_own(tmp_path):
+    made = made_up_run(tmp_path, ["ours", "verified", "category"])
+    found = {table.name: list(table.cells.index) for table in every_table(made.summary)}
+    assert found["with_others"] == ["category"] and found["all_rows"] == tables.important_rows(made.summary)
+
+
 def test_figures_by_category_are_those_of_the_summary(run):
     found = {table.name: table for table in every_table(run.summary)}
     methods, rows = run.summary["methods"], tables.important_rows(run.summary)

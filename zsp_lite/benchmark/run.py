@@ -107,7 +107,7 @@ def write_reports(run: str | Path, out: str | Path | None = None, metrics: Seque
     """
     found, out = read_run(run), Path(out or run)
     tables = every_table(found.summary, metrics)
-    for name in {spec["name"] for spec in read_paper_tables()} - {table.name for table in tables}:
+    for name in {"with_others", *(spec["name"] for spec in read_paper_tables())} - {table.name for table in tables}:
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
     write_tables(tables, out / "tables")

@@ -18,6 +18,7 @@ from zsp_lite.io.files import write_atomic
 
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "published on CO3D (other data)"
+WITH_OTHERS = ("category",)  # rows that see other objects than the two of the pair
 _PUBLISHED_NOTE = "Published figures are the paper's, of DINO ViT-S/8 on CO3D."
 _LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
 _FEATURED = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster")  # with their Acc30 in Table 1
@@ -62,13 +63,19 @@ class Table:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    return [all_rows(summary, metrics), *paper_tables(summary), *(by_category(summary, one) for one in PAPER)]
+    shown = [all_rows(summary, metrics), all_rows(summary, metrics, with_others=True), *paper_tables(summary)]
+    return [table for table in (*shown, *(by_category(summary, one) for one in PAPER)) if len(table.cells)]
 
 
-def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> Table:
-    """Return every row of the run: its figures, failed pairs, and its difference to "ours"."""
+def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, with_others: bool = False) -> Table:
+    """Return every row of the run: its figures, failed pairs, and its difference to "ours".
+
+    Rows that see other objects than the two of the pair are in a table of their own, that `with_others`.
+    """
     rows = {}
     for name, row in summary["methods"].items():
+        if (library_row(name) in WITH_OTHERS) != with_others:
+            continue
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, None, None]
         if test := summary.get("against", {}).get(name):
@@ -76,8 +83,10 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN)
             rows[name][-2:] = [difference, Cell(test["accuracy_gain_p"], decimals=3)]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    note = _note(summary, metrics, gain, '"category" sees other objects, too.' if "category" in rows else "")
-    return Table("all_rows", "All rows", _frame(rows, titles), note, titles[1:4], _data(summary))
+    name, title = "all_rows", "All rows"
+    if with_others:
+        name, title = "with_others", "With other unlabelled objects of the category"
+    return Table(name, title, _frame(rows, titles), _note(summary, metrics, gain), titles[1:4], _data(summary))
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -143,9 +152,10 @@ def own_rows(summary: Mapping[str, Any]) -> list[str]:
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run, "ours" and one's own first."""
+    """List the rows of a run that see the pair only, "ours" and one's own first."""
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
-    return sorted(summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
+    names = [name for name in summary["methods"] if library_row(name) not in WITH_OTHERS]
+    return sorted(names, key=lambda name: first.index(name) if name in first else len(first))
 
 
 def library_row(name: str) -> str:

@@ -89,9 +89,10 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_table
 
-    paper = tables.paper_tables(summary) if with_paper else []
-    for table in (tables.all_rows(summary, metrics), *paper, tables.by_category(summary, most=_ROWS_SHOWN)):
-        print_table(table)
+    found = [one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")]
+    for table in (*found, tables.by_category(summary, most=_ROWS_SHOWN)):
+        if with_paper or table.name in ("all_rows", "with_others", "categories_acc30"):
+            print_table(table)
 
 
 @click.command(epilog=examples("tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"))
