@@ -3,7 +3,7 @@
     python -m tools.size
 
 `tests/size_limits.csv` names the rooms, the pattern of their files and the limits; a test holds them. Lines are all
-lines of Python files; tokens are Python's, without comments and docstrings; definitions are functions and classes;
+lines of files of code; tokens are Python's, without comments and docstrings; definitions are functions and classes;
 words are those of Markdown files and of the text cells of notebooks.
 """
 
@@ -55,11 +55,12 @@ def _measure(row: dict[str, str]) -> Room:
     if row["unit"] == "words":
         size = sum(len(_prose(file, text).split()) for file, text in zip(files, texts))
         return Room(row["room"], "words", size, int(row["limit"]), 0, 0)
-    trees = [ast.parse(text) for text in texts]
+    code = [text for file, text in zip(files, texts) if file.suffix == ".py"]
+    trees = [ast.parse(text) for text in code]
     named = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     docstrings = sum(ast.get_docstring(node) is not None for node in [*trees, *named])
     tokens = sum(
-        one.type not in _NO_CODE for text in texts for one in tokenize.generate_tokens(io.StringIO(text).readline)
+        one.type not in _NO_CODE for text in code for one in tokenize.generate_tokens(io.StringIO(text).readline)
     )
     lines = sum(text.count("\n") for text in texts)
     return Room(row["room"], "lines", lines, int(row["limit"]), tokens - docstrings, len(named))

@@ -3,6 +3,7 @@
 import json
 import os
 import secrets
+import shutil
 import socket
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[2]
 
 # A notebook of which every cell is in the page, no news asked for.
@@ -21,6 +24,36 @@ _SETTINGS = {
     "@jupyterlab/apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/docmanager-extension/plugin": {"autosave": False},
 }
+
+
+def chromium(playwright) -> str | None:
+    """The system's Chromium or Chrome, or else the one that Playwright has installed."""
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    found = next(filter(None, map(shutil.which, names)), None)
+    own = playwright.chromium.executable_path
+    return found or (own if Path(own).exists() else None)
+
+
+def without_chromium() -> None:
+    """Skip the test, or let it fail on a machine for continuous integration, where it must not pass unseen."""
+    refuse = pytest.fail if os.environ.get("CI") else pytest.skip
+    refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
+
+
+@contextmanager
+def running_chromium():
+    """Chromium, as a browser of Playwright; without one see `without_chromium`."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        program = chromium(playwright)
+        if program is None:
+            without_chromium()
+        options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
+        options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
+        running = playwright.chromium.launch(executable_path=program, args=options)
+        yield running
+        running.close()
 
 
 @dataclass(frozen=True)

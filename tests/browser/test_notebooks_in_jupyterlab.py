@@ -3,7 +3,6 @@
 A self-check gives feedback, and asks nothing of the network.
 """
 
-import os
 import shutil
 from pathlib import Path
 
@@ -16,10 +15,12 @@ from lab_in_browser import (
     open_notebook,
     photograph,
     run_all,
+    running_chromium,
     saved,
     serve,
     slider_moves_picture,
     slider_outputs,
+    without_chromium,
 )
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
@@ -40,33 +41,10 @@ display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.ge
 """
 
 
-def chromium(playwright) -> str | None:
-    """The system's Chromium or Chrome, or else the one that Playwright has installed."""
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    found = next(filter(None, map(shutil.which, names)), None)
-    own = playwright.chromium.executable_path
-    return found or (own if Path(own).exists() else None)
-
-
-def without_chromium() -> None:
-    """Skip the test, or let it fail on a machine for continuous integration, where it must not pass unseen."""
-    refuse = pytest.fail if os.environ.get("CI") else pytest.skip
-    refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
-
-
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        program = chromium(playwright)
-        if program is None:
-            without_chromium()
-        options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
-        options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
-        running = playwright.chromium.launch(executable_path=program, args=options)
+    with running_chromium() as running:
         yield running
-        running.close()
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,31 @@
+"""What `tools.playground` writes for the page docs/playground.md; tests/browser/ tests the page itself."""
+
+import json
+import zlib
+from base64 import b64decode
+
+import numpy as np
+import pytest
+import torch
+
+from tools.playground import KEY_STEP, pair_data, stored_pairs
+from zsp_lite import Co3D, ZeroShotPose, load_backbone
+from zsp_lite.matching import key_similarities, similarity
+from zsp_lite.samples import sample_data
+
+
+@pytest.mark.slow
+def test_the_stored_keys_have_the_similarities_of_the_originals_and_eight_pairs_fit_into_six_megabytes():
+    dataset, method = Co3D(sample_data()), ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
+    pairs = stored_pairs(dataset)
+    reference, targets = dataset.load_pair(pairs[3])
+    views, error = pair_data(dataset, pairs[3], method)
+    assert len(pairs) == 8 and error < 15 and len(json.dumps(views)) < 740_000
+    originals = [view.features for view in method.views([reference, targets[0]])]
+    packed = (np.frombuffer(zlib.decompress(b64decode(view["keys"])), "<i2") for view in views[:2])
+    keys = [
+        torch.from_numpy(KEY_STEP * one.reshape(-1, 28, 28).transpose(1, 2, 0).astype(np.float32)) for one in packed
+    ]
+    assert (similarity(*keys) - similarity(*originals)).abs().max() < 5e-4
+    (stored,), (original,) = key_similarities(keys[0], keys[1:]), key_similarities(originals[0], originals[1:])
+    assert (stored - original).abs().max() < 2.5e-3
