@@ -686,59 +686,63 @@ def draw_frames() -> str:
     )  # fmt: skip
 
 
-def move(points: np.ndarray, x: np.ndarray, y: np.ndarray, mirror: bool = False) -> np.ndarray:
-    """Move points (N, 2) by the best rotation and translation from x to y; with `mirror`, by the best that mirrors."""
+def move(points: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Move points (N, 2) by the best rotation and translation from x to y."""
     a, b = x - x.mean(0), y - y.mean(0)
     u, _, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1, np.sign(np.linalg.det(u @ vt)) * (-1 if mirror else 1)])
-    return (points - x.mean(0)) @ (u * sign @ vt).T + y.mean(0)
+    return (points - x.mean(0)) @ (u * [1, np.sign(np.linalg.det(u @ vt))] @ vt).T + y.mean(0)
 
 
-# A chair from its side: back, seat, legs.
-_PROFILE = np.array([[0, 96], [0, 0], [0, 52], [52, 52], [52, 96]], float)
+def _frame_of(chair: Chair) -> np.ndarray:
+    """Return the corners (10, 3) of a chair: feet, seat and top, back before front; left and right alternate."""
+    feet = np.array([chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]) * [1, 1, 0]
+    seat, back = chair["seat"], chair["back"]
+    tops = feet[:2] * [1, 0, 0] + [0, back[0][1], back[0][2] + back[1][2] / 2]
+    return np.vstack([feet, feet + [0, 0, seat[0][2]], tops])
 
 
 def draw_mirror() -> str:
-    width, height, panel = 860, 290, 280
-    shape = _PROFILE - _PROFILE.mean(0)
-    other = shape * [-1, 1]
-    tilt = np.radians(-14)
-    other = other @ np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]).T
-
-    def outline(points: np.ndarray, colour: str, dash: str | None = None) -> str:
-        path = "M" + "L".join(f"{number(a)} {number(b)}" for a, b in points)
-        return curve(path, colour, 5, dash) + "".join(dot(point, colour, 6) for point in points[[0, 1, 3, 4]])
-
-    def lines(first: np.ndarray, second: np.ndarray) -> str:
-        return "".join(curve(straight(a, b), GREY, 1.6, "3 3") for a, b in zip(first, second, strict=True))
-
-    centre = np.array([panel / 2, 128])
-    drawn = ""
+    """Draw the best orthogonal matrix and the best rotation for matches that confuse the left and the right."""
+    width, height, panel, size = 860, 300, 280, 176
+    edges = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 7), (7, 6), (6, 4), (4, 8), (5, 9), (8, 9)]
+    x = _frame_of(REFERENCE)
+    y = x[np.arange(len(x)) ^ 1]  # left and right exchanged
+    centre = x.mean(0)
+    u, _, vt = np.linalg.svd((y - centre).T @ (x - centre))
+    sign = np.linalg.det(u @ vt)
+    fits = [(x - centre) @ (u * [1, 1, last] @ vt).T + centre for last in (1, sign)]
     panels = (
-        ("The points", ("The second object happens to", "be a mirror image of the first.")),
-        ("The best matrix: det = −1", ("Every point fits, but no motion", "of the object does this.")),
+        ("The matches", ("They join the left of a chair", "with its right.")),
+        ("The best matrix: det = −1", ("Every point is on its match, but left", "is right now. No motion does this.")),
         ("The best rotation: det = +1", ("The fit is worse. It is a motion,", "and so it is the answer.")),
     )
+    drawn = ""
     for i, (title, words) in enumerate(panels):
-        x = 10 + panel * i
-        drawn += text(title, x + panel / 2, 34, 15, anchor="middle", bold=True)
+        left = 10 + panel * i
+        drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
         if i == 0:
-            picture = outline(shape + centre - [64, 0], BLUE) + outline(other + centre + [64, 0], ORANGE)
-            a, b = shape + centre - [64, 0], other + centre + [64, 0]
-            picture = lines(a[[0, 1, 3, 4]], b[[0, 1, 3, 4]]) + picture
+            first, second = Photo(REFERENCE, 30, left + 4, 66, 126), Photo(REFERENCE, 30, left + 144, 66, 126)
+            drawn += first.draw(BLUE) + second.draw(ORANGE)
+            moved, colour, ends = first.project(x)[0], GREY, [8, 9, 6, 7]
         else:
-            moved = move(shape, shape, other, mirror=i == 1)
-            picture = outline(other + centre, ORANGE) + (lines(moved + centre, other + centre) if i == 2 else "")
-            picture += outline(moved + centre, BLUE, "7 9" if i == 1 else None)
-        drawn += group(picture, x, 0)
-        drawn += "".join(text(line, x + panel / 2, 236 + 20 * j, 14, anchor="middle") for j, line in enumerate(words))
+            second = Photo(REFERENCE, 30, left + (panel - size) / 2, 46, size)
+            drawn += second.draw(ORANGE)
+            moved, colour, ends = second.project(fits[i - 1])[0], VERMILLION, range(len(x))
+            drawn += "".join(curve(straight(moved[j], moved[k]), BLUE, 3) for j, k in edges)
+        goal = second.project(y)[0]
+        for j in ends:
+            if np.linalg.norm(goal[j] - moved[j]) > 1:
+                drawn += curve(straight(moved[j], goal[j]), colour, 1.8, "3 3")
+            drawn += dot(goal[j], ORANGE, 5) + dot(moved[j], BLUE, 4)
+        for j, line in enumerate(words):
+            drawn += text(line, left + panel / 2, 246 + 20 * j, 14, anchor="middle")
         if i:
-            drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2)
+            drawn += curve(f"M{left} 20V{height - 20}", LINE, 1.2)
     return svg(
         drawn, width, height, "Mirror and rotation",
-        "A chair from its side and its mirror image. The best orthogonal matrix lays one exactly on the other, but it "
-        "is a "
-        "mirror. The best rotation leaves distances between the points, and is the answer.",
+        "A chair whose matches confuse left and right. The best orthogonal matrix puts every point on its match, but "
+        "it is a mirror, which no motion of the chair does. The best rotation leaves distances between the points, and "
+        "is the answer.",
     )  # fmt: skip
 
 
@@ -762,8 +766,8 @@ def draw_ransac() -> str:
         good = np.flatnonzero(inside)
         picture = ""
         for j, (a, b) in enumerate(zip(moved, y, strict=True)):
-            picture += ring(b, LINE, radius, 1.2)
-            picture += curve(straight(a, b), GREEN if inside[j] else VERMILLION, 2.4, None if inside[j] else "4 4")
+            picture += ring(b, GREEN if inside[j] else LINE, radius, 2.6 if inside[j] else 1.2)
+            picture += "" if inside[j] else curve(straight(a, b), VERMILLION, 2.4, "4 4")
             picture += dot(b, ORANGE, 5) + dot(a, BLUE, 5)
             if i < 2 and j in sample:
                 picture += ring(a, INK, 8, 2)
@@ -778,7 +782,7 @@ def draw_ransac() -> str:
         (dot(np.array([20, 300]), BLUE, 5), "reference point, moved", 32),
         (dot(np.array([220, 300]), ORANGE, 5), "target point", 232),
         (ring(np.array([350, 300]), LINE, 9, 1.6), "threshold", 366),
-        (curve("M462 300h22", GREEN, 2.4), "inlier", 490),
+        (ring(np.array([472, 300]), GREEN, 9, 2.6), "inlier", 488),
         (curve("M556 300h22", VERMILLION, 2.4, "4 4"), "outlier", 584),
         (ring(np.array([664, 300]), INK, 8, 2), "drawn in the sample", 678),
     )
