@@ -78,7 +78,7 @@ notebooks: $(STAMP)
 # From the stored outputs of the notebooks. A warning, such as a broken link, is an error. What the playground loads is
 # written meanwhile, on the other core.
 site: $(STAMP)
-	OMP_NUM_THREADS=1 $(RUN) -m tools.playground outputs/site/docs/playground & playground=$$!; \
+	OMP_NUM_THREADS=1 $(RUN) -m docs.playground.build outputs/site/docs/playground & playground=$$!; \
 	  $(RUN) -m sphinx -q -W --keep-going -c docs/site -d outputs/site-doctrees . outputs/site && \
 	  wait $$playground
 	@echo "the course site is outputs/site/index.html"

@@ -1,4 +1,4 @@
-"""What `tools.playground` writes for the page docs/playground.md; tests/browser/ tests the page itself."""
+"""What `docs.playground.build` writes for the page docs/playground.md; tests/browser/ tests the page itself."""
 
 import json
 import zlib
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tools.playground import KEY_STEP, pair_data, stored_pairs
+from docs.playground.build import KEY_STEP, pair_data, stored_pairs
 from zsp_lite import Co3D, ZeroShotPose, load_backbone
 from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.samples import sample_data

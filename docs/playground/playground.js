@@ -1,4 +1,4 @@
-// The page: pairs, controls and pictures. method.js has the method; tools/playground.py writes playground/.
+// The page: pairs, controls and pictures. method.js has the method; build.py writes playground/.
 "use strict";
 
 const CANVAS = 448, CELL = CANVAS / SIDE, CROP = 224, FIRST_PAIR = 3; // sizes in pixels

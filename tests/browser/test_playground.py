@@ -13,7 +13,7 @@ import pytest
 import torch
 from lab_in_browser import REPOSITORY, running_chromium
 
-from tools.playground import stored_pairs, write_page_data
+from docs.playground.build import stored_pairs, write_page_data
 from zsp_lite import Co3D, FeatureMap, ZeroShotPose, load_backbone
 from zsp_lite.alignment import ransac
 from zsp_lite.best_view import correspondence_score

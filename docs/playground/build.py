@@ -1,4 +1,4 @@
-"""Write what docs/playground.md loads: `python -m tools.playground outputs/site/docs/playground`.
+"""Write what docs/playground.md loads: `python -m docs.playground.build outputs/site/docs/playground`.
 
 onnxruntime-web is fetched from the npm registry, or that in npm_config_registry, into the cache.
 """
