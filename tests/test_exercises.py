@@ -1,11 +1,11 @@
 """The exercises: given cells run, the solutions pass every test, the students' version none, typical mistakes fail."""
 
-import ast
-import builtins
 import os
 import re
 import shutil
+import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -13,7 +13,6 @@ import nbformat
 import numpy as np
 import pytest
 from nbgrader.api import Gradebook
-from nbgrader.apps.api import NbGraderAPI
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from traitlets.config import PyFileConfigLoader
 
@@ -25,100 +24,88 @@ ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 # For each assignment and task: the name of a mistake, the part of the solution to replace, and its replacement.
 MISTAKES = {
     "01_features": {
-        "patchify": {
-            "patches column by column": ("transpose(0, 2, 1, 3, 4)", "transpose(2, 0, 1, 3, 4)"),
+        "patches": {
+            "column by column": ("transpose(0, 1, 3, 4, 2)", "transpose(1, 0, 3, 4, 2)"),
+            "stride forgotten": ("[::stride, ::stride]", "[::p, ::p]"),
         },
         "attention_head": {
             "scale forgotten": (" / np.sqrt(query.shape[1])", ""),
             "softmax over the columns": ("axis=1", "axis=0"),
             "overflow": (" - logits.max(axis=1, keepdims=True)", ""),
+            "background gets 0 before the softmax": ("-np.inf", "0"),
         },
-        "log_bin": {
-            "rows and columns swapped": ("x[rows[:, None], columns]", "x[columns[:, None], rows]"),
-            "far ring not pooled": ("shifted(pooled", "shifted(keys"),
+        "turn_parts": {
+            "the other way round": ("reshape(3, 3))", "reshape(3, 3), -1)"),
+            "near parts only": ("np.rot90(ring)", "ring"),
         },
     },
     "02_cyclical_maps": {
-        "nearest": {
-            "rows and columns swapped": (
-                "sim.argmax(axis=1), sim.argmax(axis=0)",
-                "sim.argmax(axis=0), sim.argmax(axis=1)",
-            )
+        "ratio_test": {
+            "similarities for distances": ("np.sqrt(np.maximum(2 - 2 * sim, 0))", "1 - sim"),
+            "nothing over nothing": ("second, 1), 1.0)", "second, 1), 0.0)"),
+            "cosine above one": ("np.maximum(2 - 2 * sim, 0)", "(2 - 2 * sim)"),
         },
-        "cycle": {
-            "rows and columns swapped": ("rows, columns = grid", "columns, rows = grid"),
-            "distance along the reading order": ("np.hypot(row_step, column_step)", "np.abs(here - there)"),
+        "two_way": {
+            "one end only": ("np.maximum(", "(lambda one, other: one)("),
+            "columns of the other grid": ("v_end, fg2.shape[1]", "v_end, fg1.shape[1]"),
+            "return not checked": (" & on1[u_end]", ""),
         },
-        "cyclical_map": {
-            "return not checked": (" & on1[back[forth]]", ""),
-            "target's foreground not checked": (" & on2[forth]", ""),
-        },
-        "mutual": {
-            "one way only": ("np.flatnonzero(back[forth] == here)", "here"),
-            "ends swapped": ("[closed, forth[closed]]", "[forth[closed], closed]"),
+        "spread": {
+            "far from the last one only": ("free &= np", "free = ~np.isin(scores, scores[chosen]) & np"),
+            "gap excluded": (">= gap", "> gap"),
+            "what is no match": ("np.isfinite(scores)", "np.ones(len(scores), bool)"),
         },
     },
     "03_best_view": {
         "score": {
-            "missing matches cost nothing": (" - (k - len(distances)) * np.sqrt(2)", ""),
+            "sum, not mean": ("-distances.mean()", "-distances.sum()"),
+            "missing matches cost nothing": (" - penalty * (k - len(distances)) / k", ""),
             "cosine above one": ("np.maximum(2 - 2 * np.asarray(cosines, dtype=float), 0)", "2 - 2 * cosines"),
-        },
-        "choose": {
-            "lowest score": ("max(", "min("),
-            "few matches are fine": (" if count >= minimum", ""),
         },
         "regret": {
             "angle, not regret": (" - angles.min(axis=1)", ""),
             "nearest of all pairs": ("angles.min(axis=1)", "angles.min()"),
+            "few matches are fine": ("counts >= minimum", "counts >= 0"),
+            "a pair without a view": ("regrets[allowed.any(axis=1)]", "regrets"),
         },
         "self_fit": {
             "turned about the origin": ("points - points.mean(axis=0)", "points"),
-            "each point against itself": ("distances.min(axis=1)", "np.diag(distances)"),
-            "turned the other way round": ("rotation.T", "rotation"),
+            "one way only": ("max(there, back)", "there"),
         },
     },
     "04_umeyama_ransac": {
         "umeyama": {
             "forgotten reflection": ("np.sign(np.linalg.det(left @ right))", "1"),
-            "scale from the spreads": (
-                "(sign * singular).sum() / np.square(centred_x).sum()",
-                "np.sqrt(np.square(centred_y).sum() / np.square(centred_x).sum())",
-            ),
-            "rotation transposed": ("centred_y.T @ centred_x", "centred_x.T @ centred_y"),
+            "sign forgotten in the scale": ("(sign * singular).sum()", "singular.sum()"),
+            "means without weights": ("share @ x, share @ y", "x.mean(axis=0), y.mean(axis=0)"),
+            "weights not normalised": ("weights / weights.sum()", "weights"),
+            "rotation transposed": ("left @ np.diag(sign) @ right", "(left @ np.diag(sign) @ right).T"),
         },
         "trials": {
-            "one match, not a sample": ("inlier_share**size", "inlier_share"),
+            "the same match twice": ("(right - i) / (k - i)", "right / k"),
             "chance of failure for success": ("math.log(1 - confidence)", "math.log(confidence)"),
+            "fewer right matches than a sample": ("if right >= size else 0", "+ 1e-30"),
         },
         "consensus": {
             "last trial, not the best": ("if (residuals < threshold).sum() > best.sum():", "if True:"),
-            "no fit to all inliers": ("library_umeyama(x[best], y[best])", "library_umeyama(x[sample], y[sample])"),
-            "source and target swapped": ("library_umeyama(x[best], y[best])", "library_umeyama(y[best], x[best])"),
+            "no fit to all inliers": ("fit(x[best], y[best])", "fit(x[sample], y[sample])"),
+            "never stops early": (" and done < needed(best.sum())", ""),
         },
     },
     "05_metrics": {
-        "geodesic": {
-            "radians": ("np.degrees(np.arctan2", "(np.arctan2"),
-            "bare arccos": (
-                "np.arctan2(sine, np.trace(relative) - 1)",
-                "np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))",
-            ),
-            "no transpose": ("first.T @ second", "first @ second"),
-        },
-        "ground_truth": {
-            "written from left to right": (
-                "camera_b @ label_b @ np.linalg.inv(label_a) @ np.linalg.inv(camera_a)",
-                "np.linalg.inv(camera_a) @ np.linalg.inv(label_a) @ label_b @ camera_b",
-            ),
-            "label not inverted": ("np.linalg.inv(label_a)", "label_a"),
-        },
         "symmetric_error": {
-            "turned in the wrong frame": ("truth @ turn(axis, 360 * k / n)", "turn(axis, 360 * k / n) @ truth"),
+            "turned in the wrong frame": ("R @ turn(axis, 360 * i / n)", "turn(axis, 360 * i / n) @ R"),
+            "either end of the axis": ("a @ b", "abs(a @ b)"),
+        },
+        "new_label": {
+            "wrong order": ("np.linalg.inv(camera_b) @ estimate", "estimate @ np.linalg.inv(camera_b)"),
+            "scale removed": ("@ estimate", "@ (estimate / np.cbrt(np.linalg.det(estimate[:3, :3])))"),
         },
         "accuracy": {
-            "drawn without replacement": (
-                "rng.choice(errors, size=(resamples, len(errors)))",
-                "rng.permuted(np.tile(errors, (resamples, 1)), axis=1)",
+            "pairs drawn": ("np.unique(objects", "np.unique(np.arange(len(errors))"),
+            "mean over objects": (
+                "right[drawn].sum(axis=1) / number[drawn].sum(axis=1)",
+                "(right / number)[drawn].mean(1)",
             ),
             "30 degrees count as below 30": ("< threshold", "<= threshold"),
         },
@@ -130,56 +117,54 @@ MISTAKES = {
 STATEMENTS = {
     "01_features": {
         "the similarity of true partners falls even if every key stays the same": lambda cells: (
-            turned_similarity(cells["log_bin"], cells["keys"]) < 0.99 * turned_similarity(lambda x, _: x, cells["keys"])
-        ),
-        "9 parts take 9 times the storage of the bare key, 17 parts 17 times": lambda cells: (
-            (cells["choices"]["numbers per image"] / cells["choices"]["numbers per image"][0]).tolist() == [1, 9, 17]
+            turned_similarity(lambda x: cells["log_bin"](x[None])[0].numpy(), cells["views"][0])
+            < 0.99 * turned_similarity(np.asarray, cells["views"][0])
         ),
     },
     "02_cyclical_maps": {
-        "The counts never fall from *within 0* to *within 2*": lambda cells: (
-            np.diff(cells["counts"].iloc[:, 2:].to_numpy()) >= 0
-        ).all(),
-        "The column *within 0* counts the mutual nearest neighbours": lambda cells: (
-            cells["counts"].set_index("category")["within 0"]["chair"]
-            == sum(
-                cells["fg1"].ravel()[u] and cells["fg2"].ravel()[v]
-                for u, v in cells["mutual"](cells["chairs_forth"], cells["chairs_back"])
-            )
+        "39 % against 37 % on the bicycles, 32 % against 32 % on the cars": lambda cells: (
+            cells["counts"].iloc[[1, 0], [1, 3]].to_numpy().tolist() == [[39, 32], [37, 32]]
         ),
-        "a larger one never accepts fewer": lambda cells: all(
-            group.is_monotonic_increasing for _, group in cells["limits"].groupby("category")["accepted"]
+        "up to 2 patches are the best broad rule, 48 % and 38 %, and leave more than 100": lambda cells: (
+            cells["counts"].loc["up to 2 patches"].tolist() == [105, 48, 279, 38]
+        ),
+        "highest at 2 patches, 48 and 38 %, against 37 and 32 % without a limit": lambda cells: (
+            cells["limits"].groupby("category")["right of known"].max().tolist() == ["48%", "38%"]
         ),
     },
     "03_best_view": {
-        "The nearest view never gets farther away as N grows": lambda cells: all(
-            group.is_monotonic_decreasing for _, group in cells["views"].groupby("category")["nearest (°)"]
+        "turned by 171°, one of 23° was offered, and it wins clearly, -29.9 against -33.5": lambda cells: (
+            cells["wrong"] == (171, 23)
+        ),
+        "the chosen one does so on three of the four pairs": lambda cells: (
+            sum((np.diff(one) > 0).any() for _, one in cells["views"].groupby("category")["chosen (°)"]) == 3
+            and all(one.is_monotonic_decreasing for _, one in cells["views"].groupby("category")["nearest (°)"])
         ),
     },
     "04_umeyama_ransac": {
-        "the number of inliers never falls as the threshold grows": lambda cells: (
-            cells["thresholds"]["inliers"].is_monotonic_increasing
+        "The number of inliers never falls as the threshold grows": lambda cells: all(
+            table["inliers"].is_monotonic_increasing for table in cells["tables"].values()
         ),
-        "at 3 scene units nearly all matches are inliers, also the shuffled ones": lambda cells: (
-            cells["thresholds"].iloc[-1, 1:3].min() > 0.8 * len(cells["points"][0])
+        "the error is smallest, 5°, at 0.2 and 0.5": lambda cells: (
+            cells["tables"]["chair"]["error (°)"].tolist() == [30, 15, 9, 5, 5, 9, 28]
         ),
-        "The shuffled matches have inliers, too, and their number never falls": lambda cells: (
-            cells["thresholds"]["inliers if shuffled"].is_monotonic_increasing
-            and cells["thresholds"].set_index("threshold")["inliers if shuffled"][0.2] > 0
+        "the motorcycles have 19 inliers and the chairs 18, but the error is 135° against 5°": lambda cells: (
+            [table.loc[0.5].tolist() for table in cells["tables"].values()] == [[18, 4, 5], [19, 9, 135]]
         ),
-        "574 trials with samples of 3, 2,876 with samples of 4 and 1,798,893 with samples of 8": lambda cells: (
-            [cells["trials"](0.2, size) for size in (3, 4, 8)] == [574, 2876, 1798893]
+        "750 trials with samples of 3, 5,049 with samples of 4 and 348,471 with samples of 6": lambda cells: (
+            [cells["trials"](10, 50, size) for size in (3, 4, 6)] == [750, 5049, 348471]
+        ),
+        "samples of 3 have the smaller median (3.3° against 5.4°) but a worst case of 173° against 20°": lambda cells: (
+            np.allclose(cells["settings"].iloc[:2, 2:4], [[3.3, 173.5], [5.4, 20.0]], atol=0.5)
         ),
     },
     "05_metrics": {
         "two intervals that overlap, and p = 0.002": lambda cells: (
-            cells["bootstrap_ci"](cells["new"], lambda e, drawn: cells["library_accuracy"](e, 30, drawn))[0]
-            < cells["bootstrap_ci"](cells["old"], lambda e, drawn: cells["library_accuracy"](e, 30, drawn))[1]
+            cells["intervals"]["new"][0] < cells["intervals"]["old"][1]
             and round(cells["paired_test"](cells["old"], cells["new"])["sign_test_p"], 3) == 0.002
         ),
         "13 that only the new method solves against 1": lambda cells: (
-            np.sum((cells["new"] < 30) & (cells["old"] >= 30)) == 13
-            and np.sum((cells["old"] < 30) & (cells["new"] >= 30)) == 1
+            [np.sum((cells[a] < 30) & (cells[b] >= 30)) for a, b in (("new", "old"), ("old", "new"))] == [13, 1]
         ),
         # A gain of 3 points at a discordance of 12 %: z = 2, and z = 1.96 + 0.84 for a power of 80 %.
         "exceeded from about 530 pairs on, and a power of 80 % takes about 1,050": lambda cells: (
@@ -193,10 +178,10 @@ STATEMENTS = {
 }
 
 
-def turned_similarity(described, keys):
+def turned_similarity(described, view):
     """Mean cosine of a grid's descriptors with those of the same grid, turned by 90 degrees and back again."""
-    turned = np.rot90(keys)
-    pair = described(keys, keys), np.rot90(described(turned, turned), -1)
+    keys = view.features.keys.numpy()
+    pair = described(keys), np.rot90(described(np.rot90(keys).copy()), -1)
     a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in pair)
     return (a * b).sum(axis=-1).mean()
 
@@ -226,12 +211,6 @@ def students_version(assignment, config):
     for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
         notebook, _ = clear(config=config).preprocess(notebook, {})
     return notebook
-
-
-def with_mistake(solution, mistake):
-    right, wrong = mistake
-    assert right in solution, f"the solution does not contain {right!r}"
-    return solution.replace(right, wrong)
 
 
 @pytest.fixture(scope="module")
@@ -272,20 +251,12 @@ def tasks(notebook):
     return found
 
 
-def unknown_names(text, namespace):
-    """Names in the inline code of a text that are neither known nor defined there."""
-    codes = [code for code in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text) if "-" not in code and "..." not in code]
-    used = [node for code in codes for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)]
-    defined = {name.id for name in used if isinstance(name.ctx, ast.Store)} | {*namespace, *dir(builtins)}
-    return {name.id for name in used} - defined
-
-
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_marking_guides(prepared, config, assignment):
     """No given cell needs more than the first cell of the notebook and the function of its own task."""
     handed_out, solutions = students_version(assignment, config), graded(source(assignment), solution=True)
     computed, given = {}, 0
-    for title, cells in tasks(handed_out).items():
+    for cells in tasks(handed_out).values():
         namespace = prepared(assignment)
         for cell in graded(handed_out, solution=True, grade=False).values():
             exec(cell.source, namespace)
@@ -295,14 +266,10 @@ def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_marki
                 given += 1
             elif "nbgrader" in cell.metadata and cell.cell_type == "code" and cell.metadata.nbgrader.solution:
                 exec(solutions[cell.metadata.nbgrader.grade_id].source, namespace)
-        if "read by a person" in title:
-            assert not unknown_names(cells[0].source, namespace), title
         computed |= namespace
     plt.close("all")
     assert given == len(tasks(handed_out))
     exec("\n".join(cell.source for cell in graded(source(assignment), solution=True, grade=False).values()), computed)
-    if assignment == "01_features":
-        computed["keys"] = computed["views"][0].features.keys.numpy()
     guides = " ".join(cell.source for cell in graded(source(assignment), solution=True, grade=True).values())
     for statement, holds in STATEMENTS[assignment].items():
         assert statement in " ".join(guides.split()), statement
@@ -310,19 +277,12 @@ def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_marki
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_every_test_passes_with_the_solutions(prepared, assignment):
-    assert failing_tests(prepared(assignment), source(assignment), source(assignment)) == set()
-
-
-@pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_students_version_shows_no_solution_and_passes_no_test(prepared, config, assignment):
-    notebook = source(assignment)
-    tests = set(graded(notebook, grade=True, solution=False))
-    assert len(tests) >= 3
-    handed_out = students_version(assignment, config)
+def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, config, assignment):
+    notebook, handed_out = source(assignment), students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
     assert "SOLUTION" not in text and "HIDDEN" not in text and "Guide for marking" not in text
-    assert failing_tests(prepared(assignment), handed_out, notebook) == tests
+    assert failing_tests(prepared(assignment), notebook, notebook) == set()
+    assert failing_tests(prepared(assignment), handed_out, notebook) == set(graded(notebook, grade=True, locked=True))
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
@@ -332,76 +292,114 @@ def test_the_students_version_shows_no_solution_and_passes_no_test(prepared, con
 )
 def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake):
     notebook = source(assignment)
-    cell = graded(notebook, solution=True)[task]
-    cell.source = with_mistake(cell.source, MISTAKES[assignment][task][mistake])
-    assert failing_tests(prepared(assignment), notebook, notebook) == {f"test_{task}"}
+    cell, (right, wrong) = graded(notebook, solution=True)[task], MISTAKES[assignment][task][mistake]
+    assert right in cell.source, f"the solution does not contain {right!r}"
+    cell.source = cell.source.replace(right, wrong)
+    failing = failing_tests(prepared(assignment), notebook, notebook)
+    assert failing and {name.removeprefix("test_")[:-2] for name in failing} == {task}
 
 
-@pytest.mark.slow
-def test_nbgrader_generates_grades_and_returns_an_assignment(tmp_path, config, monkeypatch):
-    """A hand-in with one solution, one mistake and the other tasks left open gets the points of the first task."""
-    assignment = "05_metrics"
-    shutil.copytree(EXERCISES / "source" / assignment, tmp_path / "source" / assignment)
-    config.CourseDirectory.root = str(tmp_path)
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel draws as it does for students
-    # nbgrader starts the program `alembic`, which is installed beside the interpreter.
-    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
-    nbgrader = NbGraderAPI(config=config)
-    result = nbgrader.generate_assignment(assignment)
-    assert result["success"], result["log"]
-
-    handed_in = nbformat.read(tmp_path / "release" / assignment / f"{assignment}.ipynb", as_version=4)
-    solutions, answers = graded(source(assignment), solution=True), graded(handed_in, solution=True)
-    first, second, *_ = MISTAKES[assignment]
-    answers[first].source = solutions[first].source
-    answers[second].source = with_mistake(solutions[second].source, next(iter(MISTAKES[assignment][second].values())))
-    answers["better"].source = "See my remark: [Comment](#mine)"
-    folder = tmp_path / "submitted" / "student" / assignment
-    folder.mkdir(parents=True)
-    nbformat.write(handed_in, folder / f"{assignment}.ipynb")
-    result = nbgrader.autograde(assignment, "student")
-    assert result["success"], result["log"]
-    with_hidden_part = {name for name, cell in graded(source(assignment)).items() if "HIDDEN TESTS" in cell.source}
-    assert set(re.findall("'checksum' for cell (\\w+) has changed", result["log"])) == with_hidden_part
-
-    with Gradebook(nbgrader.coursedir.db_url, nbgrader.coursedir.course_id) as gradebook:
-        grades = gradebook.find_submission(assignment, "student").notebooks[0].grades
-        points = {grade.name: grade.auto_score for grade in grades if grade.cell.cell_type == "code"}
-    expected = {f"test_{task}": 0 for task in MISTAKES[assignment]}
-    expected[f"test_{first}"] = graded(source(assignment))[f"test_{first}"].metadata.nbgrader.points
-    assert points == expected
-
-    result = nbgrader.generate_feedback(assignment, "student")
-    assert result["success"], result["log"]
-    page = (tmp_path / "feedback" / "student" / assignment / f"{assignment}.html").read_text(encoding="utf-8")
-    scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
-    titles = [title.removeprefix("## ").partition(" (")[0] for title in tasks(source(assignment))]
-    assert [name for name, _, _ in scores] == titles and "Test cell" not in page
-    assert re.findall(r'href="([^"]*)">Comment</a>', page) == ["#mine"]  # the student's own link, and no other
-    assert scores[0] == (titles[0], "4.0", "4.0") and "HIDDEN TESTS" in page
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "archive/Ada Lovelace_123_assignsubmission_file_05_metrics.ipynb",
-        "archive/Ada Lovelace_123_assignsubmission_file_/05_metrics.ipynb",
-        "archive/lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
-    ],
-)
-def test_nbgrader_recognises_the_files_of_learning_platforms(config, name):
-    found = re.match(config.FileNameCollectorPlugin.named_regexp, f"downloaded/05_metrics/extracted/{name}")
-    assert found.groupdict() == {"student_id": "123", "file_id": "05_metrics"}
+CALLS_THE_LIBRARY = """
+own = {0}
+def {0}(*arguments):
+    from zsp_lite.metrics import rotation_angle as alias
+    alias(np.eye(3), np.eye(3))
+    return own(*arguments)"""
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_every_task_has_a_mistake_and_the_points_equal_those_in_the_text(assignment):
-    notebook = source(assignment)
-    tests, answers = graded(notebook, grade=True, solution=False), graded(notebook, grade=True, solution=True)
-    assert set(tests) == {f"test_{task}" for task in MISTAKES[assignment]} and len(tests) >= 3
-    points = [cell.metadata.nbgrader.points for cell in (*tests.values(), *answers.values())]
-    said = re.search(r"(\d+) points: ([\d + ]+) by tests, ([\d + ]+) by a reader", notebook.cells[0].source)
-    parts = [int(number) for group in (said[2], said[3]) for number in group.split(" + ")]
-    assert parts == points and int(said[1]) == sum(points)
-    titles = [re.match(r"## Task .*\((\d+) points", cell.source) for cell in notebook.cells]
-    assert [int(title[1]) for title in titles if title] == points
+def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared, assignment):
+    for task in MISTAKES[assignment]:
+        notebook = source(assignment)
+        graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
+        assert failing_tests(prepared(assignment), notebook, notebook) == {f"test_{task}_1", f"test_{task}_2"}
+
+
+def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, monkeypatch):
+    """Ada has one task right, calls the library in the second and leaves the others; Bob's file is damaged."""
+    name, folder = "05_metrics", tmp_path / "notebooks" / "exercises"
+    shutil.copytree(EXERCISES / "source" / name, folder / "source" / name)
+    shutil.copy(EXERCISES / "nbgrader_config.py", folder)
+    shutil.copy(EXERCISES.parents[1] / ".gitignore", tmp_path)
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel draws as it does for students
+    # nbgrader starts the program `alembic`, which is installed beside the interpreter.
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(EXERCISES.parents[1]))
+
+    def run(*words):
+        words = [sys.executable, "-m", "nbgrader", *words] if words[0] != "git" else words
+        return subprocess.run(words, cwd=folder, capture_output=True, text=True)
+
+    run("git", "init", str(tmp_path)), run("git", "add", str(tmp_path))
+    assert run("generate_assignment", name).returncode == 0
+    handed_in = nbformat.read(folder / "release" / name / f"{name}.ipynb", as_version=4)
+    solutions, answers = graded(source(name), solution=True), graded(handed_in, solution=True)
+    first, second, _ = MISTAKES[name]
+    answers[first].source = solutions[first].source
+    answers[second].source = solutions[second].source + CALLS_THE_LIBRARY.format(second)
+    answers["better"].source = "See my remark: [Comment](#mine), $\\lambda R$ and $\\broken{$"
+    downloads = folder / "downloaded" / name
+    (downloads / "archive").mkdir(parents=True)
+    with zipfile.ZipFile(downloads / "archive" / "all.zip", "w") as archive:
+        archive.writestr(f"Ada Lovelace_123_assignsubmission_file_{name} (1).ipynb", nbformat.writes(handed_in))
+        archive.writestr(f"Bob_124_assignsubmission_file_{name}.ipynb", "{")
+        archive.writestr("Eve_125_assignsubmission_file_homework.ipynb", "{}")
+    lines = [["\ufeffIdentifier", "Grade"], *([f"Participant {number}", ""] for number in (123, 124, 125, 126))]
+    (downloads / "worksheet.csv").write_text("\n".join(map(",".join, lines)))
+
+    for _ in range(2):  # a second time, after another download
+        assert run("zip_collect", name).returncode == 0
+    log = run("autograde", name).stderr
+    assert set(re.findall("'checksum' for cell (\\w+) has changed", log)) == set(
+        graded(source(name), locked=True, grade=True)
+    )
+    log = run("export").stderr
+    assert "123: answers to be graded by hand" in log and "124: not graded" in log
+    assert "Eve_125_assignsubmission_file_homework.ipynb was not collected" in log
+    with Gradebook(f"sqlite:///{folder / 'gradebook.db'}", "zsp-lite") as gradebook:
+        grades = gradebook.find_submission(name, "123").notebooks[0].grades
+        points = {grade.name: grade.auto_score for grade in grades if grade.cell.cell_type == "code"}
+        for grade in grades:
+            if grade.needs_manual_grade:
+                grade.manual_score, grade.needs_manual_grade = 1.5, False
+        gradebook.db.commit()
+    assert points == {f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)}
+    run("export")
+    grades = [line.split(",") for line in (folder / "grades.csv").read_text().splitlines()]
+    assert grades[1:] == [[name, "123", "5.5", "20", "graded"], [name, "124", "", "20", "not graded"]]
+    filled = (downloads / "worksheet_filled.csv").read_text().splitlines()
+    assert filled[1:] == ["Participant 123,5.5", "Participant 124,", "Participant 125,", "Participant 126,"]
+
+    assert run("generate_feedback", name).returncode == 0
+    page = (folder / "feedback" / "123" / name / f"{name}.html").read_text(encoding="utf-8")
+    scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
+    assert scores[0] == ("Task 1 · Symmetric objects: An n-fold symmetry", "2.0", "2.0") and "HIDDEN TESTS" in page
+    assert len(scores) == 8 and "Test cell" not in page
+    assert re.findall(r'href="([^"]*)">Comment</a>', page) == ["#mine"]  # the student's own link, and no other
+    assert "<math" in page and "<code>\\broken{</code>" in page
+    assert "<script" not in page and not re.search(r"""(src|href)=["'](?!#|data:)|url\(["']?http""", page)
+    assert run("git", "ls-files", "--others", "--exclude-standard", str(tmp_path)).stdout == ""
+
+
+def test_nbgrader_recognises_the_files_of_learning_platforms(config):
+    for name in (
+        "Ada Lovelace_123_assignsubmission_file_05_metrics.ipynb",
+        "Ada Lovelace_123_assignsubmission_file_/05_metrics.ipynb",
+        "Ada Lovelace_123_assignsubmission_file_05_metrics (1).ipynb",
+        "lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
+        "lovelaceada_123_67890_05_metrics-Copy1.ipynb",
+    ):
+        found = re.match(config.FileNameCollectorPlugin.named_regexp, f"downloaded/05_metrics/extracted/all/{name}")
+        assert found.groupdict() == {"student_id": "123", "file_id": "05_metrics"}
+
+
+def test_the_five_exercises_have_100_points_and_no_test_decides_more_than_two():
+    readme = (EXERCISES / "README.md").read_text()
+    for assignment in ASSIGNMENTS:
+        notebook = source(assignment)
+        points = {name: cell.metadata.nbgrader.points for name, cell in graded(notebook, grade=True).items()}
+        tests = [name for name in points if name.startswith("test_")]
+        assert tests == [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
+        assert [*points.values()] == [2] * 6 + [4] * 2 and "20 points: 12 by tests, 8 by" in notebook.cells[0].source
+        titles = [re.match(r"## Task \d · (.*) \(4 points", cell.source) for cell in notebook.cells]
+        assert all(title[1].lower() in readme.lower() for title in titles if title) and sum(map(bool, titles)) == 5

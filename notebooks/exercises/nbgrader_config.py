@@ -1,11 +1,19 @@
 """Configuration of this course; nbgrader reads it when started in this folder."""
 
+import csv
 import re
 from html import escape
+from pathlib import Path
 
+from jinja2 import pass_context
+from latex2mathml.converter import convert
 from nbconvert.exporters import HTMLExporter
+from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+from nbgrader.api import MissingEntry
+from nbgrader.plugins import ExportPlugin
 
 c = get_config()  # noqa: F821, nbgrader defines it
+HERE = Path(__file__).parent
 
 c.CourseDirectory.course_id = "zsp-lite"
 
@@ -18,32 +26,56 @@ c.ClearSolutions.text_stub = "*Write your answer here, in place of this line.*"
 
 # Names of handed-in files, for `nbgrader zip_collect`. Moodle:
 # NAME_STUDENT_assignsubmission_file_EXERCISE.ipynb, or with "/" before EXERCISE.
-# Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb.
-c.FileNameCollectorPlugin.named_regexp = (
+# Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb. Browsers and people add " (1)", "-Copy1".
+EXERCISES = "|".join(sorted(folder.name for folder in (HERE / "source").glob("*")))
+HANDED_IN = (
     r".*/[^/]+?_(?:LATE_)?(?P<student_id>\d+)_(?:assignsubmission_file_?/?|\d+_)"
-    r"(?P<file_id>[^/]+?)(?:-\d+)?\.ipynb"
+    rf"(?P<file_id>{EXERCISES})[^/]*\.ipynb$"
 )
+c.FileNameCollectorPlugin.named_regexp = HANDED_IN
+# A second download replaces the first.
+c.ZipCollectApp.force = c.ExtractorPlugin.force = True
 
 # Seconds for one cell. The first import of torch takes most of them on a slow machine.
 c.Execute.timeout = 120
 
 
+class Renderer(IPythonRenderer):
+    """Formulas as MathML, which needs no script from the network."""
+
+    def inline_math(self, body, display="inline"):
+        try:
+            return convert(body, display=display)
+        except Exception:  # a formula of a student
+            return f"<code>{escape(body)}</code>"
+
+    def block_math(self, body):
+        return f"<p>{self.inline_math(body, 'block')}</p>"
+
+
 class FeedbackPage(HTMLExporter):
-    """nbgrader's feedback page, with the names of the tasks in its list of scores."""
+    """nbgrader's page, without a network, with the names of the tasks in its list."""
+
+    @pass_context
+    def markdown2html(self, context, source):
+        pictures = context.get("cell", {}).get("attachments", {})
+        renderer = Renderer(escape=False, attachments=pictures)
+        return MarkdownWithMath(renderer=renderer).render(source)
 
     def from_notebook_node(self, nb, resources=None, **keywords):
         page, resources = super().from_notebook_node(nb, resources, **keywords)
-        names, name = {}, ""
+        page = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+        names, task = {}, ""
         for cell in nb.cells:
             if heading := re.match(r"## (Task .*?) \(\d+ points", cell.source):
-                name = heading[1]
+                task = heading[1]
+            part = re.match(r"# (.*)\.\n", cell.source)
+            name = f"{task}: {part[1]}" if task and part else task
             names[cell.metadata.get("nbgrader", {}).get("grade_id")] = name
 
         def with_name(link):
             name = escape(names.get(link["cell"], ""))
-            if (
-                not name
-            ):  # a student's own link, or a task whose heading has another form
+            if not name:  # a student's own link
                 return link[0]
             return link["start"] + (f"{name}: comment" if link["comment"] else name)
 
@@ -53,3 +85,77 @@ class FeedbackPage(HTMLExporter):
 
 
 c.GenerateFeedback.exporter_class = FeedbackPage
+
+# The name of the column for the grade in Moodle's grading worksheet.
+GRADE = "Grade"
+
+
+class Marks(ExportPlugin):
+    """`nbgrader export`: grades.csv, Moodle's worksheets, and what has no grade yet.
+
+    A hand-in that was not graded has an empty score, never 0, and is listed.
+    """
+
+    def export(self, gradebook):
+        self.root, rows = Path(self.parent.coursedir.root), []
+        for assignment in gradebook.assignments:
+            if self.assignment and assignment.name not in self.assignment:
+                continue
+            folders = sorted(self.root.glob(f"submitted/*/{assignment.name}"))
+            found = {
+                one.parent.name: self.score(gradebook, assignment, one.parent.name)
+                for one in folders
+            }
+            rows += [
+                (assignment.name, student, score, f"{assignment.max_score:g}", state)
+                for student, (score, state) in found.items()
+            ]
+            self.list_open(assignment.name, found)
+            self.fill_worksheet(assignment.name, found)
+        with open(self.to or self.root / "grades.csv", "w", newline="") as file:
+            names = ["assignment", "student_id", "score", "max_score", "state"]
+            csv.writer(file).writerows([names, *rows])
+
+    def score(self, gradebook, assignment, student):
+        """The score as text, empty if there is none, and the state of a hand-in."""
+        handed_in = self.root / "submitted" / student / assignment.name
+        graded = self.root / "autograded" / student / assignment.name
+        for notebook in assignment.notebooks:
+            ends = [one / f"{notebook.name}.ipynb" for one in (handed_in, graded)]
+            if not all(one.is_file() for one in ends):
+                return "", "not graded"
+            if ends[0].stat().st_mtime > ends[1].stat().st_mtime:
+                return "", "handed in again, not graded"
+        try:
+            submission = gradebook.find_submission(assignment.name, student)
+        except MissingEntry:
+            return "", "not graded"
+        if submission.needs_manual_grade:
+            return "", "answers to be graded by hand"
+        return f"{submission.score - submission.late_submission_penalty:g}", "graded"
+
+    def list_open(self, name, found):
+        for student, (_, state) in found.items():
+            if state != "graded":
+                self.log.warning("%s of %s: %s", name, student, state)
+        for file in sorted((self.root / "downloaded" / name / "extracted").rglob("*")):
+            if file.is_file() and not re.match(HANDED_IN, file.as_posix()):
+                self.log.warning("%s: %s was not collected", name, file.name)
+
+    def fill_worksheet(self, name, found):
+        """Fill in downloaded/EXERCISE/worksheet.csv; its lines are "Participant N"."""
+        path = self.root / "downloaded" / name / "worksheet.csv"
+        if not path.is_file():
+            return
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            head, *lines = csv.reader(file)
+        for line in lines:
+            number = re.sub(r"\D", "", line[0])
+            line[head.index(GRADE)] = found.get(number, ("", ""))[0]
+        filled = path.with_name("worksheet_filled.csv")
+        with filled.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([head, *lines])
+        self.log.info("%s: upload %s in Moodle", name, filled)
+
+
+c.ExportApp.plugin_class = Marks
