@@ -390,7 +390,7 @@ def draw_pose(words: bool = True) -> str:
     for end in ends[1:]:
         drawn += curve(straight(ends[0], end), INK, 2.4, head=True)
     if words:
-        drawn += text("front", 48, 106, 13, anchor="end") + text("up", 158, 18, 13)
+        drawn += text("front", 158, 96, 13) + text("up", 158, 18, 13)
     return drawn
 
 
@@ -420,10 +420,10 @@ def draw_method() -> str:
 
     stages = [
         ("Features", "01", ("A network describes each", "patch by a vector Φ."), draw_features()),
-        ("Cycle", "02", ("A match is kept if *u*′, two", "nearest steps on, is near *u*."), draw_cycle()),
+        ("Cycle", "02", ("A match is kept if the way", "*u* → *v* → *u*′ ends near *u*."), draw_cycle()),
         ("Best view", "03", ("The view is chosen whose", "matches score highest."), draw_best_view()),
-        ("Depth", "04", ("Depth turns the patches of a", "match into two 3D points."), draw_depth()),
-        ("Umeyama, RANSAC", "04", ("The similarity is fitted that", "most matches agree with."), draw_fit()),
+        ("Depth", "04", ("Depth turns the patches *u*, *v*", "into the 3D points *x*, *y*."), draw_depth()),
+        ("Umeyama, RANSAC", "04", ("Of many fits, the one with", "which most matches agree."), draw_fit()),
         ("Pose", "05", ("*y* = *λRx* + *t* lays the", "reference on the target."), draw_pose()),
     ]
     drawn = ""
@@ -566,15 +566,14 @@ def draw_query_key_value() -> str:
     drawn += Photo(REFERENCE, 35, 20, 96, 112).draw(BLUE) + draw_grid(20, 96, 112, 4)
     drawn += rect(76, 124, 28, 28, "none", INK, 2.6) + text("patch *i*", 76, 230, 13, anchor="middle")
     drawn += curve("M106 138H152", INK, 2, head=True)
-    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text("token *x*_{i}", 188, 118, 13, anchor="middle")
+    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text("token_{i}", 188, 118, 13, anchor="middle")
     rows = (
-        (56, BLUE, "q", "query *q*_{i}", "what the patch looks for"),
-        (138, VERMILLION, "k", "key *k*_{i}", "what the patch offers"),
-        (220, GREEN, "v", "value *v*_{i}", "what the patch hands on"),
+        (56, BLUE, "query_{i}", "what the patch looks for"),
+        (138, VERMILLION, "key_{i}", "what the patch offers"),
+        (220, GREEN, "value_{i}", "what the patch hands on"),
     )
-    for i, (y, colour, name, title, meaning) in enumerate(rows):
+    for i, (y, colour, title, meaning) in enumerate(rows):
         drawn += curve(f"M222 138L294 {y}", INK, 1.8, head=True)
-        drawn += text(f"*W*_{{{name}}}", 252, (88, 131, 202)[i], 13, anchor="end" if i != 1 else "start")
         drawn += draw_vector(302, y - 8, colour, _SHADES[i])
         drawn += text(title, 372, y - 3, 13, bold=True) + text(meaning, 372, y + 15, 13, GREY)
     x = 570
@@ -588,8 +587,8 @@ def draw_query_key_value() -> str:
         drawn += draw_vector(x + 202, y, mix(GREEN, "white", 0.35 + weight), _SHADES[i])
     drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True) + draw_vector(x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4))
     drawn += text("weighted sum", x + 190, 242, 13, anchor="end")
-    drawn += text("*w*_{ij} = softmax_{j} ( *q*_{i} · *k*_{j} / √*d* )", x, 282, 14)
-    drawn += text("out_{i} = Σ_{j} *w*_{ij} *v*_{j}", x, 310, 14)
+    drawn += text("weight_{ij} = softmax_{j} ( query_{i} · key_{j} / √*D* )", x, 282, 14)
+    drawn += text("output_{i} = Σ_{j} weight_{ij} value_{j}", x, 310, 14)
     return svg(
         drawn, width, height, "Query, key and value",
         "Three matrices turn the token of a patch i into its query, its key and its value. The query is compared with "
@@ -620,13 +619,13 @@ def draw_cycles() -> str:
         return drawn + "".join(text(line, x, 236 + 21 * i, 14) for i, line in enumerate(lines))
 
     drawn = case(
-        20, "A cycle that closes", ("front left", "front left", "front left"), (12, 16),
+        20, "A short cycle", ("front left", "front left", "front left"), (12, 16),
         ("*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
          "*u*′ is next to *u*: the match (*u*, *v*) is kept."),
     )  # fmt: skip
     drawn += curve(f"M430 20V{height - 20}", LINE, 1.2)
     drawn += case(
-        450, "A cycle that does not", ("foot left", "foot right", "top right"), (0, 0),
+        450, "A long cycle", ("foot left", "foot right", "top right"), (0, 0),
         ("The way back leads to another part.", "*d*(*u*, *u*′) is large: the match (*u*, *v*) is dropped."),
     )  # fmt: skip
     return svg(

@@ -165,6 +165,8 @@ def draw_cycle(
     names: Sequence[str] = ("u", "v", "u'"),
 ) -> list[Artist]:
     """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v back to u'."""
+    if names and tuple(cells[0]) == tuple(cells[2]):
+        names = f"{names[0]} = {names[2]}", names[1], ""
     ends = axes[0], axes[1], axes[0]
     places = [patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, ends)]
     drawn = axes[0].plot(*places[0], "o", color=colour, markeredgecolor="black", markersize=8)
@@ -197,23 +199,18 @@ def show_matches(
 def draw_matches(
     axes: Sequence[Axes], pixels: Sequence[Real[np.ndarray, "n 2"]], inliers: Bool[np.ndarray, " n"] | None = None
 ) -> list[Artist]:
-    """Draw a line for each match, between pixels (x, y) of the images of two axes; outliers are thin, dashed and grey.
-
-    The colour of an inlier depends on its row in the first image, so that lines can be told apart.
-    """
+    """Draw a line for each match, between pixels (x, y) of two images: inliers solid, blue; others dashed, red."""
     inliers = np.ones(len(pixels[0]), bool) if inliers is None else inliers
-    # plasma without its brightest end, which is not visible on light images.
-    colours = plt.get_cmap("plasma")(0.85 * pixels[0][:, 1] / _size(axes[0])[0])
     drawn = []
-    for a, b, good, colour in sorted(zip(*pixels, inliers, colours, strict=True), key=lambda match: match[2]):
-        style = {"color": "0.35", "linewidth": 0.7, "linestyle": (0, (4, 3)), "alpha": 0.7}
+    for a, b, good in sorted(zip(*pixels, inliers, strict=True), key=lambda match: match[2]):
+        style = {"color": VERMILLION, "linewidth": 1.2, "linestyle": (0, (4, 2))}
         if good:  # with a white outline, to be visible on dark images
-            style = {"color": colour, "linewidth": 1.8, "path_effects": _OUTLINE}
+            style = {"color": BLUE, "linewidth": 1.8, "path_effects": _OUTLINE}
         line = ConnectionPatch(a, b, "data", "data", axesA=axes[0], axesB=axes[1], zorder=5, **style)
         drawn.append(axes[0].figure.add_artist(line))
     for axis, at in zip(axes, pixels):
-        drawn.append(axis.scatter(*at[~inliers].T, 16, "0.35", marker="x", linewidths=0.7))
-        drawn.append(axis.scatter(*at[inliers].T, 25, colours[inliers], edgecolors="white", linewidths=0.7))
+        drawn.append(axis.scatter(*at[~inliers].T, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6))
+        drawn.append(axis.scatter(*at[inliers].T, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6))
     return drawn
 
 
