@@ -9,7 +9,8 @@ import pytest
 from benchmark_folder import SEQUENCES, SlowBackbone, small_folder
 
 from zsp_lite import align
-from zsp_lite.align import align_category, estimate_with_helpers, write_labels
+from zsp_lite.align import align_category, estimate_with_helpers, read_hypotheses, write_labels
+from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
@@ -54,7 +55,7 @@ def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_
     assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
     monkeypatch.setattr(align, "hypotheses", None)  # nothing is left to compute
     again = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path)
-    for one in (found, again):
+    for one in (found, again, synchronise(list(read_hypotheses(tmp_path).values()))):
         assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
             name: pose.sim3.matrix.tolist() for name, pose in whole.objects.items()
         }

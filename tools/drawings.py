@@ -74,10 +74,7 @@ class Photo:
         up = np.cross(to_camera, right)
         centred = np.asarray(points, float) - [0, 0, 0.92]
         scale = self.size / 2.45
-        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + [
-            self.x + self.size / 2,
-            self.y + self.size / 2,
-        ]
+        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + np.add([self.x, self.y], self.size / 2)
         return places, -(centred @ to_camera)
 
     @cached_property
@@ -460,9 +457,8 @@ def draw_method() -> str:
         drawn, WIDTH, below + row + MARGIN, "The method",
         "From one image of a reference object and several images of a target object, both with depth, to the pose: "
         "features of patches, cycles of nearest neighbours, choice of the best view, depth of the matched patches, a "
-        "fit by "
-        "Umeyama's method in RANSAC, and the pose that lays the reference on the target. The numbers are those of the "
-        "notebooks.",
+        "fit by Umeyama's method in RANSAC, and the pose that lays the reference on the target. The numbers are those "
+        "of the notebooks.",
     )  # fmt: skip
 
 
@@ -472,8 +468,7 @@ def draw_method() -> str:
 AROUND = {
     "10": ("own objects", MARGIN, 136),
     "09": ("training", 183.2, 108),
-    "11": ("hypotheses", 314, 120),
-    "12": ("calibration", 444, 120),
+    "11": ("hypotheses, whole category", 314, 250),
     "08": ("labels", 594, 86),
     "05": ("errors", 690, 88),
     "07": ("benchmark", 788, 138),
@@ -508,12 +503,8 @@ def draw_here(notebook: str) -> str:
         if name != "images":
             drawn += curve(f"M{number(x - gap + 2)} {top + height / 2:g}h{gap - 6:g}", GREY, 2, head=True)
     line, centre = top + height + 10, {name: x + w / 2 for name, (x, w) in spans.items()}
-    for names, stage in (
-        (("10",), "images"),
-        (("09",), "features"),
-        (("11", "12"), "best view"),
-        (("08", "05", "07"), "pose"),
-    ):
+    below_stage = {"images": ["10"], "features": ["09"], "best view": ["11"], "pose": ["08", "05", "07"]}
+    for stage, names in below_stage.items():
         stops = [AROUND[name][1] + AROUND[name][2] / 2 for name in names]
         path = f"M{number(centre[stage])} {top + height + 2}V{line}"
         path += f"M{number(min([centre[stage], *stops]))} {line}H{number(max([centre[stage], *stops]))}"
@@ -536,11 +527,7 @@ def draw_here(notebook: str) -> str:
         foot = below + 28
         drawn += polygon(np.array([[middle - 6, foot + 12], [middle + 6, foot + 12], [middle, foot + 3]]), BLUE)
         drawn += text("you are here", middle, foot + 27, 13, BLUE, "middle", bold=True)
-    names = (
-        "the whole method"
-        if here == WHOLE
-        else ", ".join(dict(STAGES).get(name, AROUND.get(name, ("",)))[0] for name in here)
-    )
+    names = ", ".join((STAGES | AROUND)[name][0] for name in here) if here != WHOLE else "the whole method"
     return svg(
         drawn, WIDTH, below + 28 + (MARGIN if here[0] in STAGES else 36), f"Where notebook {notebook} stands",
         f"The stages of the method in a row: images, features, cycle, best view, depth and RANSAC, pose. "
@@ -641,9 +628,8 @@ def draw_axes(place: np.ndarray, turn: float, size: float = 30) -> str:
     drawn = ""
     for angle, colour in ((0, VERMILLION), (90, GREEN), (215, BLUE)):
         angle = np.radians(turn + angle)
-        drawn += curve(
-            straight(place, place + size * np.array([np.cos(angle), -np.sin(angle)])), colour, 2.4, head=True
-        )
+        end = place + size * np.array([np.cos(angle), -np.sin(angle)])
+        drawn += curve(straight(place, end), colour, 2.4, head=True)
     return drawn + dot(place, INK, 3)
 
 
@@ -745,6 +731,36 @@ def draw_mirror() -> str:
     )  # fmt: skip
 
 
+def draw_three() -> str:
+    width, height, panel, size = 860, 356, 280, 76
+    third = _chair(1.1, 1, 0.7, 0.7, 0.1)
+    chairs = (REFERENCE, BLUE, (22, 66)), (TARGET, ORANGE, (182, 66)), (third, GREEN, (102, 190))
+    panels = (
+        ("All right: it closes", (0, 0), ("0° + 0° = 0°: by way of *b* or", "directly, *c* stands the same.")),
+        ("One error: it does not", (0, 180), ("0° + 180° ≠ 0°: one of the three", "is wrong.")),
+        ("Errors agree: it closes", (180, 180), ("180° + 180° = 0°: *b* is turned,", "only more objects can tell.")),
+    )
+    drawn = ""
+    for i, (title, angles, words) in enumerate(panels):
+        x = 10 + panel * i
+        drawn += text(title, x + panel / 2, 34, 15, anchor="middle", bold=True)
+        drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2) if i else ""
+        for j, (chair, colour, (left, top)) in enumerate(chairs):
+            drawn += Photo(chair, 205 if i == 2 and j == 1 else 25, x + left, top, size).draw(colour)
+        a, b, c = (np.add(corner, size / 2) + [x, 0] for *_, corner in chairs)
+        lines = (a, b, angles[0], (140, 90)), (b, c, angles[1], (220, 182)), (a, c, 0, (54, 182))
+        for start, end, angle, at in lines:
+            drawn += curve(straight(start, end, 50), colour := VERMILLION if angle else INK, 2.2, head=True)
+            drawn += text(f"{angle}°", x + at[0], at[1], 14, colour, "middle", bold=True)
+        drawn += text("*a*", x + 10, 106, 15) + text("*b*", x + 262, 106, 15) + text("*c*", x + 186, 232, 15)
+        drawn += "".join(text(line, x + panel / 2, 306 + 20 * j, 14, anchor="middle") for j, line in enumerate(words))
+    return svg(
+        drawn, width, height, "Cycles of three objects",
+        "Three chairs a, b and c with arrows from a to b, b to c and a to c. If all turns are right, the way by b "
+        "agrees with the direct one. If one is half a turn off, it does not. If both of b are off, it does again.",
+    )  # fmt: skip
+
+
 def draw_ransac() -> str:
     width, height, panel, radius = 860, 330, 280, 15
     random = np.random.default_rng(3)
@@ -799,6 +815,7 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "cycle": draw_cycles,
     "frames": draw_frames,
     "mirror": draw_mirror,
+    "three": draw_three,
     "ransac": draw_ransac,
     **{f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook)) for notebook in sorted(HERE)},
 }

@@ -131,8 +131,8 @@ def align_category(
             sent = backbone if pool else loaded
             make = partial(PairSolver, str(dataset.root.resolve()), sent, max(1, get_num_threads() // workers))
             evaluate_pairs(folder, make, todo, len(chosen), pool, workers, _Line)
-        lines = {line.pair: line for line in _read(folder)}
-    found = [_pair_hypotheses(pair, lines[key]) for key, pair in chosen.items() if lines[key].matrices]
+        known = read_hypotheses(folder)
+    found = [known[key] for key in chosen if key in known]
     if not found:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
     for name in sorted({pair.reference_sequence for pair in chosen.values()} - {one.reference for one in found}):
@@ -152,17 +152,21 @@ def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> t
     )
 
 
+def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
+    """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames, for `synchronise`."""
+    found = {}
+    for line in (line for line in _read(out) if line.matrices):
+        sim3s = []
+        for matrix in np.array(line.matrices):
+            scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+            sim3s.append(Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3]))
+        names = [part.rpartition(":")[0] for part in line.pair.split("/")[1:]]
+        found[line.pair] = PairHypotheses(*names, tuple(sim3s), np.array(line.probabilities), np.array(line.centre))
+    return found
+
+
 def _read(out: str | Path) -> list[_Line]:
     return [decode_json(text, _Line, where) for text, where in read_texts(out)]
-
-
-def _pair_hypotheses(pair: Pair, line: _Line) -> PairHypotheses:
-    sim3s = []
-    for matrix in np.array(line.matrices):
-        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-        sim3s.append(Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3]))
-    names, numbers = (pair.reference_sequence, pair.target_sequence), (line.probabilities, line.centre)
-    return PairHypotheses(*names, tuple(sim3s), *map(np.array, numbers))
 
 
 def estimate_with_helpers(

@@ -26,7 +26,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = REPOSITORY / "outputs" / "browser"
-LABELLING = {"08_label_poses.ipynb", "10_your_own_objects.ipynb"}  # have a 3D view that a click labels
+LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 

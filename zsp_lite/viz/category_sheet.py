@@ -28,14 +28,14 @@ def contact_sheet(
 ) -> Figure:
     """Show objects by the frame that is nearest to one camera: in their own worlds above, in the common frame below.
 
-    The camera is that of a frame, by its place, of the most probable object. Doubtful objects are shown in their next
-    best turn, too. At most ten objects are shown.
+    The camera is that of a frame, by its place, of the most probable object of the category. Doubtful objects are shown
+    in their next best turn, too. At most ten objects are shown.
     """
     names = list(names or alignment.objects)[:_PER_LINE]
     objects = {name: alignment.objects[name] for name in names}
-    surest = max(names, key=lambda name: objects[name].probability)
+    surest, first = max(alignment.objects.items(), key=lambda item: item[1].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[frame]).R
-    common = camera @ objects[surest].sim3.R.T
+    common = camera @ first.sim3.R.T
     rows = {"as scanned": dict.fromkeys(names, camera)}
     rows["aligned"] = {name: common @ one.sim3.R for name, one in objects.items()}
     doubtful = {name: one.alternative for name, one in objects.items() if one.probability < DOUBTFUL}

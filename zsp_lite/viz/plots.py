@@ -16,6 +16,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.legend import Legend
 from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import offset_copy
@@ -273,7 +274,8 @@ def show_points(
         axis.set_title(plain_text(title), fontsize=_FONT)
         y_limits = (y + half[1], y - half[1]) if down else (y - half[1], y + half[1])
         axis.set(**{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels)
-    _legend(figure, axes[0], "outside lower center", markerscale=2)
+    for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
+        handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
     return figure
 
 
@@ -486,9 +488,9 @@ def _panels(number: int, columns: int | None, width: float, height: float) -> tu
     return figure, list(axes.flat[:number])
 
 
-def _legend(figure: Figure, axis: Axes, place: str = "outside upper center", **style: Any) -> None:
+def _legend(figure: Figure, axis: Axes, place: str = "outside upper center") -> Legend:
     handles, names = axis.get_legend_handles_labels()
-    figure.legend(handles, names, ncols=min(len(names), 4), fontsize=9, loc=place, **style)
+    return figure.legend(handles, names, ncols=min(len(names), 4), fontsize=9, loc=place)
 
 
 def _lines_of(titles: Iterable[str]) -> int:
