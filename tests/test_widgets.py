@@ -12,8 +12,7 @@ import pytest
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.errors import InputError
-from zsp_lite.matchers import MATCHERS
-from zsp_lite.matching import cyclical_distances, match, similarity
+from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import correct_matches
 
@@ -125,18 +124,6 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
         assert f"u ({row}, {col}) →" in widget.caption.value
         assert f"d(u, u') = {distances[row, col]:.1f} patches" in widget.caption.value
         assert ("not on the foreground" in widget.caption.value) == (not valid[row, col])
-
-
-@pytest.mark.parametrize("matcher", ["cyclical", *MATCHERS])
-def test_matches_are_compared_with_the_ground_truth(sim, matcher):
-    truth, pair = examples.sample_pair(), examples.sample_views()
-    widget = matching.matches(*pair, sim, truth.cells, truth.valid)
-    widget.controls["matcher"].value, widget.controls["k"].value, widget.controls["kmeans"].value = matcher, 20, False
-    expected = match(pair[0].features, pair[1].features, 20, False, sim=sim, matcher=matcher)
-    at = tuple(expected.reference.T)
-    correct = (correct_matches(expected.target, truth.cells[at]) & truth.valid[at]).sum()
-    assert widget.caption.value.startswith(f"{matcher}: {len(expected)} matches, {correct} correct")
-    assert f"{(~truth.valid[at]).sum()} without ground truth" in widget.caption.value
 
 
 # alignment

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from zsp_lite.alignment import ransac, umeyama_batch
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
@@ -40,16 +39,6 @@ def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
         function()
         times.append(time.perf_counter() - start)
     return float(np.median(times[1:]))
-
-
-def ransac_by_loop(source: np.ndarray, target: np.ndarray, threshold: float = 0.2, trials: int = 1000) -> None:
-    """Run RANSAC as a plain loop: sample four points, fit, count the inliers."""
-    rng = np.random.default_rng(0)
-    for _ in range(trials):
-        sample = rng.choice(len(source), 4, replace=False)
-        (scale,), (rotation,), (translation,), _ = umeyama_batch(source[None, sample], target[None, sample])
-        residual = np.linalg.norm(scale * source @ rotation.T + translation - target, axis=1)
-        np.count_nonzero(residual < threshold)
 
 
 def write_category(root: Path, frames: int) -> None:
@@ -88,8 +77,6 @@ def main() -> None:
         for stage in stages:
             report(f"{solver} solver: {stage}", stages[stage])
         report(f"{solver} solver: all but features", sum(stages.values()) - stages["features"])
-        solving = sum(stages.values()) - sum(stages[name] for name in ("features", "matching"))
-        report(f"{solver} solver without crop, features and matching", solving)
     frame = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[0])
     report("reading and features, per frame", 1000 * seconds(lambda: method.views([dataset.load(frame)])))
 
@@ -99,13 +86,6 @@ def main() -> None:
     loop = 5 * len(first) * seconds(lambda: F.cosine_similarity(first[:1], second))  # of one descriptor, scaled
     report("similarity of log-binned descriptors, 5 targets", 1000 * fast)
     report("the same by a loop over the descriptors, times", loop / fast, "x")
-
-    rng = np.random.default_rng(0)
-    source = rng.normal(size=(50, 3))
-    moved = np.where(np.arange(50)[:, None] < 30, rng.normal(size=(50, 3)), source + 0.02 * rng.normal(size=(50, 3)))
-    fast, loop = seconds(lambda: ransac(source, moved)), seconds(lambda: ransac_by_loop(source, moved))
-    report("RANSAC, 1,000 trials, 50 points", 1000 * fast)
-    report("the same by a loop over the trials, times", loop / fast, "x")
 
     command = [sys.executable, "-c", "from tools.speed import one_estimate; one_estimate()"]
     peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -74,12 +74,6 @@ def cycle() -> "VBox":
     return matching.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
 
 
-def matches() -> "VBox":
-    """`matching.matches` on a sample pair."""
-    sim = similarity(*(view.features for view in sample_views()))
-    return matching.matches(*sample_views(), sim, sample_pair().cells, sample_pair().valid)
-
-
 def ransac_settings() -> "VBox":
     """`alignment.ransac_settings` on a sample pair."""
     pair = sample_views()
@@ -121,7 +115,7 @@ def label_poses() -> "VBox":
 WIDGETS: dict[str, Callable[[], "VBox"]] = {
     build.__name__: build
     for build in (
-        attention, similarities, saliency, cycle, matches, ransac_settings, one_outlier, box_to_mask, label_poses,
+        attention, similarities, saliency, cycle, ransac_settings, one_outlier, box_to_mask, label_poses,
     )
 }  # fmt: skip
 

@@ -28,7 +28,7 @@ def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
 def example_pair(dataset: Co3D) -> Pair:
     """Return a pair for a first try: a stored pair of scooters in `data_samples/`, else the first of all.
 
-    The pair of scooters is chosen by its result: a turn of 41 degrees, of which both solvers with zsp-tiny miss below 10.
+    The pair of scooters is chosen by its result: a turn of 41 degrees, and both solvers are less than 10 off.
     """
     chosen = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
     folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))

@@ -1,17 +1,12 @@
-"""Widgets on matching: the cycle of one patch, and the matches of every matcher."""
-
-from functools import cache
+"""A widget on matching: the cycle of one patch."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.matchers import MATCHERS
-from zsp_lite.matching import match, nearest_neighbours
-from zsp_lite.synthetic.ground_truth import correct_matches
+from zsp_lite.matching import nearest_neighbours
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.widgets import common
 from zsp_lite.widgets.common import Widget, interactive_figure, patch_sliders, redrawing
 
 
@@ -46,42 +41,3 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     start = divmod(int(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax()), grid[1])
     alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the patch u'."
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)
-
-
-def matches(
-    reference: View,
-    target: View,
-    sim: Float[Tensor, "n1 n2"],
-    cells: Int[np.ndarray, "h w 2"],
-    valid: Bool[np.ndarray, "h w"],
-) -> Widget:
-    """Show which matches are correct; choose the matcher, the number of matches and k-means."""
-    titles = "reference", "target; solid: correct, dashed: not or unknown"
-    figure, axes = plots.show_images([reference.frame.rgb, target.frame.rgb], titles, size=3.7)
-    draw = redrawing(plots.draw_matches)
-
-    @cache
-    def compute(matcher: str, k: int, kmeans: bool):
-        return match(
-            reference.features, target.features, k, kmeans, sim=sim, matcher=matcher,
-            ref_foreground=reference.foreground, target_foreground=target.foreground,
-        )  # fmt: skip
-
-    def update(matcher: str, k: int, kmeans: bool) -> str:
-        found = compute(matcher, k, kmeans)
-        known = valid[tuple(found.reference.T)]
-        correct = correct_matches(found.target, cells[tuple(found.reference.T)]) & known
-        draw(axes, plots.match_pixels((reference, target), found), correct)
-        distances = np.linalg.norm(found.reference[:, None] - found.reference, axis=-1)
-        np.fill_diagonal(distances, np.inf)
-        spacing = distances.min(axis=1).mean() if len(found) > 1 else 0.0
-        return (
-            f"{matcher}: {len(found)} matches, {correct.sum()} correct, {(known & ~correct).sum()} wrong, "
-            f"{(~known).sum()} without ground truth; mean distance to the nearest match {spacing:.1f} patches."
-        )
-
-    controls = {
-        "matcher": common.choice("matcher", ["cyclical", *MATCHERS]), "k": common.slider("K", 5, 100, 50, 5),
-        "kmeans": common.load_package().Checkbox(value=True, description="k-means on the best 2K", indent=False),
-    }  # fmt: skip
-    return interactive_figure(figure, controls, update, "Two objects and lines between matched patches.")
