@@ -207,8 +207,10 @@ def read_run(out: str | Path) -> Run:
         of_row, wanted = ("pair", finished[views]) if views in finished else ("problem", problems)
         table = table[(table["row"] != row) | table[of_row].isin(wanted)]
         rows += [row] if wanted <= set(found[of_row]) else []
-    table = table[table["row"].isin(rows)].drop(columns="views")
     rows = [row for row in settings.methods if row in rows]
+    table = table[table["row"].isin(rows)].drop(columns="views")
+    if table.empty:
+        raise InputError(f"{out}: the run has no results of the rows that its {SETTINGS} names")
     kinds = {"row": pd.CategoricalDtype(rows), "category": pd.CategoricalDtype(list(last.pairs))}
     table = table.astype(kinds).sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(kinds, object))
     timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
