@@ -10,6 +10,7 @@ from benchmark_folder import SEQUENCES, SlowBackbone, small_folder
 
 from zsp_lite import align
 from zsp_lite.align import align_category, estimate_with_helpers, read_hypotheses, write_labels
+from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
@@ -59,6 +60,8 @@ def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_
         assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
             name: pose.sim3.matrix.tolist() for name, pose in whole.objects.items()
         }
+    with pytest.raises(InputError, match="holds a run of another command"):
+        evaluate(small_folder(), BACKBONE, ["ours"], 1, 3, tmp_path)
     with pytest.raises(InputError, match="holds a run with targets 3, this is 2"):
         align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
 
@@ -109,9 +112,12 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     one = found.estimates["verified"]
     assert found.errors["verified"] < 15 and one.confidence > 0.5 and not one.one_of_two
     assert [other.mode for other in one.hypotheses] == [0, 1] and one.angle_to(one.alternatives[0]) > 100
-    assert "masks" in one.flags
+    assert "masks" in one.flags and found.sources[1].endswith(f"helpers: {sources[2].path}")
+    with pytest.raises(InputError, match="expected different objects"):
+        estimate_with_helpers([*sources, sources[1]], BACKBONE)
 
 
 def test_paths_after_the_pair_belong_to_helpers(capsys):
     assert cli.main(["estimate", "a", "b", "c"]) == 2
     assert "1 more paths, expected these after --helpers" in capsys.readouterr().err
+    assert cli.main(["estimate", "a", "b", "--helpers", "c", "--solver", "paper"]) == 2

@@ -8,7 +8,7 @@ import logging
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import permutations
@@ -178,19 +178,24 @@ def estimate_with_helpers(
     Others are unlabelled objects of the category. Of the hypotheses for the first two, the one that agrees with the
     alignment of all objects comes first. An image alone is the reference of pairs only.
     """
+    if len({one.path.resolve() for one in sources}) < len(sources):
+        raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
     names, found, remembering = [f"{k} {one.name}" for k, one in enumerate(sources)], {}, _Remembering(backbone)
     for a, b in permutations(range(len(sources)), 2):
         if sources[b].format != "image" or (a, b) == (0, 1):
             number = reference_frame if a == 0 else None
-            found[a, b] = estimate_pose(
-                sources[a], sources[b], "verified", number, targets, backbone=remembering, upright=upright
-            )
+            with nullcontext() if (a, b) == (0, 1) else suppress(InputError):  # a pair that has no pose says nothing
+                found[a, b] = estimate_pose(
+                    sources[a], sources[b], "verified", number, targets, backbone=remembering, upright=upright
+                )
     pairs = {
         (a, b): world_hypotheses(Pair("", names[a], 0, names[b], ()), one.estimates["verified"])
         for (a, b), one in found.items()
     }
     alignment = synchronise(list(pairs.values()))
-    result, estimate = found[0, 1], found[0, 1].estimates["verified"]
+    estimate, helpers = found[0, 1].estimates["verified"], ", ".join(str(one.path) for one in sources[2:])
+    first, second = found[0, 1].sources
+    result = replace(found[0, 1], sources=(first, f"{second}; helpers: {helpers}"))
     between = alignment.between(names[0], names[1]).R
     angles = [float(rotation_angle(one.R, between)) for one in pairs[0, 1].sim3s]
     chosen = int(np.argmin(angles))

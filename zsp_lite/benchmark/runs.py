@@ -133,6 +133,8 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
     for name in ("data", "backbone", "targets"):
         if (held := getattr(before, name)) != (asked := getattr(now, name)):
             raise InputError(f"{out} holds a run with {name} {held}, this is {asked}; choose another folder")
+    if ("alignment" in before.methods) != ("alignment" in now.methods):
+        raise InputError(f"{out} holds a run of another command; choose another folder")
     groups = {name: (getattr(before, name), getattr(now, name)) for name in ("methods", "labels", "origins")}
     for name, (held, asked) in groups.items():
         for one in asked:

@@ -1,5 +1,7 @@
 """The command `align`: a whole category in one frame."""
 
+from pathlib import Path
+
 import click
 
 from zsp_lite.cli.common import (
@@ -27,7 +29,7 @@ from zsp_lite.cli.common import (
     "--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Objects that each is compared with."
 )
 @click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
-@click.option("--out", type=PATH, default="outputs/align", help="Folder; an existing run is continued.")
+@click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
 @replace_option
 @workers_options
@@ -51,12 +53,12 @@ def align(
     from zsp_lite.data.labels import read_labels
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows, write_category_report
 
-    dataset = Co3D(data)
+    dataset, out = Co3D(data), out or Path("outputs/align") / category
     found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers, **again)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
+    written.append(write_category_report(out / "report.html", found, dataset, category))
     if propose:
         written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
-    written.append(write_category_report(out / "report.html", found, dataset, category))
     print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")

@@ -76,7 +76,7 @@ def print_checks(root: Path, checks: Sequence[Any], deep: bool) -> int:
 def labels(source, root, replace) -> None:
     """Import the published pose labels and evaluation pairs into a data folder.
 
-    SOURCE is a local clone of the published repository.
+    SOURCE is a local clone of the published repository, or what `zsp-lite align` has written.
     """
     from zsp_lite.data.published import import_labels
     from zsp_lite.data.transfer import labelled_v2_categories

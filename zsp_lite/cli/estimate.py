@@ -19,7 +19,9 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
 @click.argument("others", type=PATH, nargs=-1, metavar="")
-@click.option("--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects of the category.")
+@click.option(
+    "--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects of the category, last of all."
+)
 @click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
 @click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
 @click.option("--targets", type=COUNT, default=5, help="Number of target views, evenly spaced.")
@@ -65,6 +67,8 @@ def estimate(
     from zsp_lite.io.locks import writing
     from zsp_lite.own_objects import estimate_pose, open_pair, open_source, write_pair
 
+    if helpers and solver != "verified":
+        raise click.UsageError("--helpers goes with --solver verified only")
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
@@ -107,7 +111,7 @@ def _print_tables(found: Any) -> None:
         for rank, other in enumerate(one.alternatives, 2):
             print(
                 f"  hypothesis {rank}: turned by {one.angle_to(other):.0f}° from the best, "
-                f"score {one.hypotheses[0].score - other.score:.1f} nats below it, probability {other.confidence:.2f}"
+                f"score {other.score - one.hypotheses[0].score:+.1f} nats, probability {other.confidence:.2f}"
             )
         for flag in one.flags:
             print(f"  flag: {flag}")

@@ -16,7 +16,15 @@ from jaxtyping import Float, Real
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_folder, parse_label, read_labels, rigid_label, write_label
+from zsp_lite.data.labels import (
+    PoseLabel,
+    check_one_reference,
+    label_folder,
+    parse_label,
+    read_labels,
+    rigid_label,
+    write_label,
+)
 from zsp_lite.errors import InputError, check_choice, check_integer, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_bytes, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
@@ -105,8 +113,12 @@ class Labelling:
         self.reference = next(iter(references), best)
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
-        proposals = sorted((self.root / "label_proposals" / self.category).glob("*.json"))
-        self._proposals = {path.stem: parse_label(read_bytes(path, "proposal"), path).trans for path in proposals}
+        folder = self.root / "label_proposals" / self.category
+        proposals = {
+            path.stem: parse_label(read_bytes(path, "proposal"), path) for path in sorted(folder.glob("*.json"))
+        }
+        check_one_reference(proposals, folder)
+        self._proposals = {name: label.trans for name, label in proposals.items()}
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
