@@ -21,10 +21,7 @@ def folder_and_pairs(text: str) -> tuple[Path, int]:
 
 
 def check_sides(folders: Iterable[str | Path], side: str) -> None:
-    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side.
-
-    A category CATEGORY-MODEL, as `tools/variants.py` makes it, is on the side of CATEGORY.
-    """
+    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side."""
     with CONCEPTS.open(newline="") as file:
         sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
     for folder in folders:

@@ -94,12 +94,11 @@ def category_pairs(
     per_object: int | None,
     targets: int,
     seed: int,
-    references: int = REFERENCES,
 ) -> list[Pair]:
     """Choose the pairs of objects, and their frames, that a category is aligned by.
 
     Each object is the reference of `per_object` others; None is all below 12 objects, and 6 from there on. Each pair
-    becomes `references` pairs of frames: reference frames are evenly spaced over their sequence, to see several sides,
+    becomes three pairs of frames: reference frames are evenly spaced over their sequence, to see several sides,
     and so are the `targets` target frames, from random starts that depend on the two names and the seed only.
     """
     numbers: dict[str, list[int]] = {}
@@ -109,7 +108,7 @@ def category_pairs(
     if (n := len(names)) < 2:
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
     for name in names:
-        if (length := len(numbers.get(name, ()))) < (least := max(targets, references)):
+        if (length := len(numbers.get(name, ()))) < (least := max(targets, REFERENCES)):
             raise InputError(f"sequence {category}/{name} has {length} frames, expected at least {least}")
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
@@ -122,9 +121,9 @@ def category_pairs(
         rng = np.random.default_rng([seed, stable_hash(f"{category}/{reference}/{target}") >> 1])
         first, around = sorted(numbers[reference]), sorted(numbers[target])
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
-        for r in range(references):
-            frame = first[(start + r * len(first) // references) % len(first)]
-            turn = (np.arange(targets) + r / references) / targets  # of the sequence, from its start
+        for r in range(REFERENCES):
+            frame = first[(start + r * len(first) // REFERENCES) % len(first)]
+            turn = (np.arange(targets) + r / REFERENCES) / targets  # of the sequence, from its start
             positions = (target_start + (turn * len(around)).astype(int)) % len(around)
             pairs.append(Pair(category, reference, frame, target, tuple(around[k] for k in positions)))
     return pairs

@@ -24,17 +24,17 @@ _PER_LINE = 10
 
 
 def contact_sheet(
-    dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None, frame: int = 0
+    dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None
 ) -> Figure:
     """Show objects by the frame that is nearest to one camera: in their own worlds above, in the common frame below.
 
-    The camera is that of a frame, by its place, of the most probable object of the category. Doubtful objects are shown
-    in their next best turn, too. At most ten objects are shown.
+    The camera is that of the first frame of the most probable object of the category. Doubtful objects are shown in
+    their next best turn, too. At most ten objects are shown.
     """
     names = list(names or alignment.objects)[:_PER_LINE]
     objects = {name: alignment.objects[name] for name in names}
     surest, first = max(alignment.objects.items(), key=lambda item: item[1].probability)
-    camera = dataset.camera(_frames(dataset, category, surest)[frame]).R
+    camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ first.sim3.R.T
     rows = {"as scanned": dict.fromkeys(names, camera)}
     rows["aligned"] = {name: common @ one.sim3.R for name, one in objects.items()}
