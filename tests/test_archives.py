@@ -210,7 +210,7 @@ def test_without_a_terminal_nothing_is_downloaded_unless_told(server, tmp_path, 
 @pytest.mark.parametrize(("answer", "code"), [("n", 1), ("", 1), ("Y", 0)])
 def test_the_user_is_asked_on_a_terminal(server, tmp_path, capsys, monkeypatch, answer, code):
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", lambda question: answer)
+    monkeypatch.setattr("click.termui.visible_prompt_func", lambda question: answer)
     assert download(tmp_path / "co3d", yes=False) == code
     assert (tmp_path / "co3d").exists() == (code == 0)
 

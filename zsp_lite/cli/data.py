@@ -76,18 +76,13 @@ def print_checks(root: Path, checks: Sequence[Any], deep: bool) -> int:
 def labels(source, root, replace) -> None:
     """Import the published pose labels and evaluation pairs into a data folder.
 
-    SOURCE is a local clone of the published repository, or what `zsp-lite align` has written.
+    SOURCE is a local clone of the published repository, or what `zsp-lite align` has written. The published labels are
+    those of CO3D v1 and do not fit v2: import them into a v1 folder, then use `zsp-lite data transfer`.
     """
     from zsp_lite.data.published import import_labels
-    from zsp_lite.data.transfer import labelled_v2_categories
 
     counts = import_labels(source, root, replace=replace)
     print(f"Written to {root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
-    if v2 := labelled_v2_categories(root):
-        print(
-            f"Note: {', '.join(v2)} in {root} is CO3D v2. The published labels and pairs are of v1, whose coordinates "
-            "and frames differ: import them into a v1 folder, then use `zsp-lite data transfer`."
-        )
 
 
 @data.command(epilog=examples("data transfer path/to/v1 path/to/v2 chair"))

@@ -2,8 +2,9 @@
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -40,7 +41,6 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     from zsp_lite.data import archives as co3d
     from zsp_lite.data.check import check_folder
     from zsp_lite.data.published import import_labels, published_sequences
-    from zsp_lite.io.download import remote_size
 
     if dataset == "co3d-v1":
         refuse_options({"single_sequence": single_sequence, "chunks": chunks}, (), dataset)
@@ -53,27 +53,17 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     categories = tuple(dict.fromkeys(categories))
     archives = [one for name in categories for one in co3d.list_archives(dataset, name, single_sequence, chunks)]
     if labelled_only:
-        labelled = published_sequences(labels, categories=categories)
-        for name in categories:
-            if not labelled.get(name):
-                raise InputError(f"category {name!r} has no labels in {labels}, expected class_labels/{name}/SEQ.json")
-        wanted = {one: co3d.missing_sequences(root, one, labelled[one.category]) for one in archives}
-        missing = [one for one in archives if wanted[one]]
-        sizes = [co3d.sequence_size(one, wanted[one]) for one in missing]
-        names = [f"{len(wanted[one])} sequences of {one.name}" for one in missing]
-    else:
-        missing = co3d.missing_archives(root, archives)
-        sizes, names = [remote_size(one.url) for one in missing], [one.name for one in missing]
+        labelled = published_sequences(labels, categories)
+        archives = [replace(one, sequences=labelled[one.category]) for one in archives]
+    missing = co3d.missing_archives(root, archives)
+    sizes = [co3d.download_size(one) for one in missing]
     if not missing:
         print(f"{root}: everything is unpacked already")
-    elif not _confirmed(names, sizes, co3d.check_disk(root, missing, sizes, whole=not labelled_only), root, yes):
+    elif not _confirmed(missing, sizes, co3d.check_disk(root, missing, sizes), root, yes):
         print("Nothing was downloaded.")
         return 1
-    elif labelled_only:
-        for archive in missing:
-            co3d.download_sequences(root, archive, wanted[archive])
     else:
-        co3d.download_archives(root, archives)
+        co3d.download_archives(root, missing)
     if labels:
         counts = import_labels(labels, root, categories=categories)
         print(f"Imported: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
@@ -81,16 +71,14 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     return print_checks(root, check_folder(root, categories=categories, partial=some), deep=False)
 
 
-def _confirmed(names: Sequence[str], sizes: Sequence[int | None], needed: int, root: Path, yes: bool) -> bool:
+def _confirmed(archives: Sequence[Any], sizes: Sequence[int | None], needed: int, root: Path, yes: bool) -> bool:
     """Print the sizes of the archives and of what they need on the disk, bytes, and ask whether to download them."""
     from zsp_lite.cli.terminal import print_rows
 
+    names = [f"{len(one.sequences)} sequences of {one.name}" if one.sequences else one.name for one in archives]
     rows = [(name, "unknown" if size is None else f"{size / 1e9:,.2f} GB") for name, size in zip(names, sizes)]
     print_rows("To download", ("archive", "size"), [*rows, ("together", f"{sum(filter(None, sizes)) / 1e9:,.2f} GB")])
     print(f"Needed on the disk of {root}: {needed / 1e9:.2f} GB. {LICENCE}")
-    if yes:
-        return True
-    with suppress(EOFError):
-        if sys.stdin.isatty():
-            return input("Download? [y/N] ").strip().lower() in ("y", "yes")
-    raise InputError("nobody can confirm the download: standard input is not an open terminal, expected --yes")
+    if not yes and not sys.stdin.isatty():
+        raise InputError("nobody can confirm the download: standard input is not a terminal, expected --yes")
+    return yes or click.confirm("Download?")

@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:  # a folder without write permission, a full disk
         message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, click.Abort):  # Abort: of a question
         print("zsp-lite: interrupted", file=sys.stderr)
         return 130
     print(f"zsp-lite: error: {' '.join(message.split())}", file=sys.stderr)

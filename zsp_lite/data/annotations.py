@@ -6,7 +6,6 @@ name and number of each frame only; `FrameIndex.frame` decodes and validates a w
 
 import gzip
 import io
-import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,10 +88,10 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    by_sequence: dict[str, list[int]]  # positions of each sequence's frames in `entries`, sorted by frame number
+    by_sequence: dict[str, dict[int, int]]  # of each sequence, the positions in `entries` by frame number, sorted
 
-    def positions(self, sequence: str) -> list[int]:
-        """Return the positions of a sequence's frames in `entries`; InputError if the sequence is unknown."""
+    def positions(self, sequence: str) -> dict[int, int]:
+        """Return the positions of a sequence's frames by frame number; InputError if the sequence is unknown."""
         if sequence not in self.by_sequence:
             known = f"{len(self.by_sequence)} sequences"
             raise InputError(f"frame annotations {self.path} have {known}, and no frames of {sequence!r}")
@@ -111,17 +110,14 @@ def read_frame_index(path: Path) -> FrameIndex:
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
     keys = decode_json(data, list[FrameKey], f"frame annotations {path}")
     entries = msgspec.json.decode(data, type=list[msgspec.Raw])  # views into `data`, not copies
-    by_sequence: dict[str, list[int]] = {}
-    for position, key in enumerate(keys):
-        by_sequence.setdefault(key.sequence_name, []).append(position)
-    for positions in by_sequence.values():
-        positions.sort(key=lambda position: keys[position].frame_number)
-        for first, second in itertools.pairwise(positions):
-            if keys[first].frame_number == keys[second].frame_number:
-                raise InputError(
-                    f"frame annotations {path}: entries {first} and {second} are both frame "
-                    f"{keys[first].frame_number} of {keys[first].sequence_name}, expected each frame once"
-                )
+    by_sequence: dict[str, dict[int, int]] = {}
+    for position, key in sorted(enumerate(keys), key=lambda one: one[1].frame_number):
+        first = by_sequence.setdefault(key.sequence_name, {}).setdefault(key.frame_number, position)
+        if first != position:
+            raise InputError(
+                f"frame annotations {path}: entries {first} and {position} are both frame {key.frame_number} of "
+                f"{key.sequence_name}, expected each frame once"
+            )
     return FrameIndex(path, entries, keys, by_sequence)
 
 

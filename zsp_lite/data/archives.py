@@ -10,9 +10,9 @@ import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -40,14 +40,15 @@ class Archive:
     name: str
     url: str
     sha256: str
+    # What is read out of the archive on the server, with the annotations; if empty, the whole archive is downloaded.
+    sequences: tuple[str, ...] = ()
 
 
 class _Unpacked(msgspec.Struct):
     """What is unpacked of a category: names of archives, and of single sequences."""
 
     origin: str
-    archives: list[str] = []
-    sequences: list[str] = []
+    done: list[str] = []
 
 
 def list_archives(
@@ -67,37 +68,38 @@ def list_archives(
 
 
 def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return the archives that are not unpacked yet; InputError if the folder has a category from elsewhere."""
+    """Return the archives, with their sequences, that are not unpacked yet.
+
+    InputError if the folder has a category from elsewhere.
+    """
     record, missing = _read_record(root), []
     for archive in archives:
         place, found = root / archive.category, record.get(archive.category)
         origin = found.origin if found else "elsewhere" if place.is_dir() and any(place.iterdir()) else archive.origin
         if origin != archive.origin:
             raise InputError(f"{place} is from {origin}, expected another folder (--root) for {archive.origin}")
-        if found is None or archive.name not in found.archives:
-            missing.append(archive)
+        done = found.done if found else []
+        sequences = tuple(name for name in archive.sequences if name not in done)
+        if archive.name not in done and (sequences or not archive.sequences):
+            missing.append(replace(archive, sequences=sequences))
     return missing
 
 
-def missing_sequences(root: Path, archive: Archive, sequences: Iterable[str]) -> list[str]:
-    """Return the sequences of an archive that are not unpacked in a data folder yet."""
-    found = _read_record(root).get(archive.category, _Unpacked(archive.origin))
-    return sorted(set(sequences) - set(found.sequences)) if missing_archives(root, [archive]) else []
-
-
-def sequence_size(archive: Archive, sequences: Collection[str]) -> int:
-    """Return the size of sequences and of the annotations in an archive on the server, bytes."""
+def download_size(archive: Archive) -> int | None:
+    """Return the number of bytes to download, None if the server does not tell."""
+    if not archive.sequences:
+        return remote_size(archive.url)
     with _zip(RemoteFile(archive.url), archive.url) as zipped:
-        return sum(member.compress_size for member in _members(zipped, archive.category, sequences))
+        return sum(member.compress_size for member in _members(zipped, archive))
 
 
-def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None], whole: bool = True) -> int:
+def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None]) -> int:
     """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less.
 
-    Unpacked archives are about as large as the archives. If `whole` archives are downloaded, one of them is there, too.
+    Unpacked archives are about as large as the archives. Of whole archives, one at a time is there, too.
     """
-    known = [size for size in sizes if size is not None]
-    needed = sum(known) + (max(known, default=0) if whole else 0)
+    whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
+    needed = sum(size or 0 for size in sizes) + max(whole, default=0)
     for archive in missing:
         for path in (root / _WORK / archive.name, root / _WORK / f"{archive.name}.part"):
             needed -= path.stat().st_size if path.is_file() else 0
@@ -111,32 +113,24 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
 
 
 def download_archives(root: Path, archives: Sequence[Archive]) -> None:
-    """Download archives, verify their SHA-256 and unpack them into a data folder.
+    """Download archives, verify their SHA-256 and unpack them, or sequences of them, into a data folder.
 
     An interrupted download is continued by the next call. The annotations of a category are unpacked last, so that the
-    category is read only if it is complete.
+    category is read only if it is complete. Of single sequences, each file is verified by the CRC-32 in the archive.
     """
     with writing(root / _WORK):
         for archive in reversed(missing_archives(root, archives)):  # the first, with the annotations, comes last
             path = root / _WORK / archive.name
-            if not path.exists():
+            if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
-            with _recorded(root, archive) as category, _zip(io.FileIO(path), str(path)) as zipped:
-                _unpack(zipped, root, _members(zipped, archive.category))
-                category.archives.append(archive.name)
-            path.unlink()
-
-
-def download_sequences(root: Path, archive: Archive, sequences: Collection[str]) -> None:
-    """Read sequences and the annotations out of an archive on the server, without downloading the rest of it.
-
-    Each file is verified by the CRC-32 in the archive. The SHA-256 is that of the whole archive and cannot be verified.
-    """
-    with writing(root / _WORK):
-        if missing := missing_sequences(root, archive, sequences):
-            with _recorded(root, archive) as category, _zip(RemoteFile(archive.url), archive.url) as zipped:
-                _unpack(zipped, root, _members(zipped, archive.category, missing))
-                category.sequences += missing
+            record = _read_record(root)
+            category = record.setdefault(archive.category, _Unpacked(archive.origin))
+            write_atomic(root / _RECORD, msgspec.json.encode(record))
+            with _zip(RemoteFile(archive.url) if archive.sequences else io.FileIO(path), archive.url) as zipped:
+                _unpack(zipped, root, _members(zipped, archive))
+            category.done += archive.sequences or [archive.name]
+            write_atomic(root / _RECORD, msgspec.json.encode(record))
+            path.unlink(missing_ok=True)
 
 
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
@@ -153,25 +147,15 @@ def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipIn
         write_atomic(targets[member], zipped.read(member))
 
 
-def _members(zipped: zipfile.ZipFile, category: str, sequences: Collection[str] | None = None) -> list[zipfile.ZipInfo]:
-    """List the files of a category, or its annotations and the files of some sequences."""
-    members = [one for one in zipped.infolist() if one.filename.startswith(f"{category}/") and not one.is_dir()]
-    if sequences is not None:
-        folder_of = {one: one.filename.split("/")[1] for one in members}
-        if absent := sorted(set(sequences) - set(folder_of.values())):
-            raise InputError(f"archive of {category} has no sequence {absent[0]!r}, expected all that are labelled")
-        members = [one for one in members if _is_annotation(one) or folder_of[one] in sequences]
-    return members
-
-
-@contextmanager
-def _recorded(root: Path, archive: Archive) -> Iterator[_Unpacked]:
-    """Record that the category is from this archive, and at the end what was unpacked of it."""
-    record = _read_record(root)
-    category = record.setdefault(archive.category, _Unpacked(archive.origin))
-    write_atomic(root / _RECORD, msgspec.json.encode(record))
-    yield category
-    write_atomic(root / _RECORD, msgspec.json.encode(record))
+def _members(zipped: zipfile.ZipFile, archive: Archive) -> list[zipfile.ZipInfo]:
+    """List the files of the category in an archive, or its annotations and the files of the archive's `sequences`."""
+    members = [one for one in zipped.infolist() if one.filename.startswith(f"{archive.category}/") and not one.is_dir()]
+    if not archive.sequences:
+        return members
+    folder_of = {one: one.filename.split("/")[1] for one in members}
+    if absent := sorted(set(archive.sequences) - set(folder_of.values())):
+        raise InputError(f"archive {archive.name} has no sequence {absent[0]!r}, expected all that are labelled")
+    return [one for one in members if _is_annotation(one) or folder_of[one] in archive.sequences]
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from zsp_lite.data.annotations import SEQUENCES_FILE, FrameAnnotation
 from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import frame_defect
-from zsp_lite.data.labels import check_one_reference, label_folder, read_label_files
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import pair_files, read_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
@@ -99,12 +99,10 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
         if complete_frames >= _MIN_FRAMES:
             usable.add(name)
     check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
-    labels = check.attempt(read_label_files, dataset.root, category) or {}
+    labels = check.attempt(read_labels, dataset.root, category) or {}
     check.labelled, check.usable = len(labels), len(set(labels) & usable)
-    folder = label_folder(dataset.root, category)
     for name in sorted(set(labels) - set(names)):
-        check.problems.append(f"label {folder / name}.json is of a sequence that is not in the annotations")
-    check.attempt(check_one_reference, labels, folder)
+        check.problems.append(f"label of {name} is of a sequence that is not in the annotations")
     for path in pair_files(dataset, category):
         check.pairs += check.attempt(read_published_pairs, path, dataset) is not None
     return check

@@ -123,15 +123,14 @@ class Co3D:
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
         """Read the frame annotations of a sequence, sorted by frame number."""
         index = self._frame_index(category)
-        return [index.frame(position) for position in index.positions(sequence)]
+        return [index.frame(position) for position in index.positions(sequence).values()]
 
     def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
         """Read the annotation of one frame; its number differs from its position in `frames` if frames are missing."""
         index = self._frame_index(category)
-        for position in index.positions(sequence):
-            if index.keys[position].frame_number == frame_number:
-                return index.frame(position)
-        raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
+        if (position := index.positions(sequence).get(frame_number)) is None:
+            raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
+        return index.frame(position)
 
     def camera(self, annotation: FrameAnnotation) -> Camera:
         """Convert the viewpoint of a frame to a camera."""

@@ -3,20 +3,24 @@
 All image files are opened here.
 """
 
+import io
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Real, UInt8, UInt16
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
-from zsp_lite.io.images import decode_image
 
+MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
@@ -186,7 +190,22 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
 
 
 def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
-    return decode_image(read_bytes(path, what), flags, f"{what} {path}")
+    """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or too large."""
+    data = read_bytes(path, what)
+    is_jpeg = data[:2] == b"\xff\xd8"
+    # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
+    # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
+    start, end = (b"\xff\xda", b"\xff\xd9") if is_jpeg else (b"IDAT", b"IEND")
+    image, expected = None, "a complete JPEG or PNG"
+    with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
+        width, height = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data)).size  # reads the header only
+        if width * height > MAX_PIXELS:
+            expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
+        elif data.rfind(end) > data.rfind(start):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
+    return image
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:

@@ -7,7 +7,7 @@ world of the sequence; the label of the reference sequence is the identity. File
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_magnitude
-from zsp_lite.io.files import decode_json, plain_name, read_bytes, write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 
 # Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
 _RIGID_TOLERANCE = 1e-3
@@ -48,20 +48,19 @@ def label_folder(root: str | Path, category: str) -> Path:
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     """Read the labels of a category by sequence, sorted by name; InputError if they have several references."""
-    labels = read_label_files(root, category)
-    check_one_reference(labels, label_folder(root, category))
+    return read_label_folder(label_folder(root, category))
+
+
+def read_label_folder(folder: Path) -> dict[str, PoseLabel]:
+    """Read the labels of one category in a folder by sequence (see `read_labels`)."""
+    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))}
+    check_one_reference(labels, folder)
     return labels
 
 
-def read_label_files(root: str | Path, category: str) -> dict[str, PoseLabel]:
-    """Read the labels of a category, also if they have several reference sequences (see `read_labels`)."""
-    paths = sorted(label_folder(root, category).glob("*.json"))
-    return {path.stem: parse_label(read_bytes(path, "label"), path) for path in paths}
-
-
-def parse_label(data: bytes, path: PurePath) -> PoseLabel:
-    """Parse the content of a label file; InputError if it lacks a field, is not rigid, or has another name."""
-    label = decode_json(data, _LabelFile, f"label {path}")
+def read_label(path: Path) -> PoseLabel:
+    """Read a label file; InputError if it lacks a field, is not rigid, or has another name."""
+    label = read_json(path, _LabelFile, "label")
     trans = np.array(label.trans)
     check_magnitude(f"label {path}: trans", trans)
     rotation = trans[:3, :3]

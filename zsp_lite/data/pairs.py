@@ -7,7 +7,7 @@ code: torch files that refer to frames by their positions in the category's fram
 import io
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -17,7 +17,7 @@ import torch
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.io.files import plain_name, read_bytes, stable_hash, write_atomic
+from zsp_lite.io.files import plain_name, stable_hash, write_atomic
 from zsp_lite.io.tensors import load_torch
 
 
@@ -107,7 +107,7 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     """
     path, pairs = Path(path), []
     named = re.fullmatch(r".*_(\d{1,6})tgt", path.absolute().parent.name)
-    for number, item in enumerate(parse_published_pairs(read_bytes(path, "evaluation pairs"), path)):
+    for number, item in enumerate(read_pair_file(path)):
         where, ids = f"evaluation pairs {path}, pair {number}", item.all_target_id
         if item.reference_seq_name == item.target_seq_name or (named and len(ids) != int(named[1])):
             raise InputError(
@@ -127,9 +127,9 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
     return pairs
 
 
-def parse_published_pairs(data: bytes, path: PurePath) -> list[_PublishedPair]:
-    """Parse the content of an evaluation set of the published code; InputError if its structure is another one."""
-    content = load_torch(data, f"evaluation pairs {path}")
+def read_pair_file(path: Path) -> list[_PublishedPair]:
+    """Read an evaluation set without its data set; InputError if it is damaged or has another structure."""
+    content = load_torch(path, "evaluation pairs")
     try:
         plain = msgspec.to_builtins(content, enc_hook=lambda one: one.tolist() if torch.is_tensor(one) else str(one))
         return msgspec.convert(plain, list[_PublishedPair])

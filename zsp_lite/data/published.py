@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, check_one_reference, label_folder, parse_label, read_labels
-from zsp_lite.data.pairs import parse_published_pairs
+from zsp_lite.data.labels import PoseLabel, check_one_reference, label_folder, read_label, read_labels
+from zsp_lite.data.pairs import read_pair_file
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
-
-_EXTENSIONS = {"class_labels": ".json", "determ_eval": ".pt"}  # by folder
 
 
 def import_labels(
@@ -22,23 +20,30 @@ def import_labels(
     of other content are an InputError.
     """
     Co3D(root)  # raises InputError if there is no such folder
-    files, labels = _read_published(source, categories)
-    for category, imported in labels.items():
-        check_one_reference(read_labels(root, category) | imported, label_folder(root, category))
-    targets = {
-        (label_folder(root, group) if kind == "class_labels" else Path(root, kind, group)) / name: data
-        for (kind, group, name), data in files.items()
-    }
-    write_all(targets, replace)
-    kinds = [kind for kind, *_ in files]
-    return {kind: kinds.count(kind) for kind in _EXTENSIONS}
+    sources = {}
+    for category, labels in _published_labels(source, categories).items():
+        folder = label_folder(root, category)
+        check_one_reference(read_labels(root, category) | {one.seq: one for one in labels.values()}, folder)
+        sources |= {folder / path.name: path for path in labels}
+    for path in sorted(source.glob("**/determ_eval/*/*.pt")):
+        if categories is None or path.stem in categories:
+            read_pair_file(path)
+            sources[Path(root, "determ_eval", path.parent.name, path.name)] = path
+    if not sources:
+        raise _no_labels(source, "CATEGORY" if categories is None else " or ".join(categories))
+    write_all({target: read_bytes(path, "file") for target, path in sources.items()}, replace)
+    pairs = sum(path.suffix == ".pt" for path in sources)
+    return {"class_labels": len(sources) - pairs, "determ_eval": pairs}
 
 
-def published_sequences(source: Path, categories: Sequence[str] | None = None) -> dict[str, list[str]]:
-    """List the labelled sequences of each category in a clone of the published repository."""
-    labels = _read_published(source, categories)[1]
+def published_sequences(source: Path, categories: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """List the labelled sequences of each category in a clone; InputError if a category has none."""
+    labels = _published_labels(source, categories)
+    for category in categories:
+        if category not in labels:
+            raise _no_labels(source, category)
     return {
-        category: sorted({*found, *(label.reference_seq for label in found.values())})
+        category: tuple(sorted({name for label in found.values() for name in (label.seq, label.reference_seq)}))
         for category, found in labels.items()
     }
 
@@ -52,25 +57,15 @@ def write_all(files: dict[Path, bytes], replace: bool) -> None:
         write_atomic(path, data)
 
 
-def _read_published(
-    source: Path, categories: Sequence[str] | None
-) -> tuple[dict[tuple[str, str, str], bytes], dict[str, dict[str, PoseLabel]]]:
-    """Return the checked files of a clone by kind, folder and name, and its labels by category and sequence."""
-    files, labels = {}, {}
-    for kind, extension in _EXTENSIONS.items():
-        for path in sorted(source.glob(f"**/{kind}/*/*{extension}")):
-            group = path.parent.name
-            category = group if kind == "class_labels" else path.stem
-            if categories is not None and category not in categories:
-                continue
-            data = read_bytes(path, "file")
-            if kind == "class_labels":
-                label = parse_label(data, path)
-                labels.setdefault(category, {})[label.seq] = label
-            else:
-                parse_published_pairs(data, path)
-            files[kind, group, path.name] = data
-    if not files:
-        wanted = "CATEGORY" if categories is None else " or ".join(categories)
-        raise InputError(f"{source} holds no class_labels/{wanted}/SEQ.json, expected a clone of the published code")
-    return files, labels
+def _published_labels(source: Path, categories: Sequence[str] | None) -> dict[str, dict[Path, PoseLabel]]:
+    """Read the labels of a clone by category and path."""
+    labels: dict[str, dict[Path, PoseLabel]] = {}
+    for path in sorted(source.glob("**/class_labels/*/*.json")):
+        category = path.parent.name
+        if categories is None or category in categories:
+            labels.setdefault(category, {})[path] = read_label(path)
+    return labels
+
+
+def _no_labels(source: Path, category: str) -> InputError:
+    return InputError(f"{source} holds no class_labels/{category}/SEQ.json, expected a clone of the published code")

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from zsp_lite.alignment import Sim3, umeyama
-from zsp_lite.data.cameras import NDC_ISOTROPIC
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, check_one_reference, label_bytes, label_folder, read_labels, rigid_label
 from zsp_lite.data.published import write_all
@@ -62,14 +61,3 @@ def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Si
     sim3 = umeyama(first, second)
     distance = np.square(sim3.apply(first) - second).sum(axis=1).mean()
     return sim3, float(np.sqrt(distance / np.square(second - second.mean(axis=0)).sum(axis=1).mean()))
-
-
-def labelled_v2_categories(root: str | Path) -> list[str]:
-    """List the labelled categories of a data folder whose cameras are in the format of CO3D v2."""
-    dataset, found = Co3D(root), []
-    for category in dataset.categories():
-        names = {key.sequence_name for key in dataset.frame_list(category)} & set(read_labels(root, category))
-        views = [one.viewpoint for name in sorted(names)[:1] for one in dataset.frames(category, name)]
-        if any(view and view.intrinsics_format == NDC_ISOTROPIC for view in views):
-            found.append(category)
-    return found

@@ -41,11 +41,10 @@ def fetch(
         path.parent.mkdir(parents=True, exist_ok=True)
         complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
         received = part.stat().st_size
-        problem = "" if complete else f"was interrupted {ATTEMPTS} times at {received} bytes; call again to resume"
     except NETWORK_ERRORS as error:
-        problem = f"failed: {error}"
-    if problem:
-        raise InputError(f"download of {url} {problem}")
+        raise InputError(f"download of {url} failed: {error}") from error
+    if not complete:
+        raise InputError(f"download of {url} was interrupted at {received} bytes; call again to resume")
     matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
     if received > most or not matches:
         part.unlink()  # resuming from wrong data would never succeed
@@ -84,7 +83,6 @@ class RemoteFile(io.RawIOBase):
     seekable = readable
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Set the position, as for every file."""
         self._position = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence])
         return self._position
 

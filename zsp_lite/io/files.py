@@ -33,16 +33,6 @@ def write_atomic(path: str | Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def make_folder(path: str | Path, what: str) -> Path:
-    """Make a folder unless it exists, with those above it; InputError if that is not possible."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: a null byte
-        reason = str(getattr(error, "strerror", error)).lower()
-        raise InputError(f"{what} {_shown(path)} cannot be made: {reason}, expected a folder") from error
-    return Path(path)
-
-
 def read_bytes(path: str | Path, what: str) -> bytes:
     """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it cannot be read."""
     file_size(path, what, MAX_FILE)

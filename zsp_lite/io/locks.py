@@ -8,7 +8,6 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import make_folder
 
 
 @contextmanager
@@ -18,14 +17,16 @@ def writing(folder: str | Path) -> Iterator[None]:
     The lock is one of the operating system, which is released when the process ends, however it ends. A folder that was
     made, and into which nothing was written, is removed.
     """
-    made = [one for one in (Path(folder), *Path(folder).parents) if not os.path.exists(one)]
-    path = make_folder(folder, "folder") / ".writing.lock"
+    folder = Path(folder)
+    made = [one for one in (folder, *folder.parents) if not os.path.exists(one)]
+    path = folder / ".writing.lock"
     lock = FileLock(path, timeout=0)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except OSError as error:  # a Timeout of the lock is one, too
-        reason = "another process is writing to it" if isinstance(error, Timeout) else f"it cannot be written: {error}"
-        raise InputError(f"{folder}: {reason}; choose another folder") from error
+        problem = "another process is writing to it" if isinstance(error, Timeout) else f"cannot be written ({error})"
+        raise InputError(f"{folder}: {problem}, expected a folder for this process alone") from error
     try:
         yield
     finally:

@@ -33,19 +33,17 @@ def write_ply(
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
     """Read the positions and 8-bit colours (None if there are none) of a binary or ASCII PLY file.
 
-    Colours are rescaled from [0, 1] if they are floats of at most 1, from [0, 65535] if any is above 255, and are taken
-    as [0, 255] otherwise. InputError if the file is damaged, or positions are not finite or above 1e9.
+    InputError if the file is damaged, or positions are not finite or above 1e9.
     """
     from trimesh.exchange.ply import load_ply  # takes 0.5 s to import
+    from trimesh.visual.color import to_rgba
 
     data = read_bytes(path, "point cloud")
     try:
         loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
         points, colours = loaded["vertices"].astype(np.float64), loaded["vertex_colors"]
         if colours is not None:
-            is_unit = colours.dtype.kind == "f" and colours[:, :3].max() <= 1
-            white = 1 if is_unit else 255 if colours[:, :3].max() <= 255 else 65535
-            colours = np.rint(colours[:, :3] * (255 / white)).clip(0, 255).astype(np.uint8)
+            colours = to_rgba(colours)[:, :3]
     except Exception as error:  # trimesh raises IndexError, KeyError and others for malformed files
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
     check_magnitude(f"point cloud {path}", points)

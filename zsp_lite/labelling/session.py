@@ -18,15 +18,14 @@ from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import (
     PoseLabel,
-    check_one_reference,
     label_folder,
-    parse_label,
+    read_label_folder,
     read_labels,
     rigid_label,
     write_label,
 )
 from zsp_lite.errors import InputError, check_choice, check_integer, check_magnitude, real_array
-from zsp_lite.io.files import plain_name, read_bytes, read_json, write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
@@ -113,11 +112,7 @@ class Labelling:
         self.reference = next(iter(references), best)
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
-        folder = self.root / "label_proposals" / self.category
-        proposals = {
-            path.stem: parse_label(read_bytes(path, "proposal"), path) for path in sorted(folder.glob("*.json"))
-        }
-        check_one_reference(proposals, folder)
+        proposals = read_label_folder(self.root / "label_proposals" / self.category)
         self._proposals = {name: label.trans for name, label in proposals.items()}
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
