@@ -48,7 +48,7 @@ class Viewpoint(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class FrameAnnotation(msgspec.Struct, frozen=True):
-    """Files and camera of a frame. `frame_number` starts at 0, `frame_timestamp` is in seconds, only v2 has `meta`."""
+    """Files and camera of a frame. `frame_number` starts at 0, `frame_timestamp` is in seconds."""
 
     sequence_name: str
     frame_number: int
@@ -57,7 +57,6 @@ class FrameAnnotation(msgspec.Struct, frozen=True):
     depth: DepthAnnotation | None = None
     mask: MaskAnnotation | None = None
     viewpoint: Viewpoint | None = None
-    meta: dict | None | msgspec.UnsetType = msgspec.UNSET
 
 
 class FrameKey(msgspec.Struct, frozen=True, gc=False):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
+from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array
 
@@ -57,24 +58,15 @@ class Camera:
             check_integer("image size (height, width)", side, 1, MOST_PIXELS)
         object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
 
-    def __repr__(self) -> str:
-        names = ("focal_length", "principal_point", "t", "R")
-        values = (f"{name}={getattr(self, name).round(4).tolist()}" for name in names)
-        return f"Camera(size={self.size}, {', '.join(values)})"
-
     @classmethod
     def from_pytorch3d(
-        cls,
-        R: Real[np.ndarray, "3 3"] | Sequence,  # for row vectors: `X_cam = X_world @ R + T`, +x left, +y up
-        T: Real[np.ndarray, "3"] | Sequence,
-        focal_length: Real[np.ndarray, "2"] | Sequence,  # along x and y, in units of the format
-        principal_point: Real[np.ndarray, "2"] | Sequence,  # in units of the format
-        size: Sequence[int],  # image (height, width), pixels
-        intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
-    ) -> "Camera":
-        """Convert a PyTorch3D camera, such as a CO3D viewpoint.
+        cls, R: ArrayLike, T: ArrayLike, focal_length: ArrayLike, principal_point: ArrayLike,
+        intrinsics_format: str, size: Sequence[int],
+    ) -> "Camera":  # fmt: skip
+        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height, width) in pixels.
 
-        Each side of the image covers [-1, 1] in "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
+        `X_cam = X_world @ R + T` with row vectors, +x left, +y up. Each side of the image covers [-1, 1] in the format
+        "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
         """
         R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)

@@ -25,7 +25,7 @@ class CategoryCheck:
     """Result of the check of a category."""
 
     category: str
-    layout: str = "v1"  # or "v2", or "mixed"
+    layout: str = "v1"  # or "v2"
     sequences: int = 0  # annotated ones
     frames: int = 0  # annotated ones
     complete: int = 0  # sequences without problems
@@ -52,14 +52,10 @@ class CategoryCheck:
 def check_folder(
     root: str | Path, deep: bool = False, categories: Sequence[str] | None = None, partial: bool = False
 ) -> list[CategoryCheck]:
-    """Check the categories of a data folder, sorted by name.
+    """Check some or all categories of a data folder, sorted by name.
 
-    Args:
-        root: The data folder.
-        deep: Also decode every image, mask, depth map and point cloud, which is slow on large folders. Otherwise only
-            check that the files exist and are not empty.
-        categories: Names of the categories to check; all by default.
-        partial: An annotated sequence without any file is counted, and is not a problem.
+    A `deep` check also decodes every image, mask, depth map and point cloud, which is slow on large folders; otherwise
+    the files must exist and not be empty. If `partial`, a sequence without any file is counted, and is not a problem.
     """
     dataset = Co3D(root)
     chosen = sorted(set(dataset.categories() if categories is None else categories))
@@ -70,35 +66,31 @@ def check_folder(
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
     check = CategoryCheck(category)
-    annotations = check.attempt(dataset.sequences, category)
-    keys = check.attempt(dataset.frame_list, category) if annotations is not None else None
-    if keys is None:
+    keys, sequences = check.attempt(dataset.frame_list, category), check.attempt(dataset.sequences, category)
+    if keys is None or sequences is None:
         return check
-    sequences = {one.sequence_name: one for one in annotations}
+    clouds = {one.sequence_name: one.point_cloud for one in sequences}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
     check.sequences, check.frames = len(names), len(keys)
-    frameless = sorted(set(sequences) - set(names))
-    check.problems += [f"sequence {name} has no frames in the annotations" for name in frameless]
-    layouts, usable = set(), set()
+    check.problems += [f"sequence {name} has no frames in the annotations" for name in sorted(set(clouds) - set(names))]
+    usable = set()
     for name in names:
         if partial and not (dataset.root / category / name).exists():
             check.absent += 1
             continue
-        before, complete_frames = len(check.problems), 0
-        for annotation in check.attempt(dataset.frames, category, name) or ():
-            complete_frames += _check_frame(dataset, annotation, deep, check)
-            if annotation.viewpoint is not None:
-                layouts.add("v2" if annotation.viewpoint.intrinsics_format == NDC_ISOTROPIC else "v1")
-        if name not in sequences:
+        before = len(check.problems)
+        frames = check.attempt(dataset.frames, category, name) or []
+        if sum(_check_frame(dataset, frame, deep, check) for frame in frames) >= _MIN_FRAMES:
+            usable.add(name)
+        if any(frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC for frame in frames):
+            check.layout = "v2"
+        if name not in clouds:
             check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
-        elif not (cloud := sequences[name].point_cloud) or not _check_file(dataset, cloud.path, check):
+        elif not clouds[name] or not _check_file(dataset, clouds[name].path, check):
             check.cloudless += 1
         elif deep:
             check.attempt(dataset.point_cloud, category, name)
         check.complete += len(check.problems) == before
-        if complete_frames >= _MIN_FRAMES:
-            usable.add(name)
-    check.layout = "mixed" if len(layouts) > 1 else next(iter(layouts), "v1")
     labels = check.attempt(read_labels, dataset.root, category) or {}
     check.labelled, check.usable = len(labels), len(set(labels) & usable)
     for name in sorted(set(labels) - set(names)):
@@ -125,8 +117,8 @@ def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> bool:
     """Check that a file exists and is not empty, and add its size to `check`."""
     if (path := check.attempt(path_inside, dataset.root, relative)) is None:
         return False
-    size = path.stat().st_size if path.is_file() else None
-    check.size += size or 0
+    size = path.stat().st_size if path.is_file() else 0
+    check.size += size
     if not size:
-        check.problems.append(f"{relative} is {'missing' if size is None else 'empty'}")
-    return bool(size)
+        check.problems.append(f"{relative} is {'empty' if path.exists() else 'missing'}")
+    return size > 0

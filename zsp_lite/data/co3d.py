@@ -26,14 +26,13 @@ from zsp_lite.data.annotations import (
     read_frame_index,
     read_sequences,
 )
-from zsp_lite.data.cameras import NDC_ISOTROPIC, NDC_NORM_IMAGE_BOUNDS, Camera
+from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import (
     Frame,
     check_pixels,
     read_depth,
     read_image,
     read_mask,
-    write_binary_mask,
     write_depth,
     write_image,
     write_mask,
@@ -42,6 +41,8 @@ from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
+
+_MIN_VIEW_QUALITY, _MIN_CLOUD_QUALITY = 1.25, 0.3  # of sequences that are worth labelling
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,7 @@ class Co3D:
         self.root = Path(root)
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
-            raise InputError(
-                f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE} as "
-                "`zsp-lite synth --preset demo --out FOLDER` makes it"
-            )
+            raise InputError(f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE}")
         self._index: tuple[str, FrameIndex] | None = None
         self._sequences: dict[str, list[SequenceAnnotation]] = {}
 
@@ -100,21 +98,17 @@ class Co3D:
             self._sequences[category] = read_sequences(self._category_folder(category) / SEQUENCES_FILE)
         return list(self._sequences[category])
 
-    def select(
-        self, category: str, viewpoint_quality: float = 1.25, point_cloud_quality: float = 0.3, top: int | None = 10
-    ) -> list[SequenceAnnotation]:
-        """Select the `top` sequences for labelling whose quality scores are above both bounds, best point clouds first.
+    def select(self, category: str, top: int = 10) -> list[SequenceAnnotation]:
+        """Select at most `top` sequences for labelling, best point clouds first.
 
-        Follows the supplement, "Choice of evaluation categories & sequences".
+        Both quality scores are above the bounds of the supplement, "Choice of evaluation categories & sequences".
         """
         selected = []
         for sequence in self.sequences(category):
-            cloud, views = sequence.point_cloud, sequence.viewpoint_quality_score
-            score = None if cloud is None else cloud.quality_score
-            if None not in (score, views) and score > point_cloud_quality and views > viewpoint_quality:
+            cloud = sequence.point_cloud.quality_score if sequence.point_cloud else None
+            if (cloud or 0) > _MIN_CLOUD_QUALITY and (sequence.viewpoint_quality_score or 0) > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
-        selected.sort(key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name))
-        return selected[:top]
+        return sorted(selected, key=lambda one: (-one.point_cloud.quality_score, one.sequence_name))[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
         """List the frames in the order of the annotation file, to which the ids of published pairs refer."""
@@ -138,9 +132,7 @@ class Co3D:
         if (view := annotation.viewpoint) is None:
             raise InputError(f"frame {name} has no viewpoint, expected a camera")
         try:
-            return Camera.from_pytorch3d(
-                view.R, view.T, view.focal_length, view.principal_point, annotation.image.size, view.intrinsics_format
-            )
+            return Camera.from_pytorch3d(**msgspec.structs.asdict(view), size=annotation.image.size)
         except InputError as error:
             raise InputError(f"frame {name}: {error}") from error
 
@@ -205,22 +197,14 @@ class SequenceData:
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
 
 
-def write_co3d(
-    root: str | Path,
-    category: str,
-    sequences: Iterable[SequenceData],
-    quality: int = 92,
-    intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS,
-) -> None:
-    """Write sequences into `root / category` in CO3D's layout; the same input gives the same bytes.
+def write_co3d(root: str | Path, category: str, sequences: Iterable[SequenceData], quality: int = 92) -> None:
+    """Write sequences into `root / category` in the layout of CO3D v1; the same input gives the same bytes.
 
     Other sequences in the folder are kept; those of the same names are replaced. The annotations are updated
     atomically after each sequence, so the folder stays readable if the run is interrupted. Only one process can write
-    to a category at a time. `quality` is that of JPEG, 0 to 100; the formats are "ndc_norm_image_bounds" (v1) and
-    "ndc_isotropic" (v2).
+    to a category at a time. `quality` is that of JPEG, 0 to 100.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
     frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
@@ -234,7 +218,7 @@ def write_co3d(
             listed = list(zip(names, msgspec.json.decode(read_annotations(sequences_path), type=list[msgspec.Raw])))
 
         for sequence in sequences:
-            annotations, annotation = _write_sequence(root, category, sequence, quality, intrinsics_format)
+            annotations, annotation = _write_sequence(root, category, sequence, quality)
             frames = [one for one in frames if one[0] != sequence.name] + [(sequence.name, one) for one in annotations]
             listed = [one for one in listed if one[0] != sequence.name] + [(sequence.name, annotation)]
             for path, entries in ((frames_path, frames), (sequences_path, listed)):
@@ -243,7 +227,7 @@ def write_co3d(
 
 
 def _write_sequence(
-    root: Path, category: str, sequence: SequenceData, quality: int, intrinsics_format: str
+    root: Path, category: str, sequence: SequenceData, quality: int
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
@@ -254,17 +238,16 @@ def _write_sequence(
         depth = mask = None
         if frame.depth is not None:
             path, mask_path = f"{base}/depths/{stem}.jpg.geometric.png", f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
-            write_binary_mask(root / mask_path, frame.depth > 0)
+            depth = DepthAnnotation(path, 1.0, mask_path)
+            write_depth(root / path, frame.depth)
+            write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every machine.
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)
-        view = Viewpoint(**frame.camera.to_pytorch3d(intrinsics_format))  # its arrays are written as lists
-        meta = {"frame_splits": [], "eval_batch_maps": []} if intrinsics_format == NDC_ISOTROPIC else msgspec.UNSET
-        annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view, meta))
+        view = Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
+        annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view))
     cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
     return annotations, SequenceAnnotation(sequence.name, category, None, cloud, sequence.viewpoint_quality)

@@ -23,9 +23,9 @@ def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def encode_depth(depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> UInt16[np.ndarray, "h w"]:
+def encode_depth(depth: Real[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
     """Encode depth (0 where unknown) as the bits of float16 values; the inverse of `decode_depth`."""
-    depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
+    depth = np.asarray(depth, dtype=np.float64)
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
     return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
@@ -84,11 +84,7 @@ def patch_points(
     n_known = np.isfinite(values).sum(axis=-1)
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
-    # The pixel of this rank in a stable sort. Sorting the values alone is much faster than sorting their indices.
-    percentile = np.take_along_axis(np.sort(values, axis=-1), rank[..., None], axis=-1)
-    among_equal = rank - (values < percentile).sum(axis=-1)
-    equal = np.cumsum(values == percentile, axis=-1) > among_equal[..., None]
-    chosen = equal.argmax(axis=-1, keepdims=True)
+    chosen = np.take_along_axis(np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1)
     index = np.where(
         known,
         np.take_along_axis(pixel, chosen, axis=-1)[..., 0],

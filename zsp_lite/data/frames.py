@@ -161,19 +161,15 @@ def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int 
     _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"]) -> None:
-    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG."""
-    _encode(path, ".png", np.rint(np.asarray(mask, dtype=np.float64) * 255).astype(np.uint8), [])
+def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> None:
+    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one, with values 255 and 0."""
+    options = [cv2.IMWRITE_PNG_BILEVEL, 1] if mask.dtype == bool else []
+    _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
 
 
-def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> None:
-    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth / scale_adjustment`."""
-    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
-
-
-def write_binary_mask(path: str | Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    """Write a boolean mask (H, W) as a 1-bit PNG, which reads as 255 and 0."""
-    _encode(path, ".png", np.asarray(mask, dtype=bool).astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
+def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"]) -> None:
+    """Write depth (H, W) as a 16-bit PNG that holds the bits of float16 values."""
+    _encode(path, ".png", encode_depth(depth), [])
 
 
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:

@@ -41,9 +41,8 @@ class PoseLabel:
 
 
 def label_folder(root: str | Path, category: str) -> Path:
-    """Return ROOT/class_labels/CATEGORY, or ROOT/data/class_labels/CATEGORY (published code) if only that exists."""
-    folders = [Path(root) / part / plain_name(category, "category") for part in ("class_labels", "data/class_labels")]
-    return next((folder for folder in folders if folder.is_dir()), folders[0])
+    """Return ROOT/class_labels/CATEGORY."""
+    return Path(root) / "class_labels" / plain_name(category, "category")
 
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:

@@ -1,11 +1,9 @@
-"""Evaluation pairs: a reference frame of one sequence and N target frames of another sequence of the category.
+"""Evaluation pairs (section 5.1 of the paper): sampled, or read from the evaluation sets of the published code.
 
-See the paper's section 5.1, "Evaluation setting". Pairs are sampled, or read from the evaluation sets of the published
-code: torch files that refer to frames by their positions in the category's frame list.
+These sets are torch files that refer to frames by their positions in the category's frame list.
 """
 
 import io
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +14,7 @@ import torch
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name, stable_hash, write_atomic
 from zsp_lite.io.tensors import load_torch
 
@@ -29,25 +27,14 @@ class _PublishedPair(msgspec.Struct):
     all_target_id: Annotated[list[int], msgspec.Meta(min_length=1)]
 
 
-def sample_pairs(
-    dataset: Co3D, category: str, n: int, n_targets: int, seed: int | np.random.Generator = 0
-) -> list[Pair]:
-    """Sample evaluation pairs of a category.
+def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
+    """Sample `n` evaluation pairs of a category, each with `n_targets` target frames.
 
     Reference sequences cycle through the labelled sequences in sorted order; the target sequence is a random other
     one. The reference frame is random; the target frames are evenly spaced over the sequence, from a random start.
-
-    Args:
-        dataset: The data set, with labels.
-        category: Name of the category.
-        n: Number of pairs.
-        n_targets: Number of target frames per pair.
-        seed: Seed or generator. With an integer, the draws depend on the category and the seed only, and the pairs of
-            a smaller `n` are the first ones of a larger `n`.
+    The draws depend on the category and the seed only, and the pairs of a smaller `n` are the first ones of a larger.
     """
-    if not isinstance(seed, np.random.Generator):
-        check_integer("seed", seed, 0)
-        seed = np.random.default_rng([seed, stable_hash(category) >> 1])
+    rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
     frames = dataset.frame_list(category)
     numbers = {name: sorted(key.frame_number for key in frames if key.sequence_name == name) for name in sequences}
@@ -61,10 +48,10 @@ def sample_pairs(
     for index in range(n):
         reference = sequences[index % len(sequences)]
         others = [name for name in sequences if name != reference]
-        target = others[seed.integers(len(others))]
-        frame = numbers[reference][seed.integers(len(numbers[reference]))]
+        target = others[rng.integers(len(others))]
+        frame = numbers[reference][rng.integers(len(numbers[reference]))]
         length = len(numbers[target])
-        positions = (seed.integers(length) + np.arange(n_targets) * length // n_targets) % length
+        positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
         pairs.append(Pair(category, reference, frame, target, tuple(numbers[target][p] for p in positions)))
     return pairs
 
@@ -95,9 +82,8 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
 
 
 def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
-    """List a category's evaluation sets in ROOT/determ_eval and, as in the published code, ROOT/data/determ_eval."""
-    name = f"determ_eval/{folders}/{plain_name(category, 'category')}.pt"
-    return [*sorted(dataset.root.glob(name)), *sorted(dataset.root.glob(f"data/{name}"))]
+    """List a category's evaluation sets, ROOT/determ_eval/*/CATEGORY.pt."""
+    return sorted(dataset.root.glob(f"determ_eval/{folders}/{plain_name(category, 'category')}.pt"))
 
 
 def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
@@ -105,22 +91,16 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
 
     Code in the file is not executed. InputError if the set is damaged or does not fit the data set.
     """
-    path, pairs = Path(path), []
-    named = re.fullmatch(r".*_(\d{1,6})tgt", path.absolute().parent.name)
-    for number, item in enumerate(read_pair_file(path)):
-        where, ids = f"evaluation pairs {path}, pair {number}", item.all_target_id
-        if item.reference_seq_name == item.target_seq_name or (named and len(ids) != int(named[1])):
-            raise InputError(
-                f"{where}: {item.reference_seq_name} is compared with {len(ids)} targets of {item.target_seq_name}, "
-                "expected another sequence, and as many targets as the name of the folder says"
-            )
+    pairs = []
+    for number, item in enumerate(read_pair_file(Path(path))):
         frames = dataset.frame_list(item.category)
-        chosen = [(item.reference_seq_name, item.reference_frame_id), *((item.target_seq_name, one) for one in ids)]
+        chosen = [(item.reference_seq_name, item.reference_frame_id)]
+        chosen += [(item.target_seq_name, position) for position in item.all_target_id]
         for sequence, position in chosen:
             if not 0 <= position < len(frames) or frames[position].sequence_name != sequence:
                 raise InputError(
-                    f"{where}: frame id {position} is not of {sequence}, expected a position in the list of "
-                    f"{len(frames)} frames"
+                    f"evaluation pairs {path}, pair {number}: frame id {position} is not of {sequence}, expected a "
+                    f"position in the list of {len(frames)} frames"
                 )
         reference, *targets = (frames[position].frame_number for _, position in chosen)
         pairs.append(Pair(item.category, item.reference_seq_name, reference, item.target_seq_name, tuple(targets)))

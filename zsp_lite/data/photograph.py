@@ -31,10 +31,8 @@ def motorcycle_photograph() -> Frame:
     """Load a photograph of a motorcycle with dense depth and an object mask.
 
     The photograph and its disparities, measured with structured light, come with scikit-image
-    (`skimage.data.stereo_motorcycle`). They are a scene of the Middlebury 2014 stereo data:
-
-        D. Scharstein, H. Hirschmueller, Y. Kitajima, G. Krathwohl, N. Nesic, X. Wang and P. Westling.
-        High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
+    (`skimage.data.stereo_motorcycle`). They are a scene of the Middlebury 2014 stereo data: D. Scharstein et al.,
+    High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
 
     The world is the camera's frame. Lengths are scaled as in CO3D (supplement), so that the points of the object have
     unit standard deviation, averaged over the axes; one unit is about 0.22 m.
