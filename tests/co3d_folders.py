@@ -24,7 +24,7 @@ def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
     return Camera(rotation, rng.normal(size=3) * 3, focal, rng.uniform(0.2, 0.8, 2) * size[::-1], size)
 
 
-def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options) -> SequenceData:
+def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0) -> SequenceData:
     """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a hole."""
     rng = np.random.default_rng([seed, *name.encode()])
     height, width = 24, 32
@@ -40,7 +40,7 @@ def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.
     points = rng.normal(size=(50, 3))
     colours = rng.integers(0, 256, (50, 3)).astype(np.uint8)
     times = [0.2 * number for number in range(frames)]
-    return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
+    return SequenceData(name, made, times, points, colours, None, 2.0, quality)
 
 
 def contents(folder) -> dict[str, bytes]:
@@ -53,3 +53,17 @@ def edit_json(path, change) -> None:
     content = json.loads(gzip.decompress(path.read_bytes()))
     changed = change(content)
     path.write_bytes(gzip.compress(json.dumps(content if changed is None else changed).encode()))
+
+
+def convert_to_v2(folder) -> None:
+    """Rewrite the cameras of a category in the format of CO3D v2, with the fields that only v2 has."""
+
+    def convert(frames):
+        for frame in frames:
+            size = tuple(frame["image"]["size"])
+            camera = Camera.from_pytorch3d(**frame["viewpoint"], intrinsics_format="ndc_norm_image_bounds", size=size)
+            view = camera.to_pytorch3d("ndc_isotropic")
+            frame["viewpoint"] = {name: x if isinstance(x, str) else x.tolist() for name, x in view.items()}
+            frame["meta"] = {"frame_splits": ["train"], "eval_batch_maps": []}
+
+    edit_json(folder / "frame_annotations.jgz", convert)

@@ -1,11 +1,12 @@
 """The commands for data: their output, the files they write, and one line for bad input."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_folders import sequence_data
+from co3d_folders import convert_to_v2, sequence_data
 from test_importers import hairdryer_views, write_lists
 
 from zsp_lite.cli.main import main
@@ -38,8 +39,8 @@ def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
         write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
     assert main(["data", "labels", str(tmp_path / "clone"), "--root", str(root)]) == 0
     assert "2 labels, 0 files of pairs" in capsys.readouterr().out
-    write_co3d(tmp_path / "v2", "chair", [sequence_data("a", quality=2.0), sequence_data("b")],
-               intrinsics_format="ndc_isotropic")  # fmt: skip
+    shutil.copytree(root / "chair", tmp_path / "v2/chair")
+    convert_to_v2(tmp_path / "v2/chair")
     assert main(["data", "transfer", str(root), str(tmp_path / "v2"), "chair"]) == 0
     assert "camera centres differ by 0.00 %" in capsys.readouterr().out
     assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]

@@ -1,16 +1,16 @@
+"""Data sets in the layout of CO3D: reading, writing, and files of other people's."""
+
 import gzip
 import json
 import os
 
 import numpy as np
 import pytest
-from co3d_folders import contents, edit_json, sequence_data
+from co3d_folders import contents, convert_to_v2, edit_json, sequence_data
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
 from zsp_lite.errors import InputError
-
-V1, V2 = "ndc_norm_image_bounds", "ndc_isotropic"
 
 
 @pytest.fixture
@@ -19,16 +19,12 @@ def root(tmp_path):
     return tmp_path
 
 
-def frames_file(root):
-    return root / "chair" / "frame_annotations.jgz"
-
-
-def change_first_frame(root, **changes):
-    edit_json(frames_file(root), lambda frames: frames[0].update(changes))
+def edit_first(root, change) -> None:
+    """Change the entry of the frame that `first` returns."""
+    edit_json(root / "chair/frame_annotations.jgz", lambda frames: change(frames[0]) and None)
 
 
 def first(root):
-    """The annotation that `change_first_frame` changes."""
     return Co3D(root).frame("chair", "b_2", 0)
 
 
@@ -39,11 +35,12 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
         Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,)))
 
 
-@pytest.mark.parametrize("intrinsics_format", [V1, V2])
-def test_written_data_is_read_back(tmp_path, intrinsics_format):
-    written = sequence_data("b_2", depth_scale_adjustment=1.7)
-    write_co3d(tmp_path, "chair", [written], intrinsics_format=intrinsics_format)
-    dataset = Co3D(tmp_path)
+@pytest.mark.parametrize("version", [1, 2])
+def test_written_data_is_read_back(root, version):
+    written = sequence_data("b_2")
+    if version == 2:
+        convert_to_v2(root / "chair")
+    dataset = Co3D(root)
     assert dataset.categories() == ["chair"]
     annotations = dataset.frames("chair", "b_2")
     assert [annotation.frame_number for annotation in annotations] == [0, 1, 2, 3]
@@ -65,10 +62,9 @@ def test_written_files_have_the_layout_of_co3d(root):
     assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
     for part in ("images/?.jpg", "masks/?.png", "depths/?.jpg.geometric.png", "depth_masks/?.png", "pointcloud.ply"):
         assert (root / "chair/a_1" / part.replace("?", "frame000001")).is_file()
-    entry = json.loads(gzip.decompress(frames_file(root).read_bytes()))[0]
+    entry = json.loads(gzip.decompress((root / "chair/frame_annotations.jgz").read_bytes()))[0]
     assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
     assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}  # v1 has no format
-    assert "meta" not in entry
 
 
 def test_writing_together_again_and_one_after_the_other_gives_the_same_bytes(tmp_path):
@@ -100,7 +96,7 @@ def test_an_interrupted_run_leaves_the_finished_sequences(tmp_path):
 
 
 def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
-    edit_json(frames_file(root), lambda frames: frames[::-1])
+    edit_json(root / "chair/frame_annotations.jgz", lambda frames: frames[::-1])
     dataset = Co3D(root)
     keys = [(key.sequence_name, key.frame_number) for key in dataset.frame_list("chair")]
     assert keys == [(name, number) for name in ("a_1", "b_2") for number in (3, 2, 1, 0)]
@@ -109,14 +105,11 @@ def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
 
 
 def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
-    change_first_frame(root, depth=None, mask=None, novelty={"deep": [1, 2]})
+    edit_first(root, lambda frame: frame.update(depth=None, mask=None, novelty={"deep": [1, 2]}))
     frame = Co3D(root).load(first(root))
     assert frame.depth is None and frame.mask is None
-
-    def strip(items):
-        items[0].update(video=None, point_cloud=None, viewpoint_quality_score=None)
-
-    edit_json(root / "chair" / "sequence_annotations.jgz", strip)
+    nothing = dict.fromkeys(("video", "point_cloud", "viewpoint_quality_score"))
+    edit_json(root / "chair/sequence_annotations.jgz", lambda items: items[0].update(nothing))
     dataset = Co3D(root)
     assert [sequence.sequence_name for sequence in dataset.select("chair")] == ["a_1"]
     with pytest.raises(InputError, match="chair/b_2 has no point cloud"):
@@ -137,10 +130,7 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     ],
 )
 def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
-    def change_first(frames):
-        change(frames[0])
-
-    edit_json(frames_file(root), change_first)
+    edit_first(root, change)
     with pytest.raises(InputError, match=message):
         Co3D(root).load(first(root))
     if "`sequence_name`" not in message:
@@ -149,17 +139,16 @@ def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
 
 def test_unknown_folders_categories_sequences_and_frames_are_named(root):
     dataset = Co3D(root)
-    with pytest.raises(InputError, match="nowhere does not exist"):
-        Co3D(root / "nowhere")
-    with pytest.raises(InputError, match="frame_annotations.jgz is not a folder"):
-        Co3D(frames_file(root))
-    with pytest.raises(InputError, match="category is 'sofa', expected one of chair"):
-        dataset.frame_list("sofa")
-    for use in (dataset.frame_list, lambda name: write_co3d(root, name, [])):
-        with pytest.raises(InputError, match="category .*is .*, expected"):
-            use("../chair")
-    with pytest.raises(InputError, match="no frames of 'c_3'"):
-        dataset.frames("chair", "c_3")
+    for call, message in (
+        (lambda: Co3D(root / "nowhere"), "nowhere does not exist"),
+        (lambda: Co3D(root / "chair/frame_annotations.jgz"), "frame_annotations.jgz is not a folder"),
+        (lambda: dataset.frame_list("sofa"), "category is 'sofa', expected one of chair"),
+        (lambda: dataset.frame_list("../chair"), "category is '../chair', expected one of chair"),
+        (lambda: write_co3d(root, "../chair", []), "category name is '../chair', expected"),
+        (lambda: dataset.frames("chair", "c_3"), "no frames of 'c_3'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
 
 
 @pytest.mark.parametrize("path", ["../secret.jpg", "chair/../../secret.jpg", "ABSOLUTE", "link/secret.jpg"])
@@ -171,7 +160,7 @@ def test_paths_that_leave_the_folder_are_refused(root, path):
     os.symlink(root, inside / "link")
     path = str(root / "secret.jpg") if path == "ABSOLUTE" else path
     for part in ("image", "depth", "mask"):
-        edit_json(frames_file(inside), lambda frames, part=part: frames[0][part].update(path=path))
+        edit_first(inside, lambda frame, part=part: frame[part].update(path=path))
         with pytest.raises(InputError, match="leads out of the data folder"):
             Co3D(inside).load(first(inside))
     items = inside / "chair" / "sequence_annotations.jgz"
@@ -183,26 +172,22 @@ def test_paths_that_leave_the_folder_are_refused(root, path):
 def test_the_depth_mask_makes_depth_unknown(root):
     annotation = first(root)
     before = Co3D(root).load(annotation).depth
-    allowed = np.zeros((24, 32), np.float32)
-    allowed[:, :16] = 1
+    allowed = np.arange(32) < np.full((24, 1), 16)
     write_mask(root / annotation.depth.mask_path, allowed)
     after = Co3D(root).load(annotation).depth
-    np.testing.assert_array_equal(after, np.where(allowed > 0, before, 0))
-    change_first_frame(root, depth={"path": annotation.depth.path, "scale_adjustment": 2.0, "mask_path": None})
+    np.testing.assert_array_equal(after, np.where(allowed, before, 0))
+    edit_first(root, lambda frame: frame["depth"].update(scale_adjustment=2.0, mask_path=None))
     np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
 
 
-@pytest.mark.parametrize("part", ["image", "depth", "mask"])
-def test_missing_files_and_files_of_another_size_are_refused(root, part):
+@pytest.mark.parametrize(("part", "write"), [("image", write_image), ("depth", write_depth), ("mask", write_mask)])
+def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
     annotation = first(root)
     path = root / getattr(annotation, part).path
     path.unlink()
     with pytest.raises(InputError, match=f"{part} .*{path.name} cannot be read"):
         Co3D(root).load(annotation)
-    small = np.ones((5, 6, 3), np.uint8)
-    {"image": write_image, "depth": write_depth, "mask": write_mask}[part](
-        path, small if part == "image" else small[..., 0]
-    )
+    write(path, np.ones((5, 6, 3) if part == "image" else (5, 6), np.uint8))
     with pytest.raises(InputError, match=r"is \(5, 6\) pixels, expected \(H, W\) = \(24, 32\)"):
         Co3D(root).load(annotation)
 
@@ -219,4 +204,3 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
     dataset = Co3D(tmp_path)
     assert [sequence.sequence_name for sequence in dataset.select("chair")] == ["best", "good", "fair"]
     assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == ["best"]
-    assert len(dataset.select("chair", viewpoint_quality=0, point_cloud_quality=0)) == 5

@@ -16,16 +16,13 @@ def frontal(size):
 
 @given(seeds, st.floats(0.01, 100))
 def test_depth_survives_its_encoding_to_half_precision(seed, scale):
-    depth = np.random.default_rng(seed).uniform(0.5, 50, (6, 7)).astype(np.float32) * np.float32(scale)
-    np.testing.assert_allclose(decode_depth(encode_depth(depth, scale), scale), depth, rtol=2**-11 + 1e-6)
+    depth = np.random.default_rng(seed).uniform(0.5, 50, (6, 7)).astype(np.float32)
+    np.testing.assert_allclose(decode_depth(encode_depth(depth), scale), depth * scale, rtol=2**-11 + 1e-6)
 
 
-def test_the_bits_are_those_of_a_float16():
+def test_the_bits_are_those_of_a_float16_and_values_that_are_not_positive_and_finite_are_unknown():
     assert encode_depth(np.array([[1.0, 0.0]])).tolist() == [[0x3C00, 0]]
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
-
-
-def test_values_that_are_not_positive_and_finite_are_unknown():
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
     assert not decode_depth(np.array([[infinite, nan, negative, 0]], np.uint16)).any()
     assert not encode_depth(np.array([[np.inf, np.nan, -1, 1e9]])).any()
@@ -43,18 +40,13 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
 @given(seeds)
 def test_filled_depth_stays_between_the_known_depths(seed):
     rng = np.random.default_rng(seed)
-    depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0)
+    depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0).astype(np.float32)
     depth[3, 4] = 2.0
     filled = inpaint_depth(depth)
-    assert filled.min() >= np.float32(depth[depth > 0].min())
-    assert filled.max() <= np.float32(depth.max())
-
-
-def test_complete_depth_needs_no_filling_and_none_at_all_is_refused():
-    depth = np.full((5, 6), 2, np.float32)
-    np.testing.assert_array_equal(inpaint_depth(depth), depth)
+    assert filled.min() >= depth[depth > 0].min() and filled.max() <= depth.max()
+    np.testing.assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
     with pytest.raises(InputError, match="no known pixel"):
-        inpaint_depth(np.zeros((5, 6)))
+        inpaint_depth(0 * depth)
 
 
 def test_unprojected_depth_projects_onto_its_own_pixels():

@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from zsp_lite.data.frames import (
     read_image,
     read_mask,
     resize_frame,
-    write_binary_mask,
     write_depth,
     write_image,
     write_mask,
@@ -24,17 +24,6 @@ from zsp_lite.io.files import write_atomic
 from zsp_lite.points import axis_deviation, object_pixels, object_points, standard_deviation
 
 SIZE = (24, 32)
-
-
-def frame(**changes):
-    values = {"rgb": np.zeros((*SIZE, 3), np.uint8), "depth": None, "mask": None, "camera": random_camera(0, SIZE)}
-    return Frame(**(values | changes))
-
-
-def square_mask(top, left, height, width, value=1.0):
-    mask = np.zeros((100, 200), np.float32)
-    mask[top : top + height, left : left + width] = value
-    return mask
 
 
 @pytest.mark.parametrize(
@@ -48,12 +37,12 @@ def square_mask(top, left, height, width, value=1.0):
     ],
 )
 def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
-    assert mask_to_bbox(sum(square_mask(*part) for part in parts), padding=padding) == box
-
-
-def test_an_empty_mask_has_no_box():
+    mask = np.zeros((100, 200), np.float32)
+    for top, left, height, width, value in parts:
+        mask[top : top + height, left : left + width] = value
+    assert mask_to_bbox(mask, padding=padding) == box
     with pytest.raises(InputError, match="is empty"):
-        mask_to_bbox(np.zeros((5, 5)))
+        mask_to_bbox(0 * mask)
 
 
 def test_cropping_keeps_every_pixels_world_point():
@@ -78,14 +67,12 @@ def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, wi
     assert small.camera.size == small.rgb.shape[:2] == small.mask.shape == (height, width)
 
 
-@pytest.mark.parametrize("transpose", [False, True])
-def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(transpose):
+@pytest.mark.parametrize("size", [(4, 48), (48, 4)])
+def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(size):
     stripes = np.zeros((24, 24, 3), np.uint8)
     stripes[::3] = 240  # every third row, each row of the result covers two periods
-    size = (4, 48)
-    if transpose:
-        stripes, size = stripes.swapaxes(0, 1), size[::-1]
-    resized = resize_frame(frame(rgb=stripes, camera=random_camera(0, (24, 24))), size)
+    stripes = stripes if size[0] < 24 else stripes.swapaxes(0, 1)
+    resized = resize_frame(Frame(stripes, None, None, random_camera(0, (24, 24))), size)
     assert (resized.rgb == 80).all()
 
 
@@ -101,25 +88,22 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(tr
     ],
 )
 def test_inconsistent_parts_are_refused_by_name(changes, message):
+    values = {"rgb": np.zeros((*SIZE, 3), np.uint8), "depth": None, "mask": None} | changes
     with pytest.raises(InputError, match=message):
-        frame(**changes)
+        Frame(**values, camera=random_camera(0, SIZE))
 
 
 def test_depth_and_masks_survive_their_files(tmp_path):
     rng = np.random.default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
-    write_depth(tmp_path / "depth.png", depth, 2.0)
-    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
+    write_depth(tmp_path / "depth.png", depth)
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), 2 * depth, rtol=2**-11)
     mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
     write_mask(tmp_path / "mask.png", mask)
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
-
-
-def test_depth_masks_are_one_bit_files(tmp_path):
-    known = np.random.default_rng(0).random(SIZE) < 0.5
-    write_binary_mask(tmp_path / "known.png", known)
-    np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), known)
-    assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header
+    write_mask(tmp_path / "known.png", depth > 0)
+    np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
+    assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header: a mask of booleans
 
 
 def test_a_smooth_picture_survives_jpeg_with_its_channels_in_order(tmp_path):
@@ -142,20 +126,15 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
     assert (tmp_path / "file").read_bytes() == b"old"
 
 
-MASK = np.array([[0.0, 0.5, 0.55, 0.85, 1.0, 1.0]], np.float32)
-DEPTH = np.array([[2.0, 2.0, 2.0, 2.0, 2.0, 0.0]], np.float32)
-
-
-def soft_frame(mask):
-    return Frame(np.zeros((1, 6, 3), np.uint8), DEPTH, mask, random_camera(0, (1, 6)))
-
-
 def test_a_pixel_is_on_the_object_if_that_is_more_probable_than_not_and_its_depth_is_known():
-    assert object_pixels(soft_frame(MASK)).tolist() == [[False, False, True, True, True, False]]
-    assert len(object_points(soft_frame(MASK))) == 3
-    assert object_pixels(soft_frame(MASK), 0.9).tolist() == [[False, False, False, False, True, False]]
-    assert object_pixels(soft_frame(None)).tolist() == (DEPTH > 0).tolist()
-    assert "mask above 0.5 at 67%" in repr(soft_frame(MASK))
+    mask = np.array([[0.0, 0.5, 0.55, 0.85, 1.0, 1.0]], np.float32)
+    depth = np.array([[2.0, 2.0, 2.0, 2.0, 2.0, 0.0]], np.float32)
+    frame = Frame(np.zeros((1, 6, 3), np.uint8), depth, mask, random_camera(0, (1, 6)))
+    assert object_pixels(frame).tolist() == [[False, False, True, True, True, False]]
+    assert len(object_points(frame)) == 3
+    assert object_pixels(frame, 0.9).tolist() == [[False, False, False, False, True, False]]
+    assert object_pixels(replace(frame, mask=None)).tolist() == (depth > 0).tolist()
+    assert "mask above 0.5 at 67%" in repr(frame)
 
 
 def test_the_two_spreads_average_deviations_and_variances_of_the_axes():

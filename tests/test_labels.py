@@ -1,19 +1,18 @@
 """Labels: relative poses, files, import of published labels and pairs, transfer between data sets."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from co3d_folders import contents, random_camera, seeds, sequence_data
+from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
-from zsp_lite.data.pairs import sample_pairs, shipped_pairs, write_published_pairs
+from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
 from zsp_lite.data.published import import_labels
 from zsp_lite.data.transfer import align_worlds, transfer_labels
 from zsp_lite.errors import InputError
@@ -30,21 +29,23 @@ def root(tmp_path):
 @pytest.fixture
 def clone(tmp_path, root):
     """A folder with the layout of the published repository."""
-    folder = tmp_path / "clone"
+    folder, dataset = tmp_path / "clone", Co3D(root)
     for name in "ab":
         write_label(folder / "data", "chair", PoseLabel(np.eye(4), name, "a"))
-    shutil.copytree(folder / "data" / "class_labels", root / "class_labels")
-    dataset = Co3D(root)
-    path = folder / "data" / "determ_eval" / "200samples_2tgt" / "chair.pt"
-    write_published_pairs(path, sample_pairs(dataset, "chair", 3, 2), dataset)
-    shutil.rmtree(root / "class_labels")
+    pairs = [Pair("chair", *names) for names in (("a", 0, "b", (1, 3)), ("b", 2, "a", (0, 2)))]
+    write_published_pairs(folder / "data/determ_eval/200samples_2tgt/chair.pt", pairs, dataset)
     (folder / "README.md").write_text("code")
     return folder
 
 
-def test_an_import_replaces_other_labels_only_on_request(clone, root):
+def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone, root):
+    assert import_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
+    assert list(read_labels(root, "chair")) == ["a", "b"]
+    assert len(shipped_pairs(Co3D(root), "chair", 2)) == 2
+    assert not (root / "README.md").exists()
+    before = contents(root)
     import_labels(clone, root)
-    import_labels(clone, root)  # a repeated import changes nothing
+    assert contents(root) == before  # a repeated import changes nothing
     mine = np.eye(4)
     mine[:3, 3] = 0.1
     write_label(root, "chair", PoseLabel(mine, "b", "a"))
@@ -56,50 +57,31 @@ def test_an_import_replaces_other_labels_only_on_request(clone, root):
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
-@pytest.mark.parametrize("folder", [".", "data"])
-def test_labels_and_pairs_come_from_a_clone_into_the_folder_that_is_there(clone, root, folder):
-    write_label(root / folder, "chair", PoseLabel(np.eye(4), "a", "a"))
-    assert import_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
-    assert list(read_labels(root, "chair")) == ["a", "b"]
-    assert len(shipped_pairs(Co3D(root), "chair", 2)) == 3
-    assert not (root / "README.md").exists()
-
-
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("data/class_labels/chair/b.json", b"{", "Input data was truncated"),
-        ("data/class_labels/chair/b.json", json.dumps({"trans": np.diag([2.0, 2, 2, 1]).tolist(), "seq": "b",
-                                                       "reference_seq": "a"}).encode(), "expected a rigid transform"),
-        ("data/class_labels/chair/c.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "b",
-                                                       "reference_seq": "a"}).encode(), "seq as in its name"),
-        ("data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
+        ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
+        ("clone/data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
+        ("data/class_labels/chair/z.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "z", "reference_seq": "z"}
+                                                      ).encode(), "have reference sequences a, z, expected one"),
     ],
 )  # fmt: skip
-def test_nothing_is_written_if_one_file_is_bad(clone, root, file, content, message):
-    (clone / file).write_bytes(content)
+def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, content, message):
+    (root / "class_labels/chair").mkdir(parents=True)
+    (tmp_path / file).write_bytes(content)
     before = contents(root)
     with pytest.raises(InputError, match=message):
         import_labels(clone, root)
     assert contents(root) == before
 
 
-def test_a_category_cannot_get_labels_of_two_reference_sequences(clone, root):
-    write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
-    before = contents(root)
-    with pytest.raises(InputError, match="have reference sequences a, z, expected one"):
-        import_labels(clone, root)
-    assert contents(root) == before
-
-
 def test_sources_without_labels_are_refused(root, tmp_path):
-    (tmp_path / "empty").mkdir()
     (tmp_path / "labels.zip").write_bytes(b"text")
-    for source in ("empty", "none", "labels.zip"):
+    for source in ("none", "labels.zip"):
         with pytest.raises(InputError, match=f"{source} holds no class_labels.*, expected a clone"):
             import_labels(tmp_path / source, root)
     with pytest.raises(InputError, match="does not exist"):
-        import_labels(tmp_path / "empty", tmp_path / "nowhere")
+        import_labels(tmp_path, tmp_path / "nowhere")
     with pytest.raises(InputError, match="has no labels of category chair"):
         transfer_labels(root, root, "chair")
 
@@ -122,8 +104,8 @@ def two_layouts(tmp_path, noise=0.0):
         for seed, name in enumerate("ab", 1)
     }
     write_co3d(tmp_path / "v1", "chair", sequences.values())
-    made = [moved(sequences[name], worlds[name], noise) for name in "ab"]
-    write_co3d(tmp_path / "v2", "chair", made, intrinsics_format="ndc_isotropic")
+    write_co3d(tmp_path / "v2", "chair", [moved(sequences[name], worlds[name], noise) for name in "ab"])
+    convert_to_v2(tmp_path / "v2/chair")
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
     write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
@@ -179,23 +161,17 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     np.testing.assert_allclose(pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9)
 
 
-@pytest.mark.parametrize("folder", ["class_labels", "data/class_labels"])
-def test_labels_are_read_back_from_either_folder(tmp_path, folder):
-    (tmp_path / folder / "chair").mkdir(parents=True)
+def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
     written = {name: random_label(number, name) for number, name in enumerate("ba")}
-    for label in written.values():
-        assert write_label(tmp_path, "chair", label).parent == tmp_path / folder / "chair"
+    for name, label in written.items():
+        path = write_label(tmp_path, "chair", label)
+        assert path == tmp_path / "class_labels/chair" / f"{name}.json"
+        assert json.loads(path.read_text()) == {"trans": label.trans.tolist(), "seq": name, "reference_seq": "zero"}
     read = read_labels(tmp_path, "chair")
     assert list(read) == ["a", "b"]
     for name, label in read.items():
         np.testing.assert_array_equal(label.trans, written[name].trans)
         assert (label.seq, label.reference_seq) == (name, "zero")
-
-
-def test_a_label_file_has_the_published_format(tmp_path):
-    path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
-    assert path == tmp_path / "class_labels" / "chair" / "a.json"
-    assert json.loads(path.read_text()) == {"trans": np.eye(4).tolist(), "seq": "a", "reference_seq": "a"}
 
 
 @pytest.mark.parametrize(

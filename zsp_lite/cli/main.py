@@ -19,7 +19,6 @@ from zsp_lite.cli.common import examples
 from zsp_lite.cli.data import data
 from zsp_lite.cli.demo import demo
 from zsp_lite.cli.doctor import doctor
-from zsp_lite.cli.download import download
 from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.synth import synth
 from zsp_lite.errors import InputError
@@ -37,7 +36,6 @@ def cli() -> None:
 
 for command in (demo, estimate, align, benchmark, tables, compare, synth, data, doctor):
     cli.add_command(command)
-data.add_command(download)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

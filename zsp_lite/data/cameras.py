@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
-from numpy.typing import ArrayLike
 
 from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
+Values = Real[np.ndarray, "..."] | Sequence
 
 NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
@@ -60,8 +60,8 @@ class Camera:
 
     @classmethod
     def from_pytorch3d(
-        cls, R: ArrayLike, T: ArrayLike, focal_length: ArrayLike, principal_point: ArrayLike,
-        intrinsics_format: str, size: Sequence[int],
+        cls, R: Values, T: Values, focal_length: Values, principal_point: Values, intrinsics_format: str,
+        size: Sequence[int],
     ) -> "Camera":  # fmt: skip
         """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height, width) in pixels.
 
