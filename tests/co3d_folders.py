@@ -24,7 +24,7 @@ def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
     return Camera(rotation, rng.normal(size=3) * 3, focal, rng.uniform(0.2, 0.8, 2) * size[::-1], size)
 
 
-def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0) -> SequenceData:
+def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options) -> SequenceData:
     """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a hole."""
     rng = np.random.default_rng([seed, *name.encode()])
     height, width = 24, 32
@@ -40,7 +40,7 @@ def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.
     points = rng.normal(size=(50, 3))
     colours = rng.integers(0, 256, (50, 3)).astype(np.uint8)
     times = [0.2 * number for number in range(frames)]
-    return SequenceData(name, made, times, points, colours, None, 2.0, quality)
+    return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
 
 
 def contents(folder) -> dict[str, bytes]:

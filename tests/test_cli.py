@@ -43,11 +43,13 @@ def test_an_unknown_option_is_one_line_and_exit_code_2(command, capsys):
     assert "--unknown" in line and line.endswith(f"(see: {' '.join(('zsp-lite', *command))} --help)\n")
 
 
-def test_help_lists_every_command(capsys):
+def test_the_help_lists_every_command_and_the_version_is_told(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
     names = "demo estimate align benchmark tables compare synth weights data doctor".split()
     assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"zsp-lite, version {__version__}\n"
 
 
 def test_help_imports_no_large_library():
@@ -66,24 +68,16 @@ def test_help_imports_no_large_library():
         ([], "Missing command"),
         (["fly"], "No such command 'fly'"),
         (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range 1<=x<=1000000"),
-        (["estimate", "a", "b", "--solver", "icp"], "'icp' is not one of 'paper', 'verified', 'both'"),
         (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
         (["benchmark", "--methods", ","], "expected names separated by commas"),
         (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed', expected mean_category_median, acc30"),
-        (["tables", "x", "--metrics", ""], "got '', expected mean_category_median"),
         (["synth", "--preset", "demo"], "Missing option '--out'"),
-        (["synth", "--out", "x"], "expected either --preset or --category"),
         (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
         (["synth", "--preset", "demo", "--frames", "3", "--out", "x"], "--frames does not go with --preset"),
-        (["synth", "--models", "x", "--preset", "demo", "--out", "x"], "or --models"),
         (["synth", "--category", "mouse", "--up", "+z", "--out", "x"], "--up does not go with --category"),
-        (["synth", "--preset", "a", "--seed", "-1", "--out", "x"], "'--seed': -1 is not in the range x>=0"),
         (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
         (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
         (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
-        (["weights", "fetch"], "Missing argument 'NAME'"),
-        (["data"], "Missing command"),
-        (["data", "download", "co3d"], "--category"),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
@@ -98,15 +92,14 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
         (["demo", "--data", "no/such/folder"], "no/such/folder"),
         (["demo", "--backbone", "resnet"], "resnet"),
         (["demo", "--layer", "block12"], "'block0' to 'block11'"),
-        (["benchmark", "--layer", "-13"], "'-13'"),
         (["benchmark", "--methods", "magic"], "magic"),
         (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
+        (["tables", "."], "is not the folder of a benchmark run: it has no run.json"),
         (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
         (["synth", "--category", "sofa", "--out", "x"], "sofa"),
         (["weights", "fetch", "resnet"], "resnet"),
         (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
         (["data", "check", "/nowhere"], "does not exist"),
-        (["data", "labels", "/nowhere", "--root", "."], "holds no class_labels"),
         (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
         ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
         ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
@@ -115,9 +108,9 @@ def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
 )
 def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys, ellipsoids, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    takes_data = arguments[0] in ("demo", "benchmark") and "--data" not in arguments
-    data = ["--data", str(ellipsoids.root)] if takes_data else []
-    assert cli.main(arguments + data) == 2
+    if arguments[0] in ("demo", "benchmark") and "--data" not in arguments:
+        arguments = [*arguments, "--data", str(ellipsoids.root)]
+    assert cli.main(arguments) == 2
     assert names in assert_one_line(capsys)
     assert not list(tmp_path.iterdir())
 
@@ -139,10 +132,17 @@ def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys)
     assert_one_line(capsys)
 
 
-@pytest.mark.slow
-def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
+@pytest.fixture
+def loaded(monkeypatch) -> list[Any]:
+    """What the commands ask `load_backbone` for; they get a backbone that needs no weights."""
+    asked: list[Any] = []
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda one: asked.append(one) or CoordinateBackbone())
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
+    return asked
+
+
+@pytest.mark.slow
+def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loaded, capsys):
     assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "ellipsoid" in text and " of 5" in text and "°" in text and demo.USER_NOTE in text
@@ -152,37 +152,25 @@ def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, mon
 
 @pytest.mark.parametrize(("command", "inside"), [("demo", ""), ("estimate", "deeper")])
 def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
-    command, inside, ellipsoids, tmp_path, monkeypatch, capsys
+    command, inside, ellipsoids, tmp_path, loaded, capsys
 ):
-    def fail(*arguments):
-        raise AssertionError("loaded")
-
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", fail)
-    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     (tmp_path / "file").write_text("mine")
     folder = ellipsoids.root
     words = ["--data", str(folder)] if command == "demo" else [str(folder / "ellipsoid/a"), str(folder / "ellipsoid/b")]
     assert cli.main([command, *words, "--out", str(tmp_path / "file" / inside)]) == 2
     assert "expected a folder" in assert_one_line(capsys)
-    assert (tmp_path / "file").read_text() == "mine"
+    assert (tmp_path / "file").read_text() == "mine" and not loaded
 
 
-def test_options_of_the_demo_reach_the_library(ellipsoids, tmp_path, monkeypatch):
-    given: list[Any] = []
-
-    def load(choice):
-        given.append(choice)
-        return CoordinateBackbone()
-
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", load)
-    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
-    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(given.append(solvers) or ()))
+def test_options_of_the_demo_reach_the_library(ellipsoids, tmp_path, monkeypatch, loaded):
+    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(loaded.append(solvers) or ()))
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     words = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
     assert cli.main([*words, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
     assert cli.main([*words, "--backbone", "dino_vits8", "--solver", "paper"]) == 0
-    assert given == [BackboneConfig("zsp-tiny", "block3", "value", 96), ("paper", "verified"), "dino_vits8", ("paper",)]
+    config = BackboneConfig("zsp-tiny", "block3", "value", 96)
+    assert loaded == [config, ("paper", "verified"), "dino_vits8", ("paper",)]
 
 
 def test_synth_writes_a_co3d_folder(tmp_path):
@@ -246,20 +234,14 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, caps
     assert "ours:ours-globalsim" in capsys.readouterr().out
     assert cli.main(["compare", *(str(tmp_path / name) for name in "ab"), "--out", str(tmp_path / "d")]) == 0
     assert {path.name for path in (tmp_path / "d").iterdir()} == {f"compare.{kind}" for kind in ("csv", "md", "tex")}
-    capsys.readouterr()
-    assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
-    assert "nowhere" in assert_one_line(capsys)
 
 
 def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path):
-    class Reached(Exception):
-        pass
-
     given = []
 
     def record(*arguments):
         given.append(arguments)
-        raise Reached
+        raise errors.InputError("reached")
 
     monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
     words = "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair --pairs 7 --targets 3"
@@ -268,14 +250,5 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
     common = (tmp_path, config, ["ours", "x=a:b"], numbers, 3, Path("there"))
     for more, last in ((["--workers", "5"], (5, False)), (["--executor", "dask://h:1"], ("dask://h:1", False)),
                        (["--allow-other-version"], (1, True))):  # fmt: skip
-        with pytest.raises(Reached):
-            cli.main([*words, *more])
-        assert given == [common + last]
-        given.clear()
-
-
-def test_a_folder_that_is_no_run_is_one_line_and_the_version_is_told(tmp_path, capsys):
-    assert cli.main(["tables", str(tmp_path)]) == 2
-    assert f"{tmp_path} is not the folder of a benchmark run: it has no run.json" in assert_one_line(capsys)
-    assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"zsp-lite, version {__version__}\n"
+        assert cli.main([*words, *more]) == 2
+        assert given.pop() == common + last and not given

@@ -37,7 +37,8 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_written_data_is_read_back(root, version):
-    written = sequence_data("b_2")
+    written = sequence_data("b_2", depth_scale_adjustment=1.7)
+    write_co3d(root, "chair", [written])
     if version == 2:
         convert_to_v2(root / "chair")
     dataset = Co3D(root)

@@ -73,9 +73,12 @@ def test_sequences_without_a_point_cloud_are_counted(root, capsys):
     write_co3d(root, "stool", [sequence_data("c")])
     check, stool = check_folder(root)
     assert (check.cloudless, check.problems, check.complete, stool.cloudless) == (1, [], 2, 0)
+    assert main(["data", "check", str(root)]) == 0
+    assert "No problems" in capsys.readouterr().out
     (root / "chair" / "b" / "pointcloud.ply").unlink()
     assert main(["data", "check", str(root)]) == 1
-    assert "chair: 2 of 2 sequences have no point cloud" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "chair: 2 of 2 sequences have no point cloud" in text and "chair: chair/b/pointcloud.ply is missing" in text
 
 
 def test_an_invalid_camera_is_named(root):

@@ -16,8 +16,8 @@ def frontal(size):
 
 @given(seeds, st.floats(0.01, 100))
 def test_depth_survives_its_encoding_to_half_precision(seed, scale):
-    depth = np.random.default_rng(seed).uniform(0.5, 50, (6, 7)).astype(np.float32)
-    np.testing.assert_allclose(decode_depth(encode_depth(depth), scale), depth * scale, rtol=2**-11 + 1e-6)
+    depth = np.random.default_rng(seed).uniform(0.5, 50, (6, 7)).astype(np.float32) * np.float32(scale)
+    np.testing.assert_allclose(decode_depth(encode_depth(depth, scale), scale), depth, rtol=2**-11 + 1e-6)
 
 
 def test_the_bits_are_those_of_a_float16_and_values_that_are_not_positive_and_finite_are_unknown():

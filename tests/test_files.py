@@ -145,10 +145,9 @@ def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, rea
         read(tmp_path / name)
 
 
-@pytest.mark.parametrize("members", [1, 3])
-def test_gzip_data_of_any_number_of_members_is_read(members):
+def test_gzip_data_of_several_members_is_read():
     content = os.urandom(1000)
-    assert decompress(members * gzip.compress(content), "data") == members * content
+    assert decompress(3 * gzip.compress(content), "data") == 3 * content
 
 
 @pytest.mark.parametrize("extension", [".jpg", ".png"])
@@ -185,7 +184,7 @@ COLOURS[0] = 0, 128, 255
 def ply(encoding="binary_little_endian", colours=None, kind="uchar", comment="made here"):
     """A PLY file of `POINTS`, and of `colours` stored as the PLY type `kind`."""
     order = ">" if encoding == "binary_big_endian" else "<"
-    code = {"uchar": "u1", "int": "i4", "ushort": "u2", "float": "f4", "double": "f8"}[kind]
+    code = {"uchar": "u1", "int": "i4", "float": "f4", "double": "f8"}[kind]
     columns = [(name, f"{order}f4") for name in "xyz"]
     columns += [(name, order + code) for name in ("red", "green", "blue") if colours is not None]
     table = np.zeros(len(POINTS), columns)
@@ -213,11 +212,8 @@ def test_positions_are_read_in_every_encoding(path, encoding):
 
 
 @pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
-@pytest.mark.parametrize(
-    ("kind", "scale"),
-    [("uchar", 1), ("int", 1), ("ushort", 257), ("float", 1 / 255), ("float", 1), ("double", 1 / 255), ("double", 1)],
-)
-def test_colours_of_every_type_and_range_are_read_as_8_bit(path, encoding, kind, scale):
+@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("int", 1), ("float", 1 / 255), ("double", 1 / 255)])
+def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, encoding, kind, scale):
     path.write_bytes(ply(encoding, COLOURS * np.float64(scale), kind))
     colours = read_ply(path)[1]
     assert colours.dtype == np.uint8
@@ -248,17 +244,12 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     assert not list((tmp_path / "cup").glob(".*"))
 
 
-def test_a_command_that_writes_a_folder_is_refused_beside_another_writer(tmp_path, capsys):
+def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is_refused(tmp_path, capsys):
+    with pytest.raises(ZeroDivisionError), writing(tmp_path / "out"):
+        raise ZeroDivisionError
     with writing(tmp_path / "out"):
         assert main(["synth", "--category", "chair", "--out", str(tmp_path / "out")]) == 2
     assert "another process is writing to it" in capsys.readouterr().err
-
-
-def test_a_folder_is_free_after_an_error(tmp_path):
-    with pytest.raises(ZeroDivisionError), writing(tmp_path):
-        raise ZeroDivisionError
-    with writing(tmp_path), pytest.raises(InputError, match="another process"), writing(tmp_path):
-        pass
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):

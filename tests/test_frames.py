@@ -96,8 +96,8 @@ def test_inconsistent_parts_are_refused_by_name(changes, message):
 def test_depth_and_masks_survive_their_files(tmp_path):
     rng = np.random.default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
-    write_depth(tmp_path / "depth.png", depth)
-    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), 2 * depth, rtol=2**-11)
+    write_depth(tmp_path / "depth.png", depth, 2.0)
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
     mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
     write_mask(tmp_path / "mask.png", mask)
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
