@@ -26,7 +26,7 @@ import torch  # noqa: E402
 import transformers  # noqa: E402, F401
 
 from tests.hostile import cases  # noqa: E402, F401
-from tests.hostile.harness import CASES, REFUSED, RIGHT, Wrong, prepare  # noqa: E402
+from tests.hostile.harness import CASES, prepare  # noqa: E402
 from zsp_lite.errors import InputError  # noqa: E402
 
 SECONDS, WAIT, MEMORY = 20, 120, 1 << 30  # limits of a case: processor time, time, bytes
@@ -46,13 +46,9 @@ def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)  # the machine's memory is not to fill up
         try:
-            found = case.call(folder)
-            kind = "refused" if found is REFUSED else "right" if found is RIGHT else "wrong"
-            message = repr(found)
+            kind, message = case.call(folder)
         except InputError as error:
             kind, message = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused", str(error)
-        except Wrong as error:
-            kind, message = "wrong", str(error)
         except BaseException as error:
             lines = traceback.format_exc().strip().splitlines()
             kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"

@@ -8,6 +8,7 @@ import zlib
 
 import cv2
 import numpy as np
+from co3d_folders import edit_json
 
 from tests.hostile.harness import (
     BENCHMARK,
@@ -17,7 +18,6 @@ from tests.hostile.harness import (
     STRANGE,
     case,
     command,
-    edited,
     gzip_bomb,
     read_capture,
     read_frames,
@@ -102,8 +102,8 @@ case("malicious", "depth map of objects", read_capture("lists"), lambda folder: 
 for target in ("capture/pictures/0.jpg", "capture/rgb.txt"):
     case("malicious", f"{target} is a link out of the folder", read_capture("lists"), _link(target, "/etc/passwd"))
 for path in ("../../../etc/passwd", "/etc/passwd", "cup/a\0.jpg", "x/" * 50_000, "cup/frame_annotations.jgz"):
-    case("malicious", f"image path {path[:30]!r}", read_frames, edited(
-        FRAMES, lambda content, path=path: [entry["image"].update(path=path) for entry in content]))  # fmt: skip
+    case("malicious", f"image path {path[:30]!r}", read_frames, lambda folder, path=path: edit_json(
+        folder / FRAMES, lambda content: [entry["image"].update(path=path) for entry in content] and None))  # fmt: skip
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
 for option, value in (("--executor", "json:loads"), ("--executor", "dask://\0"), ("--metrics", "acc30,\0"),
                       ("--methods", "os:_exit"), ("--methods", "raises:now"), ("--methods", "a=/dev/zero/x.csv"),
@@ -123,16 +123,8 @@ for argv in (
     command("options", " ".join(argv).replace(" ".join(ON_DATA), "benchmark")[:60], *argv)
 
 # names that mean something to a terminal, to TeX, to HTML or to Markdown, or are not UTF-8
-for name in (
-    "[red]x[",
-    "$\\frac{$",
-    "<script>alert(1)<",
-    "| a | b |",
-    "\udcff\udcfe",
-    "a\nb",
-    "\x1b[31mred",
-    "x" * 200,
-):
+NAMES = ("[red]x[", "$\\frac{$", "<script>alert(1)<", "| a | b |", "\udcff\udcfe", "a\nb", "\x1b[31mred", "x" * 200)
+for name in NAMES:
 
     def renamed(folder, name=name):
         for parent in ("data", "data/class_labels"):

@@ -39,10 +39,7 @@ for command in (demo, estimate, align, benchmark, tables, compare, synth, data, 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command: the arguments after the program's name, or those of the process.
-
-    Returns the exit code: 0, 1 (a check failed), 2 (bad input or wrong usage), or 130 (interrupted).
-    """
+    """Run one command, and return the exit code: 0, 1 (a check failed), 2 (bad input), or 130 (interrupted)."""
     os.environ["MPLBACKEND"] = "Agg"  # figures are written to files, without a display
     logging.basicConfig(format="%(message)s")
     logging.getLogger("zsp_lite").setLevel(logging.INFO)

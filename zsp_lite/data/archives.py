@@ -68,10 +68,7 @@ def list_archives(
 
 
 def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return the archives, with their sequences, that are not unpacked yet.
-
-    InputError if the folder has a category from elsewhere.
-    """
+    """Return what is not unpacked yet of archives; InputError if the folder has a category from elsewhere."""
     record, missing = _read_record(root), []
     for archive in archives:
         place, found = root / archive.category, record.get(archive.category)
@@ -94,10 +91,8 @@ def download_size(archive: Archive) -> int | None:
 
 
 def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None]) -> int:
-    """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less.
-
-    Unpacked archives are about as large as the archives. Of whole archives, one at a time is there, too.
-    """
+    """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less."""
+    # Unpacked archives are about as large as the archives. Of whole archives, one at a time is there, too.
     whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
     needed = sum(size or 0 for size in sizes) + max(whole, default=0)
     for archive in missing:
@@ -134,17 +129,13 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 
 
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Unpack members of a zip archive, annotations last; no path leads out of the folder, and no link is made.
-
-    All paths are checked before the first file is written. A file that exists with the same size is not written again,
-    except the annotations.
-    """
-    targets = {member: path_inside(root, member.filename) for member in members}
-    sizes = {member: path.stat().st_size for member, path in targets.items() if path.is_file()}
-    wanted = [one for one in members if _is_annotation(one) or sizes.get(one) != one.file_size]
-    wanted.sort(key=lambda one: (_is_annotation(one), one.header_offset))
-    for member in tqdm(wanted, "unpacking", disable=None):
-        write_atomic(targets[member], zipped.read(member))
+    """Unpack members of a zip archive, annotations last; no path leads out of the folder, and no link is made."""
+    targets = {one: path_inside(root, one.filename) for one in members}  # checks all before the first is written
+    members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
+    for one in tqdm(members, "unpacking", disable=None):
+        path = targets[one]
+        if _is_annotation(one) or not path.is_file() or path.stat().st_size != one.file_size:
+            write_atomic(path, zipped.read(one))
 
 
 def _members(zipped: zipfile.ZipFile, archive: Archive) -> list[zipfile.ZipInfo]:

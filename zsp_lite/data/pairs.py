@@ -87,10 +87,7 @@ def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
 
 
 def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
-    """Read an evaluation set of the published code, whose ids are positions in `dataset.frame_list(category)`.
-
-    Code in the file is not executed. InputError if the set is damaged or does not fit the data set.
-    """
+    """Read an evaluation set of the published code; InputError if it is damaged or does not fit the data set."""
     pairs = []
     for number, item in enumerate(read_pair_file(Path(path))):
         frames = dataset.frame_list(item.category)

@@ -48,9 +48,8 @@ def motorcycle_photograph() -> Frame:
 def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndarray, "h w"]) -> Frame:
     """Convert the left image and its disparities in pixels to a frame with depth in metres and an object mask.
 
-    The depth is `focal length * baseline / (disparity + difference of the principal points)`. The mask is the largest
-    connected region of points above the floor and nearer than the background. Thin parts, such as the brake cables and
-    a mirror, are missing, and so are the lowest 2 cm of the tyres.
+    The mask is the largest connected region of points above the floor and nearer than the background. Thin parts, such
+    as the brake cables and a mirror, are missing, and so are the lowest 2 cm of the tyres.
     """
     known = np.isfinite(disparity)
     depth = np.zeros_like(disparity)

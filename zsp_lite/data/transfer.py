@@ -10,8 +10,7 @@ from zsp_lite.data.labels import PoseLabel, check_one_reference, label_bytes, la
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError
 
-# Residual above which the camera centres of v1 and v2 are not related by a similarity.
-_MAX_RESIDUAL = 0.05
+_MAX_RESIDUAL = 0.05  # above it, the camera centres of v1 and v2 are not related by a similarity
 _MIN_CAMERAS = 4
 
 

@@ -116,7 +116,7 @@ def _is_part(response: http.client.HTTPResponse, start: int) -> bool:
 
 
 def _fetch_rest(url: str, part: Path, most: float) -> bool:
-    """Request the missing rest of `part`, and stop beyond `most` bytes. Returns False if it was interrupted."""
+    """Request the missing rest of `part`, at most so many bytes; False if it was interrupted."""
     start = part.stat().st_size if part.exists() else 0
     if start >= most:
         return True

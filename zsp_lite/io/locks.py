@@ -12,10 +12,9 @@ from zsp_lite.errors import InputError
 
 @contextmanager
 def writing(folder: str | Path) -> Iterator[None]:
-    """Be the only writer of a folder, which is made if it does not exist; InputError if another process writes to it.
+    """Be the only writer of a folder until this process ends; InputError if another process writes to it.
 
-    The lock is one of the operating system, which is released when the process ends, however it ends. A folder that was
-    made, and into which nothing was written, is removed.
+    The folder is made if it does not exist, and is removed if it was made and nothing was written into it.
     """
     folder = Path(folder)
     made = [one for one in (folder, *folder.parents) if not os.path.exists(one)]

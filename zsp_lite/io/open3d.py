@@ -8,12 +8,9 @@ import sys
 
 @functools.cache
 def load_open3d():
-    """Import and return the `open3d` module.
-
-    Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded first, from the package
-    `libusb-package`. Open3D's web viewer, which starts a server in a notebook, is disabled unless the variable is set.
-    """
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
+    """Import and return the `open3d` module."""
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # it would start a server in a notebook
+    # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from a package.
     if sys.platform.startswith("linux"):
         import libusb_package
 
