@@ -6,7 +6,6 @@ import os
 import struct
 import subprocess
 import sys
-import zlib
 
 import cv2
 import numpy as np
@@ -30,7 +29,7 @@ from zsp_lite.io.ply import read_ply, write_ply
 PICTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
 JPEG, PNG = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png"))
 FRAME = b'{"sequence_name": "a", "frame_number": %d}'
-PLY = "ply\nformat %s 1.0\nelement vertex %d\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
+COLOUR_NAMES = ("red", "green", "blue")
 
 
 class Code:
@@ -46,15 +45,10 @@ def _torch(content) -> bytes:
     return buffer.getvalue()
 
 
-def _huge_png() -> bytes:
-    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(99))), (b"IEND", b""))
-    packed = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
-
-
-def _ply(count, body: bytes, kind="binary_little_endian") -> bytes:
-    return (PLY % (kind, count)).encode() + body
+def _ply(count, body: bytes, encoding="binary_little_endian", kind="") -> bytes:
+    """A PLY file of positions and, if a type is given, of colours."""
+    columns = [f"property float {x}\n" for x in "xyz"] + [f"property {kind} {x}\n" for x in COLOUR_NAMES if kind]
+    return f"ply\nformat {encoding} 1.0\nelement vertex {count}\n{''.join(columns)}end_header\n".encode() + body
 
 
 # Name of the file, its reader, what is wrong with it, its content, part of the message.
@@ -66,7 +60,6 @@ BAD_FILES = [
           "JPEG without a frame": b"\xff\xd8\xff\xd9", "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
           "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
       }.items()),
-    ("x.png", read_image, "huge", _huge_png(), "expected at most 67108864 pixels, not 30000 x 30000"),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
     ("frame_annotations.jgz", read_frame_index, "empty", b"", "Input data was truncated"),
     ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "not complete gzip data"),
@@ -181,40 +174,31 @@ COLOURS = np.random.default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
 COLOURS[0] = 0, 128, 255
 
 
-def ply(encoding="binary_little_endian", colours=None, kind="uchar", comment="made here"):
-    """A PLY file of `POINTS`, and of `colours` stored as the PLY type `kind`."""
-    order = ">" if encoding == "binary_big_endian" else "<"
-    code = {"uchar": "u1", "int": "i4", "float": "f4", "double": "f8"}[kind]
-    columns = [(name, f"{order}f4") for name in "xyz"]
-    columns += [(name, order + code) for name in ("red", "green", "blue") if colours is not None]
-    table = np.zeros(len(POINTS), columns)
-    values = POINTS if colours is None else np.concatenate([POINTS.astype(np.float64), colours], axis=1)
-    for (name, _), column in zip(columns, values.T, strict=True):
-        table[name] = column
-    header = f"ply\nformat {encoding} 1.0\ncomment {comment}\nelement vertex {len(table)}\n"
-    header += "".join(f"property {'float' if name in 'xyz' else kind} {name}\n" for name, _ in columns)
-    header += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
-    text = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
-    return header.encode() + (text.encode() if encoding == "ascii" else table.tobytes())
-
-
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "cloud.ply"
 
 
-@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+TEXT = "\n".join(" ".join(map(repr, row)) for row in POINTS.tolist()).encode()
+ENCODED = {"ascii": TEXT, "binary_little_endian": POINTS.tobytes(), "binary_big_endian": POINTS.astype(">f4").tobytes()}
+
+
+@pytest.mark.parametrize("encoding", ENCODED)
 def test_positions_are_read_in_every_encoding(path, encoding):
-    path.write_bytes(ply(encoding))
+    path.write_bytes(_ply(len(POINTS), ENCODED[encoding], encoding))
     points, colours = read_ply(path)
     np.testing.assert_array_equal(points, POINTS)
     assert points.dtype == np.float64 and colours is None
 
 
-@pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
-@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("int", 1), ("float", 1 / 255), ("double", 1 / 255)])
-def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, encoding, kind, scale):
-    path.write_bytes(ply(encoding, COLOURS * np.float64(scale), kind))
+@pytest.mark.parametrize(
+    ("kind", "code", "scale"),
+    [("uchar", "u1", 1), ("int", "i4", 1), ("float", "f4", 1 / 255), ("double", "f8", 1 / 255)],
+)
+def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, scale):
+    table = np.zeros(len(POINTS), [("position", "<f4", 3), ("colour", f"<{code}", 3)])
+    table["position"], table["colour"] = POINTS, COLOURS * np.float64(scale)
+    path.write_bytes(_ply(len(POINTS), table.tobytes(), kind=kind))
     colours = read_ply(path)[1]
     assert colours.dtype == np.uint8
     np.testing.assert_array_equal(colours, COLOURS)

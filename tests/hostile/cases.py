@@ -6,8 +6,6 @@ import struct
 import sys
 import zlib
 
-import cv2
-import numpy as np
 from co3d_folders import edit_json
 
 from tests.hostile.harness import (
@@ -47,13 +45,10 @@ for kind in STRANGE:
             codes = (0, 2)
         command("file", f"{what}: {kind}", *argv, change=strange(name, kind), codes=codes)
 
+
 # oversized
-JPEG = cv2.imencode(".jpg", np.zeros((240, 320, 3), np.uint8))[1].tobytes()
-_AT = JPEG.index(b"\xff\xc0") + 5
-
-
-def png(width: int, height: int, depth: int = 8) -> bytes:
-    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 0, 0, 0, 0)),
+def png(width: int, height: int) -> bytes:
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
               (b"IDAT", zlib.compress(bytes(1 << 20), 9)), (b"IEND", b""))  # fmt: skip
     packed = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
@@ -71,9 +66,7 @@ def _npy(shape, descr="<f8", data=b"") -> bytes:
 
 DEEP = b"[" * 100_000
 OVERSIZED = [
-    ("image", JPEG[:_AT] + struct.pack(">HH", 65500, 65500) + JPEG[_AT + 4 :]), ("image", png(30_000, 30_000)),
-    ("depth", png(100_000, 9_000, 16)), ("mask", png(2**31 - 1, 2**31 - 1)),
-    ("frame annotations", gzip_bomb), ("frame annotations", lambda: gzip_bomb(start=b"[]")),
+    ("image", png(30_000, 30_000)), ("depth", png(2**31 - 1, 2**31 - 1)), ("frame annotations", gzip_bomb),
     ("sequence annotations", gzip.compress(DEEP)), ("label", DEEP), ("nerfstudio", DEEP), ("labels to import", DEEP),
     ("frame annotations", gzip.compress(b'[{"sequence_name": "a", "frame_number": ' + b"9" * 100_000 + b"}]")),
     ("pairs", b"\x80\x02" + b"]" * 100_000 + b"."),
@@ -85,8 +78,6 @@ for number, (what, data) in enumerate(OVERSIZED):
     name, read = READERS_OF[what]
     case("oversized", f"{what} {number}", read, written(name, data))
 command("oversized", "results that are a gzip bomb", "tables", "ROOT/out", change=written(f"{RESULTS}.gz", gzip_bomb))
-command("oversized", "data check of a gzip bomb", "data", "check", "ROOT/data", change=written(FRAMES, gzip_bomb),
-        codes=(1,))  # fmt: skip
 case("oversized", "depth map of 10^15 numbers", read_capture("lists"), lambda folder: (
     written("capture/z/0.npy", _npy((10**15,)))(folder), written("capture/depth.txt", "z/0.npy\n")(folder)))  # fmt: skip
 

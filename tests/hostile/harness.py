@@ -130,9 +130,9 @@ def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Pat
     return write
 
 
-def gzip_bomb(gigabytes: int = 8, start: bytes = b"") -> bytes:
-    """Compressed spaces."""
-    return gzip.compress(start) + gzip.compress(b" " * (1 << 26)) * (16 * gigabytes)
+def gzip_bomb() -> bytes:
+    """8 GB of spaces, compressed."""
+    return gzip.compress(b" " * (1 << 26)) * 128
 
 
 def _sparse(path: Path) -> None:
