@@ -244,9 +244,7 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, capsys
     assert "leads out of the data folder" in capsys.readouterr().err and files_of(tmp_path / "elsewhere") == []
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda whole: b"not a zip archive", lambda whole: whole.replace(b"JFIF", b"damaged")]
-)
+@pytest.mark.parametrize("damage", [lambda whole: b"not a zip archive", lambda whole: whole.replace(b"JFIF", b"XXXX")])
 def test_a_damaged_archive_gives_one_line(server, tmp_path, capsys, damage):
     server.files[CHUNKS[1]] = damage(server.files[CHUNKS[1]])
     write_catalogue(server)

@@ -1,6 +1,5 @@
 """Reader and writer of data sets in CO3D's layout (v1 and v2)."""
 
-import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,34 +8,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
-from zsp_lite.data.annotations import (
-    FRAMES_FILE,
-    SEQUENCES_FILE,
-    DepthAnnotation,
-    FrameAnnotation,
-    FrameIndex,
-    FrameKey,
-    ImageAnnotation,
-    MaskAnnotation,
-    PointCloudAnnotation,
-    SequenceAnnotation,
-    Viewpoint,
-    compress,
-    read_annotations,
-    read_frame_index,
-    read_sequences,
-)
+from zsp_lite.data import annotations as records
+from zsp_lite.data import frames as images
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import (
-    Frame,
-    check_pixels,
-    read_depth,
-    read_image,
-    read_mask,
-    write_depth,
-    write_image,
-    write_mask,
-)
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
@@ -81,24 +56,21 @@ class Co3D:
         self.root = Path(root)
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
-            raise InputError(f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE}")
-        self._index: tuple[str, FrameIndex] | None = None
-        self._sequences: dict[str, list[SequenceAnnotation]] = {}
-
-    def __repr__(self) -> str:
-        return f"Co3D({str(self.root)!r}, categories: {textwrap.shorten(', '.join(self.categories()), 110)})"
+            raise InputError(f"data folder {root} {state}, expected a folder with CATEGORY/{records.FRAMES_FILE}")
+        self._index: tuple[str, records.FrameIndex] | None = None
+        self._sequences: dict[str, list[records.SequenceAnnotation]] = {}
 
     def categories(self) -> list[str]:
         """List the folders that have frame annotations, sorted by name."""
-        return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
+        return sorted(path.parent.name for path in self.root.glob(f"*/{records.FRAMES_FILE}"))
 
-    def sequences(self, category: str) -> list[SequenceAnnotation]:
+    def sequences(self, category: str) -> list[records.SequenceAnnotation]:
         """Read the sequence annotations of a category, in file order."""
         if category not in self._sequences:
-            self._sequences[category] = read_sequences(self._category_folder(category) / SEQUENCES_FILE)
+            self._sequences[category] = records.read_sequences(self._category_folder(category) / records.SEQUENCES_FILE)
         return list(self._sequences[category])
 
-    def select(self, category: str, top: int = 10) -> list[SequenceAnnotation]:
+    def select(self, category: str, top: int = 10) -> list[records.SequenceAnnotation]:
         """Select at most `top` sequences for labelling, best point clouds first.
 
         Both quality scores are above the bounds of the supplement, "Choice of evaluation categories & sequences".
@@ -110,23 +82,23 @@ class Co3D:
                 selected.append(sequence)
         return sorted(selected, key=lambda one: (-one.point_cloud.quality_score, one.sequence_name))[:top]
 
-    def frame_list(self, category: str) -> list[FrameKey]:
+    def frame_list(self, category: str) -> list[records.FrameKey]:
         """List the frames in the order of the annotation file, to which the ids of published pairs refer."""
         return self._frame_index(category).keys
 
-    def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
+    def frames(self, category: str, sequence: str) -> list[records.FrameAnnotation]:
         """Read the frame annotations of a sequence, sorted by frame number."""
         index = self._frame_index(category)
         return [index.frame(position) for position in index.positions(sequence).values()]
 
-    def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
+    def frame(self, category: str, sequence: str, frame_number: int) -> records.FrameAnnotation:
         """Read the annotation of one frame; its number differs from its position in `frames` if frames are missing."""
         index = self._frame_index(category)
         if (position := index.positions(sequence).get(frame_number)) is None:
             raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
         return index.frame(position)
 
-    def camera(self, annotation: FrameAnnotation) -> Camera:
+    def camera(self, annotation: records.FrameAnnotation) -> Camera:
         """Convert the viewpoint of a frame to a camera."""
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         if (view := annotation.viewpoint) is None:
@@ -136,20 +108,20 @@ class Co3D:
         except InputError as error:
             raise InputError(f"frame {name}: {error}") from error
 
-    def load(self, annotation: FrameAnnotation) -> Frame:
+    def load(self, annotation: records.FrameAnnotation) -> Frame:
         """Load the image and camera of a frame, and its depth and mask if annotated.
 
         Depth is 0 (unknown) where its file is 0 or the depth mask is 0. No path may lead out of the data folder.
         """
         camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
-        rgb = self._read(read_image, annotation.image.path, size)
-        mask = None if annotation.mask is None else self._read(read_mask, annotation.mask.path, size)
+        rgb = self._read(images.read_image, annotation.image.path, size)
+        mask = None if annotation.mask is None else self._read(images.read_mask, annotation.mask.path, size)
         depth = None
         if annotation.depth is not None:
-            depth = self._read(read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment)
+            depth = self._read(images.read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment)
             if annotation.depth.mask_path is not None:
-                valid = self._read(read_mask, annotation.depth.mask_path, size) > 0
+                valid = self._read(images.read_mask, annotation.depth.mask_path, size) > 0
                 depth = np.where(valid, depth, np.float32(0))
         return Frame(rgb, depth, mask, camera, name)
 
@@ -171,17 +143,17 @@ class Co3D:
     def _read(self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options) -> np.ndarray:
         path = path_inside(self.root, relative)
         image = reader(path, *options)
-        check_pixels(path, image, size)
+        images.check_pixels(path, image, size)
         return image
 
     def _category_folder(self, category: str) -> Path:
         check_choice(f"data folder {self.root}: category", category, self.categories())
         return self.root / category
 
-    def _frame_index(self, category: str) -> FrameIndex:
+    def _frame_index(self, category: str) -> records.FrameIndex:
         if self._index is None or self._index[0] != category:
             self._index = None  # frees the previous category's JSON before the next one is read
-            self._index = category, read_frame_index(self._category_folder(category) / FRAMES_FILE)
+            self._index = category, records.read_frame_index(self._category_folder(category) / records.FRAMES_FILE)
         return self._index[1]
 
 
@@ -208,15 +180,16 @@ def write_co3d(root: str | Path, category: str, sequences: Iterable[SequenceData
     to a category at a time. `quality` is that of JPEG, 0 to 100.
     """
     root, folder = Path(root), Path(root) / plain_name(category, "category")
-    frames_path, sequences_path = folder / FRAMES_FILE, folder / SEQUENCES_FILE
+    frames_path, sequences_path = folder / records.FRAMES_FILE, folder / records.SEQUENCES_FILE
     with writing(folder):
         frames, listed = [], []  # the name of the sequence, and the entry in the file
         if frames_path.is_file():
-            index = read_frame_index(frames_path)
+            index = records.read_frame_index(frames_path)
             frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
         if sequences_path.is_file():
-            names = [one.sequence_name for one in read_sequences(sequences_path)]
-            listed = list(zip(names, msgspec.json.decode(read_annotations(sequences_path), type=list[msgspec.Raw])))
+            names = [one.sequence_name for one in records.read_sequences(sequences_path)]
+            entries = msgspec.json.decode(records.read_annotations(sequences_path), type=list[msgspec.Raw])
+            listed = list(zip(names, entries))
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality)
@@ -224,31 +197,31 @@ def write_co3d(root: str | Path, category: str, sequences: Iterable[SequenceData
             listed = [one for one in listed if one[0] != sequence.name] + [(sequence.name, annotation)]
             for path, entries in ((frames_path, frames), (sequences_path, listed)):
                 content = msgspec.json.encode([entry for _, entry in entries], enc_hook=np.ndarray.tolist)
-                write_atomic(path, compress(content))
+                write_atomic(path, records.compress(content))
 
 
 def _write_sequence(
     root: Path, category: str, sequence: SequenceData, quality: int
-) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
+) -> tuple[list[records.FrameAnnotation], records.SequenceAnnotation]:
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
     for number, (frame, timestamp) in enumerate(zip(sequence.frames, sequence.timestamps, strict=True)):
         stem = f"frame{number + 1:06d}"
-        image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
-        write_image(root / image.path, frame.rgb, quality)
+        image = records.ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
+        images.write_image(root / image.path, frame.rgb, quality)
         depth = mask = None
         if frame.depth is not None:
             path, mask_path = f"{base}/depths/{stem}.jpg.geometric.png", f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
-            write_mask(root / mask_path, frame.depth > 0)
+            depth = records.DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
+            images.write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
+            images.write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every machine.
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
-            mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
-            write_mask(root / mask.path, frame.mask)
-        view = Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
-        annotations.append(FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view))
-    cloud = PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
+            mask = records.MaskAnnotation(f"{base}/masks/{stem}.png", mass)
+            images.write_mask(root / mask.path, frame.mask)
+        view = records.Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
+        annotations.append(records.FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view))
+    cloud = records.PointCloudAnnotation(f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points))
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
-    return annotations, SequenceAnnotation(sequence.name, category, None, cloud, sequence.viewpoint_quality)
+    return annotations, records.SequenceAnnotation(sequence.name, category, None, cloud, sequence.viewpoint_quality)
