@@ -7,6 +7,7 @@ error, after 20 s of processor time or two minutes, or with 1 GB more memory tha
 """
 
 import gc
+import multiprocessing
 import os
 import resource
 import shutil
@@ -32,42 +33,41 @@ from zsp_lite.errors import InputError  # noqa: E402
 SECONDS, WAIT, MEMORY = 20, 120, 1 << 30  # limits of a case: processor time, time, bytes
 
 
+def attempt(case, folder: Path, answers) -> None:
+    """Run a case with limits, and send the outcome, the message and the memory that was used, in bytes."""
+    os.setsid()
+    for stream in (1, 2):
+        os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+    os.chdir(folder)
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)  # the machine's memory is not to fill up
+    try:
+        kind, message = case.call(folder)
+    except InputError as error:
+        kind, message = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused", str(error)
+    except BaseException as error:
+        lines = traceback.format_exc().strip().splitlines()
+        kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
+    kind = "wrong" if (folder / "executed").exists() else kind
+    answers.send((kind, message, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+
+
 def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
     """Run a case in a forked process. Returns the outcome and the message; `idle`: bytes of an idle process."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(reading)
-        os.setsid()
-        for stream in (1, 2):
-            os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
-        os.chdir(folder)
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)  # the machine's memory is not to fill up
-        try:
-            kind, message = case.call(folder)
-        except InputError as error:
-            kind, message = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused", str(error)
-        except BaseException as error:
-            lines = traceback.format_exc().strip().splitlines()
-            kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
-        kind = "wrong" if (folder / "executed").exists() else kind
-        os.write(writing, f"{kind}\n{message}".encode(errors="backslashreplace")[:4000])
-        os._exit(0)
-    os.close(writing)
-    start, done = time.monotonic(), 0
-    while not done and time.monotonic() < start + WAIT:
-        done, _, used = os.wait4(child, os.WNOHANG)
-        time.sleep(0 if done else 0.003)
-    if not done:
-        os.killpg(child, signal.SIGKILL)
-        _, _, used = os.wait4(child, 0)
-    with open(reading, "rb") as pipe:
-        kind, _, message = pipe.read().decode(errors="replace").partition("\n") if done else ("hang", "", "")
-    if 1024 * used.ru_maxrss - idle > MEMORY:
-        return "memory", message
-    return (kind, message) if kind else ("traceback", "the process died")
+    context = multiprocessing.get_context("fork")
+    answers, sending = context.Pipe(duplex=False)
+    process = context.Process(target=attempt, args=(case, folder, sending))
+    process.start()
+    sending.close()
+    try:
+        kind, message, used = answers.recv() if answers.poll(WAIT) else ("hang", "", 0)
+    except EOFError:
+        kind, message, used = "traceback", "the process died", 0
+    if kind == "hang":
+        os.killpg(process.pid, signal.SIGKILL)
+    process.join()
+    return ("memory" if used - idle > MEMORY else kind), message
 
 
 def main(groups: list[str]) -> int:
