@@ -57,7 +57,6 @@ replace_option = click.option("--replace", is_flag=True, help="Replace existing 
 version_option = click.option(
     "--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."
 )
-seed_option = click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 
 
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,7 +2,7 @@
 
 import click
 
-from zsp_lite.cli.common import PATH, examples, refuse_options, seed_option
+from zsp_lite.cli.common import INDEX, PATH, examples, refuse_options
 
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
@@ -22,7 +22,7 @@ DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 @click.option("--sequences", type=click.IntRange(1, 900), show_default="4", help="Sequences of each category.")
 @click.option("--frames", type=click.IntRange(1, 10_000), show_default="24", help="Frames of each sequence.")
 @click.option("--image-size", type=click.IntRange(32, 4096), show_default="256", help="Shorter image side in pixels.")
-@seed_option
+@click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 @click.option("--out", type=PATH, required=True, help="Folder to write.")
 def synth(preset, categories, models_folder, seed, out, **given) -> None:
     """Render procedural objects or your own models into a CO3D folder; the same seed gives the same files.
