@@ -39,6 +39,8 @@ async function storedView(stored) {
 async function openStored(index) {
   if (!STORED[index]) await loadScript(`playground/pair${index}.js`);
   await openViews(await Promise.all(STORED[index].map(storedView)));
+  notice(DATA.runtime ? "Pictures of 3D models. Photographs that you choose stay on this computer: nothing is sent."
+    : "Your own photographs are not possible here: onnxruntime-web could not be fetched when this site was built.");
 }
 
 /** Show views, the reference first, and compute what no setting changes: similarities and nearest neighbours. */
@@ -228,9 +230,7 @@ async function photograph(file) {
 
 async function openPhotographs(files) {
   if (!DATA.runtime) return; // the notice says so
-  if (location.protocol === "file:") {
-    return notice("Photographs need a server: python -m http.server in the site's folder, then http://localhost:8000.");
-  }
+  if (location.protocol === "file:") return notice("Photographs need a server; the command stands below.");
   if (files.length !== 2) return notice("Choose two pictures at once, of two objects of one kind.");
   notice("Loading the network (10 MB) and onnxruntime-web (14 MB) …");
   try {
@@ -242,6 +242,7 @@ async function openPhotographs(files) {
     const views = [];
     for (const file of files) views.push(await photograph(file));
     await openViews(views);
+    element("pair").selectedIndex = -1; // so that any stored pair can be chosen next
     notice("Your photographs have not left this computer. There is no pose: points in space need depth.");
   } catch (error) {
     notice(`The photographs cannot be used: ${error.message || error}`);
@@ -292,8 +293,6 @@ async function start() {
   document.ondragover = (event) => event.preventDefault();
   document.ondrop = (event) => { event.preventDefault(); openPhotographs(event.dataTransfer.files); };
   window.onresize = () => show();
-  notice(DATA.runtime ? "Pictures of 3D models. Photographs that you choose stay on this computer: nothing is sent."
-    : "Your own photographs are not possible here: onnxruntime-web could not be fetched when this site was built.");
 }
 
 start();

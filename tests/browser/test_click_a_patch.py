@@ -154,6 +154,9 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, 
         keys, saliency = (array(page, f"state.views[{i}].{name}") for name in ("keys", "saliency"))
         np.testing.assert_allclose(keys, view.features.keys.flatten(), atol=1e-3)
         np.testing.assert_allclose(saliency, view.features.saliency.flatten(), atol=1e-3)
+    page.select_option("#pair", "3")  # the pair shown before
+    page.wait_for_function("/3D models/.test(document.getElementById('notice').textContent)")
+    assert page.evaluate("state.views.length") == 6 and "No pose" not in page.inner_text("#stages")
     assert asked and all(how == "GET" and url.startswith((address, "data:", "blob:")) for how, url in asked)
     server.shutdown()
 
