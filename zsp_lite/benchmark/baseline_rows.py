@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.icp import align
-from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, Problem

@@ -19,7 +19,6 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from zsp_lite.estimates import Hypothesis
 
@@ -58,22 +57,19 @@ class Calibration:
     unseen: float = 0.313  # \lambda
 
     def probabilities(self, deficit: Float[np.ndarray, " m"], evidence: Evidence) -> Float[np.ndarray, " m"]:
-        """Return the probabilities of different poses; the `deficit` S_1 - S_k is infinite for no pose."""
+        """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a pose that is none."""
         x = np.array([1.0, *astuple(evidence)])
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
         return (1 - self.unseen * hidden_share(evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
-def hidden_share(span: ArrayLike) -> np.ndarray | float:
-    """Return h of the probabilities (see the module's docstring) for a share of the circle that the views span."""
-    return np.maximum(0.0, 1 - 1.5 * np.asarray(span))
+def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndarray, " n"]:
+    """Return h of the probabilities for a share of the circle that the views span."""
+    return np.maximum(0.0, 1 - 1.5 * span)
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Return for each hypothesis the index of the one that stands for its pose.
-
-    That is the nearest better one within 30 degrees that stands for itself, or its own.
-    """
+    """Return whose pose each hypothesis has: the nearest better one's that is within 30 degrees, else its own."""
     found: list[int] = []
     for i, row in enumerate(angle):
         near = [j for j in range(i) if found[j] == j and row[j] < MODE_ANGLE]
@@ -86,42 +82,21 @@ def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
     return np.flatnonzero(mode == np.arange(len(mode)))
 
 
-def hypothesis_probabilities(
-    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], evidence: Evidence, calibration: Calibration
-) -> Float[np.ndarray, " m"]:
-    """Return the probability of each hypothesis; over different poses they sum to at most 1."""
-    different, probability = different_poses(mode), np.empty(len(score))
-    probability[different] = calibration.probabilities(score[0] - score[different], evidence)
-    return probability[mode]
-
-
-def nearly_as_probable(probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
-    """Return the indices of the best pose and of the others whose probability is above 1/e of its, best first."""
-    different = different_poses(mode)
-    return different[probability[different] > TIE_RATIO * probability[0]]
-
-
-def is_one_of_two(
-    probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]
-) -> bool:
-    """Tell whether the answer is one of two poses, nearly as probable, together more probable than not, no third.
-
-    They are more than 60 degrees apart, so that no rotation is within 30 degrees of both.
-    """
-    likely = nearly_as_probable(probability, mode)
-    return bool(len(likely) == 2 and probability[likely].sum() > 0.5 and angle[likely[0], likely[1]] > 2 * MODE_ANGLE)
-
-
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses.
+
+    That is one of just two that are nearly as probable, and together more probable than not.
+    """
     terms, flags = hypotheses[0].terms, []
     probability = np.array([one.confidence for one in hypotheses])
-    mode = np.array([one.mode for one in hypotheses])
-    tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
-    shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
+    different = different_poses(np.array([one.mode for one in hypotheses]))
+    tied = different[probability[different] > TIE_RATIO * probability[0]]
+    # More than 60 degrees apart, no rotation is within 30 degrees of both.
+    one_of_two = bool(len(tied) == 2 and probability[tied].sum() > 0.5 and angle[tied[0], tied[1]] > 2 * MODE_ANGLE)
     if len(tied) > 1:
+        shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
         start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
         flags.append(
             f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
