@@ -18,7 +18,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.estimates import Hypothesis
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.verified.confidence import Calibration, Evidence, modes, reliability_flags
+from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
 from zsp_lite.verified.maps import build_maps, project_points
 from zsp_lite.verified.poses import (
     SCALE_RANGE,
@@ -432,21 +432,23 @@ def test_hypotheses_within_30_degrees_of_a_better_one_are_the_same_pose():
 
 def test_probabilities_by_hand():
     # Of four views that span half the circle, the nearest with exp(-(angle / 45)^2) = 1/2.
-    evidence = Evidence(0.5, np.log(4), 0.5, 0.03, 2.0)
+    known = evidence(180, 4, 45 * np.sqrt(np.log(2)), 0.03, 2.0)
     calibration = Calibration((0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4)
     a, none = np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2, np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0, np.inf]))
-    found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), evidence)
+    found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), known)
     np.testing.assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))
     assert found[3] == 0
 
 
 @given(
     st.lists(st.floats(0, 40), min_size=0, max_size=5),
-    st.builds(Evidence, st.floats(0, 0.9), st.floats(0, 2.3), st.floats(0, 1), st.floats(0, 0.3), st.floats(-40, 40)),
+    st.builds(
+        evidence, st.floats(0, 340), st.integers(1, 10), st.floats(0, 180), st.floats(0, 0.3), st.floats(-40, 40)
+    ),
 )
-def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, evidence):
-    found = Calibration().probabilities(np.cumsum([0.0, *deficits]), evidence)
+def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, known):
+    found = Calibration().probabilities(np.cumsum([0.0, *deficits]), known)
     assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
 
 

@@ -20,7 +20,7 @@ from zsp_lite.views import View
 
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the processor's cache.
 _MAP_PIXELS = 128 * 128
-# The silhouette of a soft mask is uncertain: distances to it are averaged over these thresholds.
+# The silhouette of a soft mask is uncertain: distances to it are averaged over these.
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
 _NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
 _MIN_DEPTH = 1e-3  # working units; depths are clamped to it before the projection
@@ -64,12 +64,10 @@ def build_maps(
     """Build the maps of views that share a world frame."""
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
-    origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
     sizes = np.array([camera.size[::-1] for camera in cameras])
-    translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
-        float_tensor(translations),
+        float_tensor([world_to_working.scale * t - R @ world_to_working.t for R, t in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
         float_tensor(sizes),

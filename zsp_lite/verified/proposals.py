@@ -33,7 +33,7 @@ _VIEW_SCALE = 0.9
 
 
 def propose_poses(scene: Scene, rng: np.random.Generator) -> Poses:
-    """Propose poses from the matches of each target view, followed by those of `poses_from_views`."""
+    """Propose poses from the matches of each target view, and from viewpoints."""
     proposals = [poses_from_matches(source, target, rng) for source, target in scene.matches]
     return concatenate([*proposals, poses_from_views(scene)])
 

@@ -43,11 +43,7 @@ POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, s
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
-    totals, scores = (len(scene.reference_points), len(scene.target_points)), []
-    for counts in (_SEARCH_POINTS, _POLISH_POINTS):
-        stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
-        scores.append(partial(_score, scene, stride))
-    score, fine_score = scores
+    score, fine_score = (partial(_score, scene, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
@@ -100,5 +96,8 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
 
 
-def _score(scene: Scene, stride: tuple[int, int], poses: Poses) -> Float[Tensor, " m"]:
+def _score(scene: Scene, counts: tuple[int, int], poses: Poses) -> Float[Tensor, " m"]:
+    """Score poses by about `counts` points of the reference and of the targets."""
+    totals = len(scene.reference_points), len(scene.target_points)
+    stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
     return WEIGHTS.score(score_terms(scene, poses, stride))

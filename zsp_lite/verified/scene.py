@@ -114,11 +114,7 @@ def build_scene(
 
 
 def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
-    """Subtract the means of each row and each column, and add the mean of all entries.
-
-    A patch in the middle of an object is similar to most patches, one at the silhouette to few. Centring removes this
-    and leaves how much more similar a patch is to one place than to the others.
-    """
+    """Subtract the means of rows and columns, because patches amid an object are similar to most, at its rim to few."""
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
 
@@ -129,10 +125,7 @@ def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Weight points by the inverse of a Gaussian kernel density, so that densely sampled surface does not count more.
-
-    A part of the surface that three views show has three times as many points as a part that one view shows.
-    """
+    """Weight points by the inverse of a Gaussian kernel density: what three views show has three times the points."""
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
     left, right = torch.cat([points, square], dim=1), torch.cat([points, torch.full_like(square, -0.5)], dim=1)

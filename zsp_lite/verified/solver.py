@@ -11,13 +11,13 @@ from torch import Tensor
 
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.confidence import Calibration, Evidence, modes, reliability_flags
+from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, WEIGHTS, score_terms
+from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
@@ -100,12 +100,10 @@ def _hypotheses(
     views = angles.argmin(axis=1)
     score, shape_fit = (one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape()))
     mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-    nearness = float(np.exp(-((angles[0].min() / VIEWPOINT_SIGMA) ** 2)))
-    evidence = Evidence(
-        scene.view_span / 360, float(np.log(len(order))), nearness, scene.view_similarity_std, float(shape_fit[0])
-    )
+    nearest, fit = float(angles[0].min()), float(shape_fit[0])
+    known = evidence(scene.view_span, len(order), nearest, scene.view_similarity_std, fit)
     deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)  # of different poses
-    confidence = Calibration().probabilities(deficit, evidence)[mode]
+    confidence = Calibration().probabilities(deficit, known)[mode]
     sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
     named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
     parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
