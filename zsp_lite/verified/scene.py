@@ -84,7 +84,9 @@ def build_scene(
         similarity.cpu().float()[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
-    view_similarities = torch.stack([view_similarity(similarity) for similarity in between_foregrounds])
+    # Of each view: each foreground patch's highest similarity in the other view, averaged in both directions.
+    best = [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
+    view_similarity = torch.stack(best)
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     matched = []
@@ -108,7 +110,7 @@ def build_scene(
         target_to_working=target_to_working,
         target_cameras=cameras,
         matches=tuple(matched),
-        view_similarity=view_similarities - view_similarities.mean(),
+        view_similarity=view_similarity - view_similarity.mean(),
         view_span=view_span(cameras, first.to_world(target_to_working.inverse().t)),
     )
 
@@ -117,11 +119,6 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
     """Subtract the means of rows and columns, because patches amid an object are similar to most, at its rim to few."""
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
-
-
-def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
-    """Average each foreground patch's highest similarity in the other view, in both directions."""
-    return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:

@@ -112,6 +112,5 @@ def _hypotheses(
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
-    content = (target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets)
-    keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
-    return tuple(sorted(range(len(targets)), key=keys.__getitem__))
+    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+    return tuple(sorted(range(len(targets)), key=lambda k: hashlib.blake2b(content[k], digest_size=16).digest()))
