@@ -8,7 +8,7 @@ from benchmark_folder import BACKBONE, run_rows, small_folder
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve

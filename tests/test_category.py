@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.category import PairHypotheses, category_pairs, synchronise, world_hypotheses
+from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.data.annotations import FrameKey
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
@@ -92,8 +92,8 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
 @pytest.mark.parametrize(("n", "per_object"), [(2, 1), (11, 10), (12, 6), (40, 6)])
 def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
     names = Mock(Co3D, frame_list=lambda category: [FrameKey(f"{k:02d}", f) for k in range(n) for f in range(12)])
-    pairs = category_pairs(names, "cup", None, None, 4, seed=1)
-    assert pairs == category_pairs(names, "cup", None, None, 4, seed=1)
+    pairs = object_pairs(names, "cup", None, None, 4)
+    assert pairs == object_pairs(names, "cup", None, None, 4)
     ends = np.array([[int(one.reference_sequence), int(one.target_sequence)] for one in pairs])
     assert len(ends) == 3 * n * per_object and len(np.unique(ends, axis=0)) == n * per_object
     assert connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)), connection="strong")[0] == 1
@@ -102,7 +102,7 @@ def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sid
 
 
 def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoids):
-    pair = category_pairs(ellipsoids, "ellipsoid", ["b", "a"], 1, 3, seed=0)[0]
+    pair = object_pairs(ellipsoids, "ellipsoid", ["b", "a"], 1, 3)[0]
     estimate = ZeroShotPose(CoordinateBackbone(), solver="verified").estimate(*ellipsoids.load_pair(pair))
     found, label = world_hypotheses(pair, estimate), read_labels(ellipsoids.root, "ellipsoid")["b"].trans
     assert rotation_error(found.sim3s[0].R, label[:3, :3]) < 10
@@ -111,7 +111,7 @@ def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoid
 
 def test_too_few_frames_and_pairs_that_do_not_connect_all_objects_are_refused(ellipsoids):
     with pytest.raises(InputError, match="has 7 frames, expected at least 8"):
-        category_pairs(ellipsoids, "ellipsoid", None, None, 8, seed=1)
+        object_pairs(ellipsoids, "ellipsoid", None, None, 8)
     pair = problem(0)[1][0]
     with pytest.raises(InputError, match="connect 2 of 4"):
         synchronise([pair, replace(pair, reference="x", target="y")])

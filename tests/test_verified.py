@@ -47,10 +47,6 @@ def estimate(method, views):
     return method.estimate_from_views(views[0], views[1:])
 
 
-def error(estimate, frames) -> float:
-    return rotation_error(estimate.sim3.R, truth(estimate, frames).R)
-
-
 def truth(estimate, frames) -> Sim3:
     return true_pose(frames[0].camera, AT_HOME, estimate.target_camera, ELSEWHERE)
 
@@ -61,13 +57,11 @@ def changed(view, **parts):
 
 
 def test_perfect_features_give_the_true_pose(estimate, frames):
-    assert error(estimate, frames) < 4
+    assert rotation_error(estimate.sim3.R, truth(estimate, frames).R) < 4
     assert estimate.sim3.scale == pytest.approx(1.15, rel=0.08)
     centre = frames[0].camera.to_camera(np.zeros(3))
     np.testing.assert_allclose(estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12)
     assert estimate.confidence > 0.5 and not estimate.flags
-    stages = ["matching", "scene", "proposals", "alignment", "verification", "refinement", "ranking"]
-    assert list(estimate.timings) == stages
 
 
 def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
@@ -84,17 +78,14 @@ def test_hypotheses_are_ranked_and_distinct_and_have_their_terms(estimate):
         assert 0 <= one.confidence <= 1
     assert max(one.confidence for one in found) == found[0].confidence
     assert sum(one.confidence for index, one in enumerate(found) if one.mode == index) <= 1
-    cameras = [view.frame.camera for view in estimate.target_views]
-    rotations = [one.sim3.R.T @ cameras[one.view].R for one in found]  # all from the targets' world
-    apart = rotation_error(np.stack(rotations)[:, None], np.stack(rotations)[None])
+    rotations = np.stack([estimate.world_rotation(one) for one in found])
+    apart = rotation_error(rotations[:, None], rotations)
     assert (apart + 180 * np.eye(len(found)) > 14.9).all()
 
 
 def test_the_estimate_is_for_the_view_closest_to_the_reference(estimate):
-    angles = []
-    for camera in (view.frame.camera for view in estimate.target_views):
-        (pose,) = estimate.propagate([camera])
-        angles.append(rotation_error(pose.R, np.eye(3)))
+    poses = estimate.propagate([view.frame.camera for view in estimate.target_views])
+    angles = [rotation_error(pose.R, np.eye(3)) for pose in poses]
     assert estimate.view == np.argmin(angles) == np.argmax(estimate.view_scores)
     np.testing.assert_allclose(-estimate.view_scores, angles, atol=0.1)
 
@@ -144,7 +135,7 @@ def test_a_larger_scene_has_a_larger_scale_and_the_same_rotation(method, estimat
 
 def test_one_target_view_is_enough(method, views, frames):
     alone = method.estimate_from_views(views[0], views[1:2])
-    assert alone.view == 0 and error(alone, frames) < 10
+    assert alone.view == 0 and rotation_error(alone.sim3.R, truth(alone, frames).R) < 10
 
 
 @pytest.mark.parametrize("sides", [[(-1, -0.2, -0.1)], [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]])
@@ -157,7 +148,7 @@ def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
     assert "are not similar" in found.note and found.flags
 
 
-def test_uninformative_features_give_a_low_confidence(method, views):
+def test_uninformative_features_give_a_low_confidence(method, views, estimate):
     rng = torch.Generator().manual_seed(0)
 
     def meaningless(view):
@@ -165,16 +156,14 @@ def test_uninformative_features_give_a_low_confidence(method, views):
         return replace(view, features=FeatureMap(keys, view.features.saliency, keys[0, 0]))
 
     found = method.estimate_from_views(meaningless(views[0]), [meaningless(view) for view in views[1:]])
-    sure = method.estimate_from_views(views[0], views[1:])
-    assert found.confidence < sure.confidence
-    assert found.flags
+    assert found.confidence < estimate.confidence and found.flags
 
 
 AXES = np.array([1.3, 0.9, 0.6])
 
 
-def egg(direction, paint, name: str) -> Frame:
-    """A plain ellipsoid, painted with what `paint` makes of its coordinates."""
+def egg(direction, name: str) -> Frame:
+    """An ellipsoid, painted so that a half turn about z leaves it as it is."""
     camera = look_at(direction)
     y, x = np.mgrid[:140, :180] + 0.5
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((140, 180))) @ camera.R
@@ -182,45 +171,25 @@ def egg(direction, paint, name: str) -> Frame:
     a, b, c = a.sum(-1), b.sum(-1), c.sum() - 1
     root = b * b - 4 * a * c
     depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / (2 * a), 0).astype(np.float32)
-    painted = np.rint((paint(camera.centre + rays * depth[..., None]) / 1.6 + 1) * 127).clip(1, 254)
+    x, y, z = np.moveaxis(camera.centre + rays * depth[..., None], -1, 0)
+    painted = np.rint((np.stack([x * y, x**2 - y**2, z], -1) / 1.6 + 1) * 127).clip(1, 254)
     rgb = np.where(root[..., None] > 0, painted, 0).astype(np.uint8)
     return Frame(rgb, depth, (root > 0).astype(np.float32), camera, name)
 
 
-def half_turn_about_z(points):
-    x, y, z = np.moveaxis(points, -1, 0)
-    return np.stack([x * y, x**2 - y**2, z], -1)
-
-
-# What is painted, and the half turns that leave it and the ellipsoid alone.
-SYMMETRIES = {
-    "half turn about an axis": (half_turn_about_z, [(-1.0, -1.0, 1.0)]),
-    "half turns about all axes": (np.abs, [(-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0)]),
-}
 # Two by two opposite, so that a half turn about z leaves alone what was seen, too.
 ALL_AROUND = [(1, 0.5, 0.5), (-1, -0.5, 0.5), (-0.4, 1, 0.2), (0.4, -1, 0.2), (0.6, -0.8, -0.4), (-0.6, 0.8, -0.4)]
 
 
-@pytest.mark.parametrize("symmetry", SYMMETRIES)
-def test_a_symmetric_object_is_flagged_as_ambiguous(method, symmetry):
-    paint, turns = SYMMETRIES[symmetry]
-    frames = [egg(direction, paint, f"egg {i}") for i, direction in enumerate([(0.9, -0.5, 0.3), *ALL_AROUND])]
+def test_a_symmetric_object_is_flagged_as_one_of_two(method):
+    frames = [egg(direction, f"egg {i}") for i, direction in enumerate([(0.9, -0.5, 0.3), *ALL_AROUND])]
     found = method.estimate(frames[0], frames[1:])
-    assert "the object may be symmetric" in found.note and found.flags
-    assert ("one of two: poses" in found.note) == found.one_of_two
-    assert ("poses more than 30 degrees apart explain the views equally well" in found.note) != found.one_of_two
-    assert sum(one.confidence for one in found.alternatives) + found.confidence <= 1
-    if len(turns) == 1:
-        assert found.one_of_two and found.angle_to(found.alternatives[0]) > 150
-        assert found.confidence >= found.alternatives[0].confidence > found.confidence / np.e
-    assert found.confidence < 0.75
+    assert found.one_of_two and found.angle_to(found.alternatives[0]) > 150
+    assert "one of two: poses" in found.note and "the object may be symmetric" in found.note
+    assert found.confidence >= found.alternatives[0].confidence > found.confidence / np.e
+    assert found.confidence < 0.75 and sum(one.confidence for one in found.alternatives) + found.confidence <= 1
     # Both answers are among the hypotheses, the one as true as the other.
-    first = frames[0].camera
-    errors = []
-    for turn in [(1.0, 1.0, 1.0), *turns]:
-        true = [true_pose(first, AT_HOME, frames[1 + one.view].camera, Sim3(1.0, np.diag(turn), np.zeros(3))).R
-                for one in found.hypotheses]  # fmt: skip
-        errors.append([rotation_error(one.sim3.R, pose) for one, pose in zip(found.hypotheses, true)])
-    best = np.min(errors, axis=1)
+    in_world = np.stack([found.world_rotation(one) @ frames[0].camera.R for one in found.hypotheses])
+    errors = [rotation_error(in_world, np.diag(turn)) for turn in [(1.0, 1.0, 1.0), (-1.0, -1.0, 1.0)]]
     assert min(error[0] for error in errors) < 30  # where the painting says little, poses some 25 degrees off are close
-    assert best.min() < 10 and (best < 15).sum() >= 2
+    assert (np.min(errors, axis=1) < 15).all() and np.min(errors) < 10

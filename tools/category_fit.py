@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from zsp_lite import category as module
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.category import PairHypotheses, category_pairs, synchronise, world_hypotheses
+from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -29,7 +29,7 @@ from zsp_lite.pipeline import ZeroShotPose
 def collect(data: Co3D, category: str, names: list[str], method: ZeroShotPose) -> Iterator[PairHypotheses]:
     """Solve all pairs of objects of a category."""
     view = lru_cache(None)(lambda name, k: method.views([data.load(data.frame(category, name, k))])[0])
-    for pair in category_pairs(data, category, names, None, 5, seed=0):
+    for pair in object_pairs(data, category, names, None, 5):
         reference = view(pair.reference_sequence, pair.reference_frame)
         targets = [view(pair.target_sequence, number) for number in pair.target_frames]
         yield world_hypotheses(pair, replace(method, seed=pair.seed).estimate_from_views(reference, targets))

@@ -41,8 +41,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import Calibration, Evidence, different_poses, hidden_share, modes
-from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients
+from zsp_lite.verified.confidence import Calibration, different_poses, evidence, hidden_share, modes
+from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
 
@@ -105,12 +105,11 @@ class Outcome:
         different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
         return scores[order[0]] - scores[different], self.errors[different]
 
-    def evidence(self, weights: ScoreCoefficients) -> Evidence:
+    def evidence(self, weights: ScoreCoefficients) -> Float[np.ndarray, "6"]:
         """Return the evidence for the calibration."""
         best = int((self.terms @ np.array(astuple(weights))).argmax())
         shape_fit = float(self.terms[best] @ np.array(astuple(weights.of_shape())))
-        nearness = float(np.exp(-((self.nearest[best] / VIEWPOINT_SIGMA) ** 2)))
-        return Evidence(self.span / 360, float(np.log(self.n_views)), nearness, self.view_std, shape_fit)
+        return evidence(self.span, self.n_views, self.nearest[best], self.view_std, shape_fit)
 
 
 def collect_outcomes(
@@ -275,10 +274,10 @@ def fit_calibration(
     target = torch.tensor([int(found[0]) if len(found) else most for found in right])
     count = Counter(one.category for one in outcomes)
     importance = torch.tensor([1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64)
-    evidence = np.array([astuple(one.evidence(weights)) for one in outcomes])
-    mean, std = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
-    x = torch.from_numpy(np.column_stack([np.ones(len(evidence)), (evidence - mean) / std]))
-    hidden = torch.from_numpy(hidden_share(evidence[:, 0]))
+    known = np.array([one.evidence(weights) for one in outcomes])[:, 1:]
+    mean, std = known.mean(axis=0), known.std(axis=0) + 1e-9
+    x = torch.from_numpy(np.column_stack([np.ones(len(known)), (known - mean) / std]))
+    hidden = torch.from_numpy(hidden_share(known[:, 0]))
     theta = torch.zeros(2, x.shape[1], dtype=torch.float64, requires_grad=True)  # alpha and beta
     unseen = torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)  # logit of lambda
     optimiser = torch.optim.LBFGS([theta, unseen], max_iter=300, line_search_fn="strong_wolfe")

@@ -28,14 +28,7 @@ from zsp_lite.benchmark.problem import Problem
 from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_texts
 from zsp_lite.benchmark.store import FrameStore
-from zsp_lite.category import (
-    SAME_ANGLE,
-    CategoryAlignment,
-    PairHypotheses,
-    category_pairs,
-    synchronise,
-    world_hypotheses,
-)  # fmt: skip
+from zsp_lite.category import SAME_ANGLE, CategoryAlignment, PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
@@ -54,33 +47,34 @@ class _Line(msgspec.Struct):
     """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
 
     pair: str
-    centre: list[float]
-    matrices: list[list[list[float]]]
-    probabilities: list[float]
+    centre: list[float] = []
+    matrices: list[list[list[float]]] = []
+    probabilities: list[float] = []
 
 
 class PairSolver:
-    """Finds the hypotheses of pairs; frames and features are kept from chunk to chunk."""
+    """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
 
-    def __init__(self, root: str, backbone: Any, threads: int | None = None):
-        """Open the data; `backbone` is one, or what `load_backbone` takes."""
-        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-        self._dataset, self._extractors, self._threads = Co3D(root), {"backbone": loaded}, threads
-        self._store: FrameStore | None = None
+    def __init__(self, root: str, category: str, backbone: FeatureExtractor | str | BackboneConfig, threads: int):
+        self._store = FrameStore(Co3D(root), category, {"backbone": _loaded(backbone)}, threads)
 
     def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Find the hypotheses of the pairs of a chunk."""
         for pair, _ in chunk:
-            if self._store is None or self._store.category != pair.category:
-                self._store = FrameStore(self._dataset, pair.category, self._extractors, self._threads)
-            try:
+            line: dict[str, Any] = {"pair": pair.key}
+            with suppress(InputError):  # the views determine no pose
                 found = hypotheses(Problem(pair, self._store))
-            except InputError:  # the views determine no pose
-                yield {"pair": pair.key, "centre": [], "matrices": [], "probabilities": []}
-                continue
-            matrices, probabilities = [one.matrix.tolist() for one in found.sim3s], found.probabilities.tolist()
-            centre = found.centre.tolist()
-            yield {"pair": pair.key, "centre": centre, "matrices": matrices, "probabilities": probabilities}
+                line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
+                line |= {"probabilities": found.probabilities.tolist()}
+            yield line
+
+
+def _read(out: str | Path) -> list[_Line]:
+    return [decode_json(text, _Line, where) for text, where in read_texts(out)]
+
+
+def _loaded(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
+    return load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
 
 
 def align_category(
@@ -113,8 +107,8 @@ def align_category(
         InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
             of them, or OUT holds another run.
     """
-    chosen = {pair.key: pair for pair in category_pairs(dataset, category, sequences, pairs, targets, seed=0)}
-    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+    chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
+    loaded = _loaded(backbone)
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
         open_workers(executor) as (pool, workers),
@@ -128,16 +122,16 @@ def align_category(
         with open_run(folder, settings, allow_other_version):
             known = {line.pair for line in _read(folder)}
             todo = {pair: ["alignment"] for key, pair in chosen.items() if key not in known}
-            sent = backbone if pool else loaded
-            make = partial(PairSolver, str(dataset.root.resolve()), sent, max(1, get_num_threads() // workers))
+            root, threads = str(dataset.root.resolve()), max(1, get_num_threads() // workers)
+            make = partial(PairSolver, root, category, backbone if pool else loaded, threads)
             evaluate_pairs(folder, make, todo, len(chosen), pool, workers, _Line)
         known = read_hypotheses(folder)
     found = [known[key] for key in chosen if key in known]
     if not found:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
-    for name in sorted({pair.reference_sequence for pair in chosen.values()} - {one.reference for one in found}):
-        if name not in {one.target for one in found}:
-            logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
+    posed = {name for one in found for name in (one.reference, one.target)}
+    for name in sorted({pair.reference_sequence for pair in chosen.values()} - posed):
+        logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
     return synchronise(found)
 
 
@@ -165,10 +159,6 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     return found
 
 
-def _read(out: str | Path) -> list[_Line]:
-    return [decode_json(text, _Line, where) for text, where in read_texts(out)]
-
-
 def estimate_with_helpers(
     sources: Sequence[Source], backbone: FeatureExtractor, reference_frame: int | None = None, targets: int = 5,
     upright: bool = True,
@@ -180,38 +170,37 @@ def estimate_with_helpers(
     """
     if len({one.path.resolve() for one in sources}) < len(sources):
         raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
-    names, found, remembering = [f"{k} {one.name}" for k, one in enumerate(sources)], {}, _Remembering(backbone)
+    solve = partial(estimate_pose, solver="verified", targets=targets, backbone=_Remembering(backbone), upright=upright)
+    found = {(0, 1): solve(*sources[:2], reference_frame=reference_frame)}
     for a, b in permutations(range(len(sources)), 2):
-        if sources[b].format != "image" or (a, b) == (0, 1):
-            number = reference_frame if a == 0 else None
-            with nullcontext() if (a, b) == (0, 1) else suppress(InputError):  # a pair that has no pose says nothing
-                found[a, b] = estimate_pose(
-                    sources[a], sources[b], "verified", number, targets, backbone=remembering, upright=upright
-                )
+        if (a, b) != (0, 1) and sources[b].format != "image":
+            with suppress(InputError):  # a pair that has no pose says nothing
+                found[a, b] = solve(sources[a], sources[b], reference_frame=None if a else reference_frame)
+    names = [f"{k} {one.name}" for k, one in enumerate(sources)]
     pairs = {
         (a, b): world_hypotheses(Pair("", names[a], 0, names[b], ()), one.estimates["verified"])
         for (a, b), one in found.items()
     }
     alignment = synchronise(list(pairs.values()))
-    estimate, helpers = found[0, 1].estimates["verified"], ", ".join(str(one.path) for one in sources[2:])
-    first, second = found[0, 1].sources
+    estimate, (first, second) = found[0, 1].estimates["verified"], found[0, 1].sources
+    helpers = ", ".join(str(one.path) for one in sources[2:])
     result = replace(found[0, 1], sources=(first, f"{second}; helpers: {helpers}"))
-    between = alignment.between(names[0], names[1]).R
-    angles = [float(rotation_angle(one.R, between)) for one in pairs[0, 1].sim3s]
-    chosen = int(np.argmin(angles))
-    if angles[chosen] > SAME_ANGLE:
+    rotations = np.stack([one.R for one in pairs[0, 1].sim3s])
+    angles = rotation_angle(rotations, alignment.between(*names[:2]).R)
+    if angles.min() > SAME_ANGLE:
         flags = (*estimate.flags, "no hypothesis agrees with the other objects: they were not used")
         return replace(result, estimates={"verified": replace(estimate, flags=flags)})
     sure = min(alignment.objects[name].probability for name in names[:2])
-    estimates = {"verified": _settled(estimate, chosen, sure)}
+    estimates = {"verified": _settled(estimate, int(angles.argmin()), sure)}
     return replace(result, estimates=estimates, errors=known_errors(*sources[:2], result, estimates))
 
 
 def _settled(estimate: PoseEstimate, chosen: int, probability: float) -> PoseEstimate:
     """Put the hypothesis with an index first, with a probability; the others share what is left."""
-    ordered = sorted(estimate.hypotheses, key=lambda one: one is not estimate.hypotheses[chosen])
-    angles = [np.stack([estimate.world_rotation(one) for one in some]) for some in (estimate.hypotheses, ordered)]
-    before, after = (rotation_angle(one[:, None], one) for one in angles)
+    rotations = np.stack([estimate.world_rotation(one) for one in estimate.hypotheses])
+    before = rotation_angle(rotations[:, None], rotations)
+    order = sorted(range(len(rotations)), key=lambda k: k != chosen)
+    after, ordered = before[np.ix_(order, order)], [estimate.hypotheses[k] for k in order]
     mode = modes(after)
     rest = sum(one.confidence for k, one in enumerate(ordered) if 0 != mode[k] == k) or 1.0
     hypotheses = tuple(
@@ -219,11 +208,10 @@ def _settled(estimate: PoseEstimate, chosen: int, probability: float) -> PoseEst
         for one, m in zip(ordered, mode)
     )
     old, (new, one_of_two) = reliability_flags(estimate.hypotheses, before)[0], reliability_flags(hypotheses, after)
-    flags = (*new, *(flag for flag in estimate.flags if flag not in old))
-    first = hypotheses[0]
     return replace(
-        estimate, sim3=first.sim3, view=first.view, hypotheses=hypotheses, flags=flags, one_of_two=one_of_two
-    )
+        estimate, sim3=ordered[0].sim3, view=ordered[0].view, hypotheses=hypotheses, one_of_two=one_of_two,
+        flags=(*new, *(flag for flag in estimate.flags if flag not in old)),
+    )  # fmt: skip
 
 
 class _Remembering:
@@ -236,10 +224,10 @@ class _Remembering:
         return getattr(self._backbone, name)
 
     def __call__(self, images: Sequence[np.ndarray]) -> list[Any]:
-        names = [image.tobytes() for image in images]
-        new = {name: image for name, image in zip(names, images) if name not in self._known}
-        self._known |= dict(zip(new, self._backbone(list(new.values())) if new else ()))
-        return [self._known[name] for name in names]
+        for image in images:
+            if (name := image.tobytes()) not in self._known:
+                (self._known[name],) = self._backbone([image])
+        return [self._known[image.tobytes()] for image in images]
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:

@@ -34,7 +34,7 @@ from zsp_lite.metrics import rotation_angle
 
 KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off counts 1/e, and \epsilon
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
-ALL_PAIRS_BELOW, PAIRS_PER_OBJECT, REFERENCES = 12, 6, 3  # see `category_pairs`
+ALL_PAIRS_BELOW, PAIRS_PER_OBJECT, REFERENCES = 12, 6, 3  # see `object_pairs`
 _CHAINS, _TEMPERATURES = 48, (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
 _PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
 _WEAK = 1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
@@ -87,19 +87,14 @@ class CategoryAlignment:
         return self.objects[target].sim3.inverse() @ self.objects[reference].sim3
 
 
-def category_pairs(
-    dataset: Co3D,
-    category: str,
-    sequences: Sequence[str] | None,
-    per_object: int | None,
-    targets: int,
-    seed: int,
+def object_pairs(
+    dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
 ) -> list[Pair]:
     """Choose the pairs of objects, and their frames, that a category is aligned by.
 
     Each object is the reference of `per_object` others; None is all below 12 objects, and 6 from there on. Each pair
     becomes three pairs of frames: reference frames are evenly spaced over their sequence, to see several sides,
-    and so are the `targets` target frames, from random starts that depend on the two names and the seed only.
+    and so are the `targets` target frames, from random starts that depend on the two names only.
     """
     numbers: dict[str, list[int]] = {}
     for key in dataset.frame_list(category):
@@ -112,13 +107,13 @@ def category_pairs(
             raise InputError(f"sequence {category}/{name} has {length} frames, expected at least {least}")
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     circle = rng.permutation(n).tolist()
     steps = [1, *(2 + rng.permutation(n - 2)).tolist()][:per_object]  # the first connects all objects
     pairs = []
     for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
         reference, target = names[a], names[b]
-        rng = np.random.default_rng([seed, stable_hash(f"{category}/{reference}/{target}") >> 1])
+        rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         first, around = sorted(numbers[reference]), sorted(numbers[target])
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
         for r in range(REFERENCES):
@@ -132,18 +127,15 @@ def category_pairs(
 def world_hypotheses(pair: Pair, estimate: PoseEstimate) -> PairHypotheses:
     """Convert the hypotheses of the verified solver, between cameras, to similarities between the two worlds."""
     view = estimate.reference_view
-    points, known = view.measured_points
-    visible = points[view.known_foreground] if view.known_foreground.any() else points[known]
-    sim3s = []
-    for one in estimate.hypotheses:
-        first, second = (Sim3(1.0, v.frame.camera.R, v.frame.camera.t) for v in (view, estimate.target_views[one.view]))
-        sim3s.append(second.inverse() @ one.sim3 @ first)
+    cameras = [one.frame.camera for one in (view, *estimate.target_views)]
+    reference, *targets = (Sim3(1.0, camera.R, camera.t) for camera in cameras)
+    sim3s = tuple(targets[one.view].inverse() @ one.sim3 @ reference for one in estimate.hypotheses)
     probabilities = np.array([one.confidence for one in estimate.hypotheses])
-    centre = view.frame.camera.to_world(np.median(visible, axis=0))
-    return PairHypotheses(pair.reference_sequence, pair.target_sequence, tuple(sim3s), probabilities, centre)
+    centre = cameras[0].to_world(np.median(view.measured_points[0][view.known_foreground], axis=0))
+    return PairHypotheses(pair.reference_sequence, pair.target_sequence, sim3s, probabilities, centre)
 
 
-def synchronise(pairs: Sequence[PairHypotheses], seed: int = 0) -> CategoryAlignment:
+def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     """Find the similarities from the objects' worlds to one frame that agree best with the hypotheses of all pairs.
 
     Two objects may have several pairs. The order does not matter. InputError if the pairs do not connect all objects.
@@ -156,7 +148,7 @@ def synchronise(pairs: Sequence[PairHypotheses], seed: int = 0) -> CategoryAlign
     if len(order) < len(names):
         raise InputError(f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all")
     nodes = _build_nodes(pairs, ends)
-    rotations = _search(nodes, order, np.random.default_rng(seed))
+    rotations = _search(nodes, order, np.random.default_rng(0))
     scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
     off = np.array([rotation_angle(rotations[a], rotations[b] @ one.sim3s[0].R) for (a, b), one in zip(ends, pairs)])
     objects = {}

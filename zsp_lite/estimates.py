@@ -30,7 +30,7 @@ class Hypothesis:
     score: float  # in nats, comparable between the hypotheses of one estimate
     terms: dict[str, float]  # the terms that the score is a weighted sum of, by name
     # probability that the rotation error is below 30 degrees. Over different poses, those whose `mode` is their own
-    # index, the probabilities sum to at most 1 (see `verified.confidence.hypothesis_probabilities`)
+    # index, the probabilities sum to at most 1 (see `verified.confidence`)
     confidence: float
     # index of the hypothesis that stands for this pose: its own, or that of a better one that is the same pose within
     # 30 degrees
@@ -54,7 +54,7 @@ class PoseEstimate:
     flags: tuple[str, ...] = ()  # one line per reason not to trust the estimate
     hypotheses: tuple[Hypothesis, ...] = ()  # candidate poses of the solver, best first; empty for the paper's solver
     # whether the solver cannot decide between the estimate and its first alternative: both are nearly equally probable
-    # and far apart, such as by a half turn (see `verified.confidence.is_one_of_two`)
+    # and far apart, such as by a half turn (see `verified.confidence.reliability_flags`)
     one_of_two: bool = False
     # by how many degrees the reference crop was turned counterclockwise for its features (see `ZeroShotPose.upright`).
     # The pose is that of the image as given

@@ -1,14 +1,12 @@
 """Iterative closest point (ICP) with scale on the object points of depth maps (supplement, "Baselines")."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.depth import inpaint_depth
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.open3d import load_open3d
@@ -47,21 +45,15 @@ def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[C
     """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera
-    source = _subsample(_cloud(reference), rng)
-    parts = [camera.to_camera(target.camera.to_world(_cloud(target))) for target in targets]
+    source = _subsample(object_points(reference), rng)
+    parts = [camera.to_camera(target.camera.to_world(object_points(target))) for target in targets]
     target = _subsample(np.concatenate(parts), rng)
     aligned = icp(firsts[0].to_world(source), firsts[1].to_world(target))
     to_reference, to_target = (Sim3(1.0, first.R, first.t) for first in firsts)
     return to_target @ aligned @ to_reference.inverse()
 
 
-def _cloud(frame: Frame) -> Float[np.ndarray, "n 3"]:
-    """Object points in camera coordinates, with in-painted depth if fewer than 10 pixels have known depth."""
-    points = object_points(frame)
-    return points if len(points) >= _MIN_POINTS else object_points(replace(frame, depth=inpaint_depth(frame.depth)))
-
-
 def _subsample(points: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
     if len(points) < _MIN_POINTS:
-        raise InputError(f"object has {len(points)} points, expected at least {_MIN_POINTS}")
+        raise InputError(f"object has {len(points)} points of known depth, expected at least {_MIN_POINTS}")
     return points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]

@@ -1,14 +1,25 @@
-"""SIFT keypoints (Lowe 2004), matched as mutual nearest neighbours and unprojected by depth (paper sec. 5.2)."""
+"""SIFT (Lowe 2004): keypoints with depth, a baseline of the paper (sec. 5.2), and dense RootSIFT as patch features."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Float, Int, UInt8
 
+from zsp_lite.backbones.backbone import Image, prepare_images
 from zsp_lite.data.depth import inpaint_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame
+from zsp_lite.features import FeatureMap
+from zsp_lite.matchers import mutual_nearest_neighbours
+
+KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
+_CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations per cell
+_CELL = 1.5  # side of a cell, in keypoint sizes
+# OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5), clipping, scale.
+_BLUR = (1.6**2 - 0.5**2) ** 0.5
+_CLIP, _SCALE = 0.2, 512.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,32 +37,28 @@ class Sift:
 
     def describe(self, frames: Sequence[Frame]) -> list[Keypoints]:
         """Detect the keypoints of object crops."""
-        return [self._describe(frame) for frame in frames]
-
-    def _describe(self, frame: Frame) -> Keypoints:
-        grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
-        mask = None if frame.mask is None else (frame.mask > ON_OBJECT).astype(np.uint8)
-        points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
-        if not points:
-            return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
-        # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image that is shifted by -1/4 pixel.
-        pixels = np.array([point.pt for point in points], dtype=np.float64) + 0.25
-        length = np.linalg.norm(descriptors, axis=1, keepdims=True)
-        return Keypoints(pixels, descriptors / np.maximum(length, 1e-12))
+        found = []
+        for frame in frames:
+            grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
+            mask = None if frame.mask is None else (frame.mask > ON_OBJECT).astype(np.uint8)
+            points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
+            descriptors = np.empty((0, 128), np.float32) if descriptors is None else descriptors
+            # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image, shifted by -1/4 pixel.
+            pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.25
+            length = np.linalg.norm(descriptors, axis=1, keepdims=True)
+            found.append(Keypoints(pixels, descriptors / np.maximum(length, 1e-12)))
+        return found
 
 
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Indices in both images, and cosine similarities, of the k most similar mutual nearest neighbours, best first."""
-    if not len(first.pixels) or not len(second.pixels):
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    similarity = first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)
-    partner = similarity.argmax(axis=1)
-    index = np.arange(len(similarity))
-    index = index[similarity.argmax(axis=0)[partner] == index]
-    index = index[np.argsort(-similarity[index, partner[index]], kind="stable")][:k]
-    return index, partner[index], similarity[index, partner[index]]
+    """Return indices in both images, and cosines, of the k most similar mutual nearest neighbours, best first."""
+    similarity = torch.from_numpy(first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64))
+    everywhere = (torch.ones(n, dtype=torch.bool) for n in similarity.shape)
+    partner, score = mutual_nearest_neighbours(similarity, *everywhere)
+    best = score.argsort(descending=True, stable=True)[: min(k, int(score.isfinite().sum()))]
+    return best.numpy(), partner[best].numpy(), score[best].numpy()
 
 
 def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
@@ -59,3 +66,65 @@ def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np
     height, width = frame.camera.size
     columns, rows = np.floor(pixels).astype(np.int64).clip(0, (width - 1, height - 1)).T
     return frame.camera.unproject_camera(pixels, inpaint_depth(frame.depth)[rows, columns])
+
+
+class RootSift:
+    """Feature extractor (see `features.FeatureExtractor`) with one RootSIFT descriptor per patch.
+
+    The image is resized to 224 pixels. The keys, (28, 28, 128), are upright SIFT descriptors at the patch centres as
+    RootSIFT (Arandjelovic and Zisserman 2012): square roots of L1-normalised histograms, whose dot products are
+    Hellinger kernels. The saliency is 1 everywhere; use object masks. The global feature is the normalised mean of the
+    keys.
+    """
+
+    name = "rootsift"
+    has_saliency = False
+    image_size = 224
+    patch_size = 8
+
+    def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
+        """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
+        maps, side = [], self.image_size // self.patch_size
+        centres = (np.arange(side) + 0.5) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
+        for rgb in prepare_images(images, self.image_size).mul(255).round().to(torch.uint8):
+            grey = cv2.cvtColor(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
+            histograms = dense_sift(grey, centres, KEYPOINT_SIZE)
+            total = histograms.sum(axis=-1, keepdims=True)
+            keys = torch.from_numpy(np.sqrt(histograms / np.maximum(total, 1e-12)).astype(np.float32))
+            mean = torch.nn.functional.normalize(keys.mean((0, 1)), dim=0)
+            maps.append(FeatureMap(keys, torch.ones(side, side), mean))
+        return maps
+
+
+def dense_sift(
+    grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
+) -> Float[np.ndarray, "side side 128"]:
+    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding.
+
+    The weights of the histograms are separable in rows and columns: two small matrix products compute all of them, in
+    a hundredth of OpenCV's time.
+    """
+    n, side = len(grey), len(centres)
+    blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)
+    right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # gradients are 0 at the border
+    right[1:-1, 1:-1] = blurred[1:-1, 2:] - blurred[1:-1, :-2]
+    up[1:-1, 1:-1] = blurred[:-2, 1:-1] - blurred[2:, 1:-1]
+    length, angle = cv2.cartToPolar(right, up, angleInDegrees=True)
+    # Each gradient contributes to the two nearest orientations, with linear weights.
+    distance = np.abs(angle * (_BINS / 360) - np.arange(_BINS, dtype=np.float32)[:, None, None])
+    oriented = length * np.maximum(1 - np.minimum(distance, _BINS - distance), 0)
+    weights = _weights(n, centres, _CELL * size)
+    cells = (weights @ oriented @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
+    histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)
+    histograms = np.minimum(histograms, _CLIP * np.linalg.norm(histograms, axis=-1, keepdims=True))
+    norm = np.linalg.norm(histograms, axis=-1, keepdims=True)
+    return np.round(histograms * (_SCALE / np.maximum(norm, np.finfo(np.float32).eps))).clip(0, 255)
+
+
+def _weights(n: int, centres: Float[np.ndarray, " side"], cell: float) -> Float[np.ndarray, "rows n"]:
+    """Compute the weight of each of n pixels along one axis in each cell of each keypoint (keypoints x cells, n)."""
+    offset = np.arange(n) - np.round(centres)[:, None]
+    in_cells = offset / cell
+    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * (np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2))
+    distance = np.abs(in_cells[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
+    return (window[:, None] * np.maximum(1 - distance, 0)).reshape(-1, n).astype(np.float32)

@@ -8,12 +8,12 @@ import torch.nn.functional as F
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.icp import align
-from zsp_lite.baselines.posecontrast import Viewpoint
+from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import PairHypotheses, category_pairs, synchronise, world_hypotheses
+from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.errors import InputError
 
 _K = 50  # number of matches, as in "Ours"
@@ -63,7 +63,7 @@ def category(problem: Problem) -> Answer:
     own = hypotheses(problem)
     if ("category", views) not in store.lasting:
         others: list[PairHypotheses] = []
-        for pair in category_pairs(store.dataset, store.category, None, None, views, seed=0):
+        for pair in object_pairs(store.dataset, store.category, None, None, views):
             with suppress(InputError):  # the views determine no pose
                 others.append(hypotheses(Problem(pair, store)))
         store.lasting["category", views] = others

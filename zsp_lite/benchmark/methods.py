@@ -13,10 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.baselines.posecontrast import load_posecontrast
-from zsp_lite.baselines.rootsift import RootSift
-from zsp_lite.baselines.sift import Sift
-from zsp_lite.baselines.swav import load_swav
+from zsp_lite.baselines.networks import load_posecontrast, load_swav
+from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
 from zsp_lite.benchmark.own import Estimator, KeypointMatcher, import_object, kind_of, read_poses

@@ -6,7 +6,7 @@ different poses (see `modes`) of an estimate, pose k has the probability
     p_k = (1 - \lambda h) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
     \log a = \alpha . x,   b = \beta . x.
 
-x is what is known about the estimate beside the scores (see `Evidence`), above all the span: how far around the target
+x is what is known about the estimate beside the scores (see `evidence`), above all the span: how far around the target
 its views go. Where they show one side only, the best pose turns that side to the reference, and whether the reference
 shows a hidden side that looks alike cannot be known. h is the share of the circle around the target from where no view
 is within 60 degrees, relative to that of a single view, and \lambda the chance of such a side. What the p_k leave of 1
@@ -15,13 +15,13 @@ probabilities are calibrated.
 """
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from zsp_lite.estimates import Hypothesis
+from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
 MODE_ANGLE = 30.0
@@ -31,23 +31,21 @@ _MIN_OVERLAP = 0.05  # fraction of points on an observed surface; with less in b
 _MIN_SIMILARITY = 0.02
 
 
-@dataclass(frozen=True)
-class Evidence:
-    r"""What the probabilities of an estimate depend on, beside the scores of its poses."""
-
-    span: float  # share of the circle around the target that its views span, in [0, 1) (see `cameras.view_span`)
-    log_views: float  # logarithm of the number N of target views
-    # \exp(-(\theta / 45 degrees)^2), \theta the angle from the reference's camera to the nearest target view's
-    nearness: float
-    # standard deviation of the target views' similarity to the reference; small if the features distinguish no sides
-    view_std: float
-    # part of the best score that compares shapes (overlap, silhouettes and free space); small if the shapes do not fit
-    shape_fit: float
+def evidence(
+    span: float,  # angle in degrees that the target views span around the target (see `cameras.view_span`)
+    n_views: int,
+    nearest: float,  # angle in degrees from the reference's camera to the nearest target view's under the best pose
+    view_std: float,  # of the target views' similarity to the reference; small if the features distinguish no sides
+    shape_fit: float,  # part of the best score from overlap, silhouettes and free space; small if shapes do not fit
+) -> Float[np.ndarray, "6"]:
+    """Return a constant and what the probabilities of an estimate depend on, beside the scores of its poses."""
+    nearness = np.exp(-((nearest / VIEWPOINT_SIGMA) ** 2))
+    return np.array([1.0, span / 360, np.log(n_views), nearness, view_std, shape_fit])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha and \beta of a constant and the `Evidence`, in its order, and \lambda.
+    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda.
 
     They are fitted on validation categories of equal weight, with target views all around the object and within arcs
     of 30 to 120 degrees (`tools/tuning.py`).
@@ -57,23 +55,19 @@ class Calibration:
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
     unseen: float = 0.313  # \lambda
 
-    def probabilities(self, deficit: Float[np.ndarray, " m"], evidence: Evidence) -> Float[np.ndarray, " m"]:
-        """Return the probabilities of different poses; the `deficit` S_1 - S_k is infinite for no pose."""
-        x = np.array([1.0, *astuple(evidence)])
+    def probabilities(self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
+        """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a pose that is none."""
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
-        return (1 - self.unseen * hidden_share(evidence.span)) * odds / (np.exp(x @ self.none) + odds.sum())
+        return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
-def hidden_share(span: ArrayLike) -> np.ndarray | float:
-    """Return h of the probabilities (see the module's docstring) for a share of the circle that the views span."""
-    return np.maximum(0.0, 1 - 1.5 * np.asarray(span))
+def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndarray, " n"]:
+    """Return h of the probabilities for a share of the circle that the views span."""
+    return np.maximum(0.0, 1 - 1.5 * span)
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Return for each hypothesis the index of the one that stands for its pose.
-
-    That is the nearest better one within 30 degrees that stands for itself, or its own.
-    """
+    """Return whose pose each hypothesis has: the nearest better one's that is within 30 degrees, else its own."""
     found: list[int] = []
     for i, row in enumerate(angle):
         near = [j for j in range(i) if found[j] == j and row[j] < MODE_ANGLE]
@@ -86,42 +80,21 @@ def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
     return np.flatnonzero(mode == np.arange(len(mode)))
 
 
-def hypothesis_probabilities(
-    score: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], evidence: Evidence, calibration: Calibration
-) -> Float[np.ndarray, " m"]:
-    """Return the probability of each hypothesis; over different poses they sum to at most 1."""
-    different, probability = different_poses(mode), np.empty(len(score))
-    probability[different] = calibration.probabilities(score[0] - score[different], evidence)
-    return probability[mode]
-
-
-def nearly_as_probable(probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
-    """Return the indices of the best pose and of the others whose probability is above 1/e of its, best first."""
-    different = different_poses(mode)
-    return different[probability[different] > TIE_RATIO * probability[0]]
-
-
-def is_one_of_two(
-    probability: Float[np.ndarray, " m"], mode: Int[np.ndarray, " m"], angle: Float[np.ndarray, "m m"]
-) -> bool:
-    """Tell whether the answer is one of two poses, nearly as probable, together more probable than not, no third.
-
-    They are more than 60 degrees apart, so that no rotation is within 30 degrees of both.
-    """
-    likely = nearly_as_probable(probability, mode)
-    return bool(len(likely) == 2 and probability[likely].sum() > 0.5 and angle[likely[0], likely[1]] > 2 * MODE_ANGLE)
-
-
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses.
+
+    That is one of just two that are nearly as probable, and together more probable than not.
+    """
     terms, flags = hypotheses[0].terms, []
     probability = np.array([one.confidence for one in hypotheses])
-    mode = np.array([one.mode for one in hypotheses])
-    tied, one_of_two = nearly_as_probable(probability, mode), is_one_of_two(probability, mode, angle)
-    shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
+    different = different_poses(np.array([one.mode for one in hypotheses]))
+    tied = different[probability[different] > TIE_RATIO * probability[0]]
+    # More than 60 degrees apart, no rotation is within 30 degrees of both.
+    one_of_two = bool(len(tied) == 2 and probability[tied].sum() > 0.5 and angle[tied[0], tied[1]] > 2 * MODE_ANGLE)
     if len(tied) > 1:
+        shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
         start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
         flags.append(
             f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "

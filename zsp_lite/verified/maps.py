@@ -20,12 +20,10 @@ from zsp_lite.views import View
 
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the processor's cache.
 _MAP_PIXELS = 128 * 128
-# The silhouette of a soft mask is uncertain: distances to it are averaged over these thresholds.
+# The silhouette of a soft mask is uncertain: distances to it are averaged over these.
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
-_NO_SILHOUETTE = 1e4  # distance in pixels for an empty mask
+_NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
 _MIN_DEPTH = 1e-3  # working units; depths are clamped to it before the projection
-# Columns of `ViewMaps.table`.
-_DEPTH, _WEIGHT, _SILHOUETTE, _PATCH = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +41,6 @@ class ViewMaps:
     # for none). Columns are contiguous in memory
     table: Float[Tensor, "pixels 4"]
     pixel_scale: Float[Tensor, "v 2"]  # (x, y) pixels of the view's frame per map pixel
-
-    def __len__(self) -> int:
-        return len(self.focal_length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +64,10 @@ def build_maps(
     """Build the maps of views that share a world frame."""
     cameras = [_map_camera(view.frame.camera) for view in views]
     tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
-    origin = -world_to_working.t / world_to_working.scale  # of the working frame, in the world frame
     sizes = np.array([camera.size[::-1] for camera in cameras])
-    translations = [world_to_working.scale * (R @ origin + t) for R, t in world_to_camera]
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
-        float_tensor(translations),
+        float_tensor([world_to_working.scale * t - R @ world_to_working.t for R, t in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
         float_tensor(sizes),
@@ -89,11 +82,10 @@ def project_points(
 ) -> Projection:
     """Transform points by `linear @ x + translation`, project them into every view and read the maps.
 
-    A point beyond the image border reads the nearest border pixel. Its silhouette distance is that of the border
-    pixel plus the distance to it. It is 0 if the border pixel lies inside the silhouette: the object is cut off
-    there, and its extent beyond the border is unknown.
+    A point beyond the border reads the nearest border pixel, and its silhouette distance is larger by the distance to
+    it; but where the silhouette reaches the border, the object is cut off, its extent unknown, and the distance 0.
     """
-    m, v = len(linear), len(maps)
+    m, v = len(linear), len(maps.size)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
     camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
     in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
@@ -128,17 +120,8 @@ def _table(
     rows, cols = ((2 * np.arange(n) + 1) * old // (2 * n) for n, old in zip(camera.size, frame.camera.size))
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth[np.ix_(rows, cols)]
-    table = np.empty((4, height, width), np.float32)
-    table[_DEPTH] = depth * scale
-    table[_WEIGHT] = np.where(depth > 0, mask, 0)
-    table[_SILHOUETTE] = np.mean([_distance(mask < threshold) for threshold in _MASK_THRESHOLDS], axis=0)
+    outside = [(mask < threshold).astype(np.uint8) for threshold in _MASK_THRESHOLDS]
+    distance = [cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside]
     patch = (np.arange(height) * grid[0] // height)[:, None] * grid[1] + np.arange(width) * grid[1] // width
-    table[_PATCH] = columns[patch]
-    return table.reshape(4, -1)
-
-
-def _distance(outside: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Compute the distance in pixels from each pixel to the nearest one that is not outside."""
-    if outside.all():
-        return np.full(outside.shape, _NO_SILHOUETTE, np.float32)
-    return cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)
+    table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), columns[patch]
+    return np.stack([values.astype(np.float32) for values in table]).reshape(4, -1)

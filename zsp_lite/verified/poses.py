@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from zsp_lite import alignment
 from zsp_lite.metrics import rotation_angle
 
 # Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds have unit spread, so
@@ -52,16 +51,6 @@ def concatenate(batches: Sequence[Poses]) -> Poses:
     return Poses(*(torch.cat([getattr(p, name) for p in batches]) for name in ("scale", "rotation", "translation")))
 
 
-def nearest_rotation(covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
-    """Solve the orthogonal Procrustes problem (`alignment.nearest_rotation`) for a batch of covariances."""
-    return float_tensor(alignment.nearest_rotation(covariance.double().numpy())[0])
-
-
-def fit_poses(source: Float[Tensor, "m n 3"], target: Float[Tensor, "m n 3"]) -> Poses:
-    """Fit a similarity to each of m sets of n corresponding points (`alignment.umeyama_batch`)."""
-    return Poses(*map(float_tensor, alignment.umeyama_batch(source.double().numpy(), target.double().numpy())[:3]))
-
-
 def float_tensor(values) -> Tensor:
     """Convert an array, or nested lists, to a float32 tensor."""
     return torch.from_numpy(np.asarray(values, dtype=np.float32))
@@ -78,7 +67,7 @@ def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"
 
 
 def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula."""
+    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula, in float32."""
     angle = vectors.norm(dim=-1, keepdim=True)
     x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
     zero = torch.zeros_like(x)
@@ -95,8 +84,6 @@ def non_maximum_suppression(
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
     kept: list[int] = []
     for candidate in range(len(order)):
-        if not near[candidate, kept].any():
+        if len(kept) < max_count and not near[candidate, kept].any():
             kept.append(candidate)
-            if len(kept) == max_count:
-                break
     return order[torch.tensor(kept, dtype=torch.long)]

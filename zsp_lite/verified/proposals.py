@@ -11,14 +11,15 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from zsp_lite.alignment import umeyama_batch
 from zsp_lite.verified.poses import (
     SCALE_RANGE,
     Poses,
     concatenate,
-    fit_poses,
+    float_tensor,
     non_maximum_suppression,
     rotation_matrices,
-)
+)  # fmt: skip
 from zsp_lite.verified.scene import Scene
 
 _TRIALS = 300  # samples of three matches, per view
@@ -32,7 +33,7 @@ _VIEW_SCALE = 0.9
 
 
 def propose_poses(scene: Scene, rng: np.random.Generator) -> Poses:
-    """Propose poses from the matches of each target view, followed by those of `poses_from_views`."""
+    """Propose poses from the matches of each target view, and from viewpoints."""
     proposals = [poses_from_matches(source, target, rng) for source, target in scene.matches]
     return concatenate([*proposals, poses_from_views(scene)])
 
@@ -45,8 +46,9 @@ def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"
     """
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
-    sample = torch.from_numpy(np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3].copy())
-    poses = fit_poses(source[sample], target[sample])
+    sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
+    fitted = umeyama_batch(*(points.double().numpy()[sample] for points in (source, target)))[:3]
+    poses = Poses(*map(float_tensor, fitted))
     smallest, largest = SCALE_RANGE
     poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
@@ -58,9 +60,8 @@ def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"
 def poses_from_views(scene: Scene) -> Poses:
     """Return poses under which the reference has viewpoints all around the object, with the centroids aligned.
 
-    These are the N viewpoints of the target views, and that of the scene's first view turned about the vertical by 30,
-    60, ..., 330 degrees. The vertical is estimated as the mean of the directions that are up in the target images; if
-    there is one image, it is off by the camera's elevation.
+    These are the viewpoints of the target views, and that of the scene's first view turned about the vertical by 30,
+    60, ..., 330 degrees. The vertical is the mean of the directions that are up in the target images.
     """
     views = scene.target_maps.rotation.transpose(1, 2)
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

@@ -5,6 +5,7 @@ evolution strategy: per round it perturbs every pose with Gaussian steps of shri
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
 from zsp_lite.verified.scene import Scene
-from zsp_lite.verified.verification import ScoreCoefficients, score_terms
+from zsp_lite.verified.verification import WEIGHTS, score_terms
 
 # Hypotheses kept from round to round, and the smallest angle between them in degrees.
 MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
@@ -22,7 +23,6 @@ _MAX_POLISHED = 3  # of these, the best that are polished
 # About this many points of the reference and of the targets are scored during the search.
 _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
 _PARENTS = 6  # steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
-Score = Callable[[Poses], Float[Tensor, " m"]]
 
 
 class SearchSchedule(NamedTuple):
@@ -41,9 +41,9 @@ FINE = SearchSchedule(rounds=5, samples=24, rotation=4.7, translation=0.08, scal
 POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
 
 
-def refine_coarse_to_fine(scene: Scene, poses: Poses, weights: ScoreCoefficients, rng: np.random.Generator) -> Poses:
+def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
-    score, fine_score = (_score_function(scene, weights, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
+    score, fine_score = (partial(_score, scene, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
@@ -52,9 +52,9 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, weights: ScoreCoefficients
 
 
 def refine(
-    poses: Poses, score: Score, schedule: SearchSchedule, rng: np.random.Generator
+    poses: Poses, score: Callable[[Poses], Float[Tensor, " _"]], schedule: SearchSchedule, rng: np.random.Generator
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """Improve every pose by random search; scales stay within `SCALE_RANGE`.
+    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores.
 
     Each round keeps the best step if it raises the score. The weighted mean of the six best steps is a candidate of
     the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
@@ -62,8 +62,7 @@ def refine(
     """
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
-    parents = min(_PARENTS, schedule.samples)
-    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
+    weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None
     for turn in range(schedule.rounds):
@@ -73,7 +72,7 @@ def refine(
         if recombined is not None:
             steps[:, 0] = recombined
         candidates = _perturb(poses, steps, schedule)
-        top_score, top = score(candidates).view(m, -1).topk(parents, dim=1)
+        top_score, top = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
         index = rows * schedule.samples + top[:, 0]
         improved = top_score[:, 0] > best_score
         mean = (steps[rows[:, None], top] * weights).sum(dim=1)
@@ -97,8 +96,8 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
 
 
-def _score_function(scene: Scene, weights: ScoreCoefficients, counts: tuple[int, int]) -> Score:
-    """Return a function that scores poses by about `counts` points of the reference and of the targets."""
+def _score(scene: Scene, counts: tuple[int, int], poses: Poses) -> Float[Tensor, " m"]:
+    """Score poses by about `counts` points of the reference and of the targets."""
     totals = len(scene.reference_points), len(scene.target_points)
     stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
-    return lambda poses: weights.score(score_terms(scene, poses, stride))
+    return WEIGHTS.score(score_terms(scene, poses, stride))

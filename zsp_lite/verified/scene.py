@@ -68,74 +68,61 @@ def build_scene(
     """Prepare the scene of a reference view and its target views."""
     first = targets[0].frame.camera
     to_camera = [_relative_pose(first, target.frame.camera) for target in targets]
-    source, *clouds = [view.measured_points[0].reshape(-1, 3) for view in (reference, *targets)]
-    source_valid, *valid = [view.known_foreground.ravel() for view in (reference, *targets)]
-    clouds = [(points - t) @ R for points, (R, t) in zip(clouds, to_camera)]
-    reference_to_working, (source_valid,) = _normalisation(
-        [source], [source_valid], reference.frame.name or "reference"
-    )
-    target_to_working, valid = _normalisation(clouds, valid, "target views")
+    source = reference.measured_points[0].reshape(-1, 3)
+    clouds = [(view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)]
+    cloud, known = np.concatenate(clouds), np.concatenate([target.known_foreground.ravel() for target in targets])
+    name = reference.frame.name or "reference"
+    reference_to_working, source_valid = _normalisation(source, reference.known_foreground.ravel(), name)
+    target_to_working, valid = _normalisation(cloud, known, "target views")
+    source, cloud = reference_to_working.apply(source), target_to_working.apply(cloud)
 
-    foregrounds = [np.asarray(target.foreground.cpu()).ravel() for target in targets]
-    starts = np.cumsum([0, *(foreground.sum() for foreground in foregrounds)])
-    columns = [_number(foreground, start) for foreground, start in zip(foregrounds, starts)]
+    starts = np.cumsum([len(one) for one in clouds])[:-1]  # of the patches of each target but the first
+    foregrounds = [target.foreground.cpu().ravel() for target in targets]
+    column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.cpu().ravel()
     between_foregrounds = [
-        similarity.cpu().float()[reference_foreground][:, torch.from_numpy(foreground)]
+        similarity.cpu().float()[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
-    view_similarities = torch.stack([view_similarity(similarity) for similarity in between_foregrounds])
+    # Of each view: each foreground patch's highest similarity in the other view, averaged in both directions.
+    best = [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
+    view_similarity = torch.stack(best)
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
-    centred = [double_centre(similarity[valid_rows]) for similarity in between_foregrounds]
 
     matched = []
-    for target, cloud, match in zip(targets, clouds, matches):
-        u, v = _matched_patches(reference, target, match)
-        matched.append(
-            (float_tensor(reference_to_working.apply(source[u])), float_tensor(target_to_working.apply(cloud[v])))
-        )
-    target_points = target_to_working.apply(np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)]))
+    for target, points, match in zip(targets, np.split(cloud, starts), matches):
+        u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
+        v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
+        both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
+        matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
+    cameras = tuple(target.frame.camera for target in targets)
     return Scene(
-        reference_points=float_tensor(reference_to_working.apply(source[source_valid])),
-        target_points=float_tensor(target_points),
-        target_column=torch.from_numpy(np.concatenate([column[chosen] for column, chosen in zip(columns, valid)])),
-        target_weight=surface_weights(float_tensor(target_points)),
-        similarity=torch.cat(centred, dim=1).contiguous(),
+        reference_points=float_tensor(source[source_valid]),
+        target_points=float_tensor(cloud[valid]),
+        target_column=torch.from_numpy(column[valid]),
+        target_weight=surface_weights(float_tensor(cloud[valid])),
+        similarity=torch.cat([double_centre(one[valid_rows]) for one in between_foregrounds], dim=1).contiguous(),
         reference_maps=build_maps(
             [reference], [(np.eye(3), np.zeros(3))], reference_to_working, [_number(source_valid)]
         ),
-        target_maps=build_maps(targets, to_camera, target_to_working, columns),
+        target_maps=build_maps(targets, to_camera, target_to_working, np.split(column, starts)),
         reference_to_working=reference_to_working,
         target_to_working=target_to_working,
-        target_cameras=tuple(target.frame.camera for target in targets),
+        target_cameras=cameras,
         matches=tuple(matched),
-        view_similarity=view_similarities - view_similarities.mean(),
-        view_span=view_span(
-            [target.frame.camera for target in targets], first.to_world(target_to_working.inverse().apply(np.zeros(3)))
-        ),
+        view_similarity=view_similarity - view_similarity.mean(),
+        view_span=view_span(cameras, first.to_world(target_to_working.inverse().t)),
     )
 
 
 def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
-    """Subtract the means of each row and each column, and add the mean of all entries.
-
-    A patch in the middle of an object is similar to most patches, one at the silhouette to few. Centring removes this
-    and leaves how much more similar a patch is to one place than to the others.
-    """
+    """Subtract the means of rows and columns, because patches amid an object are similar to most, at its rim to few."""
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
 
 
-def view_similarity(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, ""]:
-    """Average each foreground patch's highest similarity in the other view, in both directions."""
-    return (similarity.amax(dim=1).mean() + similarity.amax(dim=0).mean()) / 2
-
-
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Weight points by the inverse of a Gaussian kernel density, so that densely sampled surface does not count more.
-
-    A part of the surface that three views show has three times as many points as a part that one view shows.
-    """
+    """Weight points by the inverse of a Gaussian kernel density: what three views show has three times the points."""
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
     left, right = torch.cat([points, square], dim=1), torch.cat([points, torch.full_like(square, -0.5)], dim=1)
@@ -151,31 +138,18 @@ def _relative_pose(first: Camera, second: Camera) -> tuple[Float[np.ndarray, "3 
     return rotation, second.t - rotation @ first.t
 
 
-def _number(selected: Bool[np.ndarray, " n"], start: int | np.integer = 0) -> Int[np.ndarray, " n"]:
-    """Number the selected entries consecutively from `start`, -1 for the others."""
-    return np.where(selected, start + np.cumsum(selected) - 1, -1)
-
-
-def _matched_patches(
-    reference: View, target: View, matches: Matches
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return the flat indices of the matched patches of both views, for the matches with known depth on both sides."""
-    u = np.ravel_multi_index(tuple(matches.reference.T), reference.features.grid)
-    v = np.ravel_multi_index(tuple(matches.target.T), target.features.grid)
-    known = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
-    return u[known], v[known]
+def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Number the selected entries consecutively from 0, -1 for the others."""
+    return np.where(selected, np.cumsum(selected) - 1, -1)
 
 
 def _normalisation(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]], valid: Sequence[Bool[np.ndarray, " _"]], name: str
-) -> tuple[Sim3, list[Bool[np.ndarray, " _"]]]:
+    points: Float[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"], name: str
+) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
     """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the outliers as invalid."""
-    points = np.concatenate([cloud[chosen] for cloud, chosen in zip(clouds, valid)])
-    if len(points) < MIN_POINTS:
-        raise InputError(f"{name}: {len(points)} foreground patches of known depth, expected at least {MIN_POINTS}")
-    near = near_median(points, _OUTLIER_DISTANCE)
-    points, kept = points[near], [chosen.copy() for chosen in valid]
-    for chosen, part in zip(kept, np.split(near, np.cumsum([chosen.sum() for chosen in valid])[:-1])):
-        chosen[chosen] = part
-    mean, spread = points.mean(axis=0), standard_deviation(points)
+    if (n := int(valid.sum())) < MIN_POINTS:
+        raise InputError(f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}")
+    kept = valid.copy()
+    kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
+    mean, spread = points[kept].mean(axis=0), standard_deviation(points[kept])
     return Sim3(1 / spread, np.eye(3), -mean / spread), kept

@@ -13,7 +13,8 @@ point that is near and similar has nearly no influence. \sigma decreases geometr
 import numpy as np
 import torch
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, nearest_rotation
+from zsp_lite.alignment import nearest_rotation
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, float_tensor
 from zsp_lite.verified.scene import Scene
 
 _ITERATIONS = 6
@@ -41,7 +42,7 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         weight = weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
         source_mean, partner_mean = (weight * source).sum(dim=1), (weight * partner).sum(dim=1)
         x, y = source - source_mean[:, None], partner - partner_mean[:, None]
-        rotation = nearest_rotation((weight * y).transpose(1, 2) @ x)
+        rotation = float_tensor(nearest_rotation(((weight * y).transpose(1, 2) @ x).double().numpy())[0])
         # Soft partners are averages and have a smaller spread than the targets, so the least-squares scale would
         # shrink in each iteration. The ratio of spreads does not; half steps make it converge.
         variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / (weight * x.square()).sum(dim=(1, 2)).clamp_min(1e-9)

@@ -3,21 +3,21 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.verified.confidence import Calibration, Evidence, hypothesis_probabilities, modes, reliability_flags
+from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
 from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import propose_poses
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import TERM_NAMES, VIEWPOINT_SIGMA, ScoreCoefficients, ScoreTerms, score_terms
+from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
 
 # Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
@@ -36,19 +36,11 @@ class Solution:
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
     poses: Poses  # the hypotheses in the scene's working units
 
-    @property
-    def target_spread(self) -> float:
-        """Standard deviation of the target object's points from all views, in units of the target's scene."""
-        return 1 / self.scene.target_to_working.scale
 
-
-@dataclass(frozen=True)
 class VerifiedSolver:
     """A `estimates.Solver` that scores many poses against all target views."""
 
-    kmeans: ClassVar[bool] = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
-    weights: ScoreCoefficients = ScoreCoefficients()
-    calibration: Calibration = Calibration()
+    kmeans = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
 
     def __call__(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
@@ -61,7 +53,8 @@ class VerifiedSolver:
         (source, known), (target, seen) = (view.measured_points for view in (reference, targets[best.view]))
         u, v = tuple(matches.reference.T), tuple(matches.target.T)
         residual = np.linalg.norm(best.sim3.apply(source[u]) - target[v], axis=1)
-        inliers = known[u] & seen[v] & (residual < threshold * solution.target_spread)
+        spread = 1 / solution.scene.target_to_working.scale  # of the target's points from all views
+        inliers = known[u] & seen[v] & (residual < threshold * spread)
         return PoseEstimate(
             best.sim3, best.view, matches, inliers, -solution.view_angles,
             reference, tuple(targets), solution.timings, flags, solution.hypotheses, one_of_two,
@@ -85,40 +78,39 @@ class VerifiedSolver:
             with timed(timings, "alignment"):
                 poses = soft_icp(scene, poses)
             with timed(timings, "verification"):
-                score = self.weights.score(score_terms(scene, poses))
+                score = WEIGHTS.score(score_terms(scene, poses))
                 poses = poses[non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)]
             with timed(timings, "refinement"):
-                poses = refine_coarse_to_fine(scene, poses, self.weights, rng)
+                poses = refine_coarse_to_fine(scene, poses, rng)
             with timed(timings, "ranking"):
                 terms = score_terms(scene, poses)
-                best = non_maximum_suppression(poses.rotation, self.weights.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
+                best = non_maximum_suppression(poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 angles = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
-                hypotheses = self._hypotheses(scene, poses, terms, angles, order)
+                hypotheses = _hypotheses(scene, poses, terms, angles, order)
         view_angles = np.empty(len(order))
         view_angles[list(order)] = angles[0]
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
 
-    def _hypotheses(
-        self, scene: Scene, poses: Poses, terms: ScoreTerms, angles: Float[np.ndarray, "m v"], order: Sequence[int]
-    ) -> tuple[Hypothesis, ...]:
-        """Build the hypotheses of ranked poses, each with the view of the scene that is closest under it."""
-        views = angles.argmin(axis=1)
-        score, shape_fit = (one.score(terms).double().numpy() for one in (self.weights, self.weights.of_shape()))
-        mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-        nearness = float(np.exp(-((angles[0].min() / VIEWPOINT_SIGMA) ** 2)))
-        evidence = Evidence(
-            scene.view_span / 360, float(np.log(len(order))), nearness, scene.view_similarity_std, float(shape_fit[0])
-        )
-        confidence = hypothesis_probabilities(score, mode, evidence, self.calibration)
-        sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
-        named = [dict(zip(TERM_NAMES, row)) for row in terms.matrix().tolist()]
-        parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
-        return tuple(Hypothesis(*one) for one in zip(*parts))
+
+def _hypotheses(
+    scene: Scene, poses: Poses, terms: Float[Tensor, "m 9"], angles: Float[np.ndarray, "m v"], order: Sequence[int]
+) -> tuple[Hypothesis, ...]:
+    """Build the hypotheses of ranked poses, each with the view of the scene that is closest under it."""
+    views = angles.argmin(axis=1)
+    score, shape_fit = (one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape()))
+    mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
+    nearest, fit = float(angles[0].min()), float(shape_fit[0])
+    known = evidence(scene.view_span, len(order), nearest, scene.view_similarity_std, fit)
+    deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)  # of different poses
+    confidence = Calibration().probabilities(deficit, known)[mode]
+    sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
+    named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
+    parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
+    return tuple(Hypothesis(*one) for one in zip(*parts))
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
-    content = (target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets)
-    keys = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
-    return tuple(sorted(range(len(targets)), key=keys.__getitem__))
+    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+    return tuple(sorted(range(len(targets)), key=lambda k: hashlib.blake2b(content[k], digest_size=16).digest()))

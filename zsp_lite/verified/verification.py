@@ -53,33 +53,6 @@ _SIMILARITY_PRIOR = 0.5  # kappa
 _CHUNK = 250_000  # projected points at a time, so that intermediate results stay in the processor's cache
 
 
-@dataclass(frozen=True, eq=False)
-class ScoreTerms:
-    """The terms of m poses as (m,) tensors. A correct pose has low silhouettes and free space, high others."""
-
-    forward_similarity: Float[Tensor, " m"]
-    forward_overlap: Float[Tensor, " m"]
-    forward_silhouette: Float[Tensor, " m"]
-    forward_free_space: Float[Tensor, " m"]
-    reverse_similarity: Float[Tensor, " m"]
-    reverse_overlap: Float[Tensor, " m"]
-    reverse_silhouette: Float[Tensor, " m"]
-    reverse_free_space: Float[Tensor, " m"]
-    viewpoint: Float[Tensor, " m"]
-
-    def __getitem__(self, index) -> "ScoreTerms":
-        """Select the terms of some poses by an index array, slice or mask."""
-        return ScoreTerms(*(getattr(self, name)[index] for name in TERM_NAMES))
-
-    def matrix(self) -> Float[Tensor, "m terms"]:
-        """Return the terms as a matrix with one column per term, in the order of `TERM_NAMES`."""
-        return torch.stack([getattr(self, name) for name in TERM_NAMES], dim=1)
-
-
-TERM_NAMES = tuple(field.name for field in fields(ScoreTerms))
-FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")  # the other terms compare shapes
-
-
 @dataclass(frozen=True)
 class ScoreCoefficients:
     """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
@@ -94,13 +67,18 @@ class ScoreCoefficients:
     reverse_free_space: float = -16.6
     viewpoint: float = 18.2
 
-    def score(self, terms: ScoreTerms) -> Float[Tensor, " m"]:
+    def score(self, terms: Float[Tensor, "m 9"]) -> Float[Tensor, " m"]:
         """Return the scores of m poses: the weighted sums of their terms, higher is better."""
-        return terms.matrix() @ torch.tensor(astuple(self), dtype=torch.float32)
+        return terms @ torch.tensor(astuple(self), dtype=torch.float32)
 
     def of_shape(self) -> "ScoreCoefficients":
         """Return the weights of the terms that compare shapes; those of `FEATURE_TERMS` are 0."""
         return replace(self, **dict.fromkeys(FEATURE_TERMS, 0.0))
+
+
+TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
+FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")  # the other terms compare shapes
+WEIGHTS = ScoreCoefficients()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,40 +102,36 @@ class PointTerms:
         yield (self.free_space @ q).mean(dim=1)
 
 
-def forward_terms(scene: Scene, poses: Poses, rows: Int[Tensor, " n"] | None = None) -> PointTerms:
-    """Project the reference points (or those at the indices `rows`) into all target views."""
-    rows = torch.arange(len(scene.reference_points)) if rows is None else rows
-    projection = project_points(scene.target_maps, poses.linear, poses.translation, scene.reference_points[rows])
-    return _point_terms(scene, projection, rows * scene.similarity.shape[1], 1)
+def forward_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
+    """Project every `stride`-th reference point into all target views."""
+    points = scene.reference_points[::stride]
+    projection = project_points(scene.target_maps, poses.linear, poses.translation, points)
+    n, columns = scene.similarity.shape
+    return _point_terms(scene, projection, torch.arange(0, n, stride) * columns, 1)
 
 
-def reverse_terms(scene: Scene, poses: Poses, indices: Int[Tensor, " n"] | None = None) -> PointTerms:
-    """Project the target points (or those at `indices`) into the reference view, by the inverse poses."""
-    indices = torch.arange(len(scene.target_points)) if indices is None else indices
-    inverse = poses.inverse()
-    projection = project_points(scene.reference_maps, inverse.linear, inverse.translation, scene.target_points[indices])
-    return _point_terms(scene, projection, scene.target_column[indices], scene.similarity.shape[1])
+def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
+    """Project every `stride`-th target point into the reference view, by the inverse poses."""
+    inverse, points = poses.inverse(), scene.target_points[::stride]
+    projection = project_points(scene.reference_maps, inverse.linear, inverse.translation, points)
+    return _point_terms(scene, projection, scene.target_column[::stride], scene.similarity.shape[1])
 
 
-def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> ScoreTerms:
-    """Compute the terms of every pose."""
-    rows = torch.arange(0, len(scene.reference_points), stride[0])
-    indices = torch.arange(0, len(scene.target_points), stride[1])
-    size = max(_CHUNK // (len(rows) * len(scene.target_maps) + len(indices)), 1)
-    reference_weights, target_weights = torch.ones(len(rows)), scene.target_weight[indices]
+def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> Float[Tensor, "m 9"]:
+    """Compute the terms of every pose, a column per term in the order of `TERM_NAMES`, on a part of the points."""
+    target_weights = scene.target_weight[:: stride[1]]
+    reference_weights = torch.ones(len(scene.reference_points[:: stride[0]]))
+    size = max(_CHUNK // (len(reference_weights) * len(scene.target_cameras) + len(target_weights)), 1)
     chunks = []
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
-        forward, reverse = forward_terms(scene, some, rows), reverse_terms(scene, some, indices)
+        forward, reverse = forward_terms(scene, some, stride[0]), reverse_terms(scene, some, stride[1])
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
-    return ScoreTerms(*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses))
+    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses)], dim=1)
 
 
 def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the viewpoint term: high if the views from near the reference's viewpoint are the most similar to it.
-
-    The angle includes rotation about the line of sight, because features change with it.
-    """
+    """Compute the viewpoint term; its angle includes rotation about the line of sight, with which features change."""
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
     return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
 
