@@ -1,5 +1,6 @@
 """Synthetic data: exports read like CO3D; labels, cameras and depth agree with the geometry."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from zsp_lite.synthetic.assembly import make_shape, surface_spread
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.export import PRESETS, export_categories, make_sequence
 from zsp_lite.synthetic.recording import shape_turns
-from zsp_lite.synthetic.sensor import soft_mask
+from zsp_lite.synthetic.sensor import soft_mask, stereo_depth
 from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep
 
 PAPER = tuple(
@@ -103,6 +104,8 @@ def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels
             to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
             wrong = (frame.mask > 0.5) != view.mask
             assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
+    edge_on = replace(chairs[0][1].views[0], mask=np.zeros_like(chairs[0][1].views[0].mask))  # of a flat object
+    assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, np.random.default_rng(0))).all()
 
 
 def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):

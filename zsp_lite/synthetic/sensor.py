@@ -38,7 +38,7 @@ def stereo_depth(
     for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
-    near = np.median(view.depth[view.mask])
+    near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf  # a flat object may be seen edge-on
     noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(view.mask.shape)
     noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
@@ -69,7 +69,7 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     distance -= np.where(mask, 0.5, -0.5)
     wander = np.clip(0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape)), -1.5, 1.5)
-    return (1 / (1 + np.exp(-np.clip((distance + wander) / 0.7, -20, 20)))).astype(np.float32)
+    return (1 / (1 + np.exp(-np.clip(distance + wander, -14, 14) / 0.7))).astype(np.float32)
 
 
 def fused_cloud(
