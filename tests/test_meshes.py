@@ -7,10 +7,9 @@ from model_files import wedge, write_quad, write_wedge
 
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import meshes
-from zsp_lite.synthetic.assembly import surface_spread
 from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo, list_models
-from zsp_lite.synthetic.primitives import box
+from zsp_lite.synthetic.primitives import box, surface_spread
 from zsp_lite.synthetic.textures import srgb_to_linear
 
 CHECKS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from model_files import painted, studio, view, wedge, write_quad
 
-from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
 from zsp_lite.synthetic.models import ModelInfo
 from zsp_lite.synthetic.raytracing import MeshScene
+from zsp_lite.synthetic.room import RoomLight
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training.renders import framed_camera
 

@@ -13,11 +13,13 @@ from zsp_lite.alignment import umeyama
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import InputError
+from zsp_lite.io.files import stable_hash
 from zsp_lite.synthetic import export
-from zsp_lite.synthetic.assembly import make_shape, surface_spread
+from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.export import PRESETS, export_categories, make_sequence
-from zsp_lite.synthetic.recording import shape_turns
+from zsp_lite.synthetic.export import PRESETS, export_categories, make_object, sequence_name
+from zsp_lite.synthetic.primitives import surface_spread
+from zsp_lite.synthetic.recording import record_sequence, shape_turns
 from zsp_lite.synthetic.sensor import soft_mask, stereo_depth
 from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep
 
@@ -40,7 +42,16 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def chairs():
     """Two chairs with simulated sensor errors, each with its exact rendering."""
-    return [make_sequence("chair", index, FRAMES, SEED, SIZE) for index in range(2)]
+    return [
+        record_sequence(
+            make_object("chair", index, SEED),
+            sequence_name(SEED, "chair", index),
+            stable_hash(f"{SEED}/chair/{index}"),
+            FRAMES,
+            SIZE,
+        )  # fmt: skip
+        for index in range(2)
+    ]
 
 
 # Categories
@@ -163,18 +174,18 @@ def test_labels_give_the_transform_between_the_canonical_frames(folder, chairs):
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):
     made = []
 
-    def interrupt_second(category, index, *rest):
-        if made == [0]:
+    def interrupt_second(mesh, name, *rest):
+        if len(made) == 1:
             made.append("interrupted")
             raise KeyboardInterrupt
-        made.append(index)
-        return make_sequence(category, index, *rest)
+        made.append(name)
+        return record_sequence(mesh, name, *rest)
 
-    monkeypatch.setattr(export, "make_sequence", interrupt_second)
+    monkeypatch.setattr(export, "record_sequence", interrupt_second)
     with pytest.raises(KeyboardInterrupt):
         export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
     export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-    assert made == [0, "interrupted", 1]
+    assert made == [sequence_name(1, "mouse", 0), "interrupted", sequence_name(1, "mouse", 1)]
     export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from zsp_lite.synthetic.primitives import Mesh, joined
+from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread
 
 N_MATERIALS = 8
 
@@ -59,15 +59,6 @@ class Assembly:
 
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
-
-
-def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
-    middle = (a + b + c) / 3
-    mean = (middle * area).sum(0) / area.sum()
-    return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
 
 
 def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> Shape:

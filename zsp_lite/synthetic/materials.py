@@ -59,14 +59,11 @@ def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Mater
     return tuple(_random_material(_KINDS[kind], rng) for kind in kinds)
 
 
-def with_materials(
-    shape: Shape, materials: tuple[Material, ...], vertices: Float[np.ndarray, "v 3"] | None = None
-) -> TexturedMesh:
-    """Return the mesh of a shape with materials; `vertices` replaces those of the shape, for a deformed copy."""
-    vertices, n = shape.vertices if vertices is None else vertices, len(shape.faces)
+def with_materials(shape: Shape, materials: tuple[Material, ...]) -> TexturedMesh:
+    """Return the mesh of a shape with materials."""
+    n, normals = len(shape.faces), smooth_normals(shape.vertices, shape.faces)
     uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
-    normals = smooth_normals(vertices, shape.faces)
-    return TexturedMesh(vertices, shape.faces, normals, uv, white, shape.material, materials)
+    return TexturedMesh(shape.vertices, shape.faces, normals, uv, white, shape.material, materials)
 
 
 def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:

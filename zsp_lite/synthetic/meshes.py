@@ -10,8 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import file_size, read_bytes
-from zsp_lite.synthetic.assembly import surface_spread
-from zsp_lite.synthetic.primitives import joined
+from zsp_lite.synthetic.primitives import joined, surface_spread
 from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")

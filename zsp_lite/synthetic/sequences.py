@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import random_room
+from zsp_lite.synthetic.room import RoomLight, random_room
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 HEIGHTS = (19.0, 30.0)  # lowest and highest mean elevation of a sequence's cameras above the object, degrees

@@ -12,11 +12,10 @@ from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.assembly import make_shape
-from zsp_lite.synthetic.lighting import RoomLight
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import random_room
+from zsp_lite.synthetic.room import RoomLight, random_room
 from zsp_lite.training.random_object import build_random_object
 
 ROOMS, SHARING = 8, 100  # so many rooms for so many consecutive objects: a room takes five times as long as a view
@@ -29,7 +28,7 @@ def make_instance(number: int, rng: np.random.Generator) -> tuple[TexturedMesh, 
     """
     shape = make_shape(build_random_object, [number, 1])
     instance = make_shape(build_random_object, [number, 1], variation=rng)
-    return with_materials(shape, random_materials(rng), instance.vertices), shape.vertices
+    return with_materials(instance, random_materials(rng)), shape.vertices
 
 
 def render_instance(
