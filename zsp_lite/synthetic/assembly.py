@@ -48,10 +48,7 @@ class Assembly:
         return int(self.rng.integers(n))
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part; with `mirror`, also its mirror image in the plane y = 0.
-
-        Parts of one number, 0 .. 7, share a material of random look (`materials.random_materials`), and nothing else.
-        """
+        """Add a part of material 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:

@@ -77,18 +77,22 @@ class MeshScene:
         self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
         self._properties = np.array([[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32)
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
-        self._texture_scale = np.sqrt(
-            uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12)
-        )  # lengths of the texture per unit, by face
+        # Lengths of the texture per unit, by face.
+        self._texture_scale = np.sqrt(uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12))
         self._shadow, self._shadow_width = self._shadow_on_the_floor()
         self._gain: float | None = None
 
     def render(self, camera: Camera) -> Rendering:
         """Render one view; the exposure is measured on the first view and varies little after it."""
         rays = _pixel_rays(camera, 1)
-        radiance, floor_depth = self._background(camera, rays)
+        radiance, depth = self._background(camera, rays)
         hits = self._cast(camera.centre, rays)
-        exact = self._exact(camera, rays, hits, floor_depth)
+        pixel = np.unravel_index(hits.ray, camera.size)
+        mask, normals = np.zeros(camera.size, bool), np.zeros((*camera.size, 3), np.float32)
+        canonical = np.full_like(normals, np.nan)
+        mask[pixel], depth[pixel] = True, hits.distance  # rays have unit z in the camera frame
+        canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
+        normals[pixel] = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]) @ camera.R.T.astype(np.float32)
         if self._samples > 1:
             rays = _pixel_rays(camera, self._samples)
             hits = self._cast(camera.centre, rays)
@@ -97,7 +101,7 @@ class MeshScene:
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
-        return Rendering(rgb=rgb, camera=camera, **exact)
+        return Rendering(rgb, depth, mask, canonical, normals, camera)
 
     # Geometry
 
@@ -137,19 +141,6 @@ class MeshScene:
         n, count = directions.shape[:2]
         blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
         return 1 - blocked.astype(np.float32) / np.float32(count)
-
-    def _exact(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits, floor_depth: Float[np.ndarray, "h w"]
-    ) -> dict:
-        """Return depth, mask, object coordinates and normals of the pixels."""
-        depth, mask = floor_depth.copy(), np.zeros(camera.size, bool)
-        canonical, normals = np.full((*camera.size, 3), np.nan, np.float32), np.zeros((*camera.size, 3), np.float32)
-        pixel = np.unravel_index(hits.ray, camera.size)
-        mask[pixel] = True
-        depth[pixel] = hits.distance  # rays have unit z in the camera frame
-        canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
-        normals[pixel] = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]) @ camera.R.T.astype(np.float32)
-        return {"depth": depth, "mask": mask, "canonical": canonical, "normals": normals}
 
     # Shading
 
@@ -236,11 +227,6 @@ class MeshScene:
         around = self._visible_share(point, towards_room).reshape(n, n)
         return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
 
-    def shadow(self, point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 n"]:
-        """Return the visible shares of the key light and of the room at floor points, relative to the room's origin."""
-        u, v = (point / self._shadow_width + 0.5).T
-        return sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT).T
-
     def _background(
         self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
@@ -248,8 +234,9 @@ class MeshScene:
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
         radiance, reach = self.lighting.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
-        shares = self.shadow((eye + reach[floor, None] * flat_rays[floor])[:, :2])
-        radiance[floor] *= self.lighting.on_the_floor(*shares)
+        u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T
+        shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
+        radiance[floor] *= self.lighting.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
