@@ -19,9 +19,8 @@ from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.export import PRESETS, export_categories, make_object, sequence_name
 from zsp_lite.synthetic.primitives import surface_spread
-from zsp_lite.synthetic.recording import record_sequence, shape_turns
-from zsp_lite.synthetic.sensor import soft_mask, stereo_depth
-from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep
+from zsp_lite.synthetic.recording import shape_turns
+from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep, record_sequence, soft_mask, stereo_depth
 
 PAPER = tuple(
     "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse "

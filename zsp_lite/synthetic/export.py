@@ -16,8 +16,8 @@ from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.models import list_models
-from zsp_lite.synthetic.recording import read_poses, record_sequence, write_labels, write_pairs, write_sequence
-from zsp_lite.synthetic.sequences import HEIGHTS
+from zsp_lite.synthetic.recording import read_poses, write_labels, write_pairs, write_sequence
+from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
 RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence
@@ -101,21 +101,9 @@ def sequence_name(seed: int, category: str, index: int) -> str:
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
-class ModelRecord(msgspec.Struct, frozen=True):
-    """Origin of a rendered sequence, as `rendered_models.json` holds it; `rotation` is that to the canonical frame."""
-
-    file: str
-    sha256: str
-    rotation: tuple[float, ...]
-    author: str
-    licence: str
-    source: str
-    changes: str
-
-
 class _Rendered(msgspec.Struct):
     settings: dict[str, int | str]
-    sequences: dict[str, dict[str, ModelRecord]]
+    sequences: dict[str, dict[str, dict]]  # the origin of each rendered sequence, by category and name
 
 
 def export_models(
@@ -145,10 +133,12 @@ def export_models(
     elif out.is_dir() and Co3D(out).categories():
         raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
     for model in progress(models):
-        info, file = model.info, model.path.relative_to(folder).as_posix()
-        rotation = tuple(np.round(info.axes(model.path.suffix), 9).ravel().tolist())
-        origin = (info.author, info.licence, info.source, info.changes)
-        record = ModelRecord(file, sha256(model.path, "model"), rotation, *origin)
+        record = {
+            "file": model.path.relative_to(folder).as_posix(),
+            "sha256": sha256(model.path, "model"),
+            "rotation": np.round(model.info.axes(model.path.suffix), 9).ravel().tolist(),  # to the canonical frame
+            **{name: getattr(model.info, name) for name in ("author", "licence", "source", "changes")},
+        }
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
             continue
