@@ -11,10 +11,9 @@ from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.sequences import orbit_pose
+from zsp_lite.training import renders as rendering
 from zsp_lite.training.batches import crop_grids, sample_batch
-from zsp_lite.training.instances import render_instance
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, losses
-from zsp_lite.training.random_object import build_random_object
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, framed_camera, render_object, render_set
 from zsp_lite.training.trainee import Trainee, as_trainee, initial_backbone
 
@@ -145,7 +144,7 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
     camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
     meshes = (with_materials(replace(shape, vertices=copy), random_materials(seed)) for seed in (0, 1))
     one, two = (
-        render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
+        rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
         for seed, mesh in enumerate(meshes)
     )
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
@@ -158,8 +157,8 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
 def test_variants_keep_the_parts_and_change_the_proportions():
     """Vertex i of a variant is the same point of the same part, so that correspondences are known."""
     for seed in range(30):
-        first = make_shape(build_random_object, seed)
-        other = make_shape(build_random_object, seed, variation=np.random.default_rng(1))
+        first = make_shape(rendering.build_random_object, seed)
+        other = make_shape(rendering.build_random_object, seed, variation=np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
         np.testing.assert_array_equal(first.material, other.material)
         assert np.abs(first.vertices - other.vertices).max() > 0.02
