@@ -14,7 +14,7 @@ from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training import renders as rendering
 from zsp_lite.training.batches import crop_grids, sample_batch
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, losses
-from zsp_lite.training.renders import GRID, SIZE, VIEWS, framed_camera, render_object, render_set
+from zsp_lite.training.renders import GRID, SIZE, VIEWS, render_object, render_set
 from zsp_lite.training.trainee import Trainee, as_trainee, initial_backbone
 
 pytestmark = pytest.mark.slow
@@ -24,16 +24,6 @@ pytestmark = pytest.mark.slow
 def renders():
     """The renders of four training objects."""
     return render_set(range(4))
-
-
-def fourier(surface, seed=0):
-    """Descriptors that know the surface point exactly; background patches get noise."""
-    generator = torch.Generator().manual_seed(seed)
-    waves = torch.randn(3, 32, generator=generator) * 3
-    phase = surface.nan_to_num(0) @ waves
-    known = F.normalize(torch.cat([phase.sin(), phase.cos()], -1), dim=-1)
-    noise = F.normalize(torch.randn(known.shape, generator=generator), dim=-1)
-    return torch.where(surface[..., :1].isnan(), noise, known)
 
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
@@ -101,28 +91,30 @@ def test_normals_turn_and_flip_with_the_crop(renders):
         assert nearest.max() < 1e-3
 
 
-def test_perfect_descriptors_match_and_random_ones_do_not(renders):
-    batch = sample_batch(renders, np.random.default_rng(1), 2, VIEWS, 96, (0.8, 1.0))
+def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formula():
+    """Two views of the same 24 places, far from each other; each place has a key of its own."""
+    places, keys = torch.arange(72.0).view(24, 3).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
 
     def loss(descriptors):
-        return correspondence_loss(descriptors, batch.surface, 2, 0.15, 0.1, 256, torch.Generator().manual_seed(0))
+        return correspondence_loss(descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0))
 
-    perfect, accuracy = loss(fourier(batch.surface))
-    noise, chance = loss(F.normalize(torch.randn(batch.surface.shape[:2] + (64,)), dim=-1))
-    assert accuracy > 0.9 > 0.2 > chance
-    assert 0 <= perfect < 0.5 * noise
+    normaliser = np.log(np.exp(10) + 23)  # of a softmax over 24 similarities, 1 / 0.1 and zeros
+    right, accuracy = loss(keys)
+    assert (float(right), accuracy) == (pytest.approx(normaliser - 10, abs=1e-5), 1)
+    keys[1] = keys[1].roll(1, 0)
+    wrong, accuracy = loss(keys)
+    assert (float(wrong), accuracy) == (pytest.approx(normaliser, abs=1e-5), 0)
 
 
-def test_no_object_is_compared_with_another(renders):
+def test_no_object_is_compared_with_another():
     """The loss of two objects is the mean of the losses of each alone."""
-    batch = sample_batch(renders, np.random.default_rng(2), 2, VIEWS, 96, (0.8, 1.0), members=np.array([0, 1]))
-    z = fourier(batch.surface)
-    full = dict(radius=0.15, temperature=0.1, queries=10**6)
-    both = correspondence_loss(z, batch.surface, 2, generator=torch.Generator(), **full)[0]
-    alone = [
-        correspondence_loss(z[part], batch.surface[part], 1, generator=torch.Generator(), **full)[0]
-        for part in (slice(0, VIEWS), slice(VIEWS, 2 * VIEWS))
-    ]
+    generator = torch.Generator().manual_seed(0)
+    z = F.normalize(torch.randn(16, 9, 32, generator=generator), dim=-1)
+    surface = 0.3 * torch.randn(16, 9, 3, generator=generator)
+    full = dict(radius=0.15, temperature=0.1, queries=10**6, generator=generator)
+    both = correspondence_loss(z, surface, 2, **full)[0]
+    alone = [correspondence_loss(z[part], surface[part], 1, **full)[0] for part in (slice(8), slice(8, 16))]
+    assert both > 0
     torch.testing.assert_close(both, torch.stack(alone).mean())
 
 
@@ -141,7 +133,7 @@ def test_losses_of_crops_without_an_object_are_zero_not_nan():
 def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room_and_materials():
     shape, factors, offset = make_shape(CATEGORIES["chair"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
-    camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
+    camera = rendering.framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
     meshes = (with_materials(replace(shape, vertices=copy), random_materials(seed)) for seed in (0, 1))
     one, two = (
         rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
