@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training import renders as rendering
 from zsp_lite.training.batches import crop_grids, sample_batch
@@ -134,7 +134,7 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
     shape, factors, offset = make_shape(CATEGORIES["chair"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
     camera = rendering.framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
-    meshes = (with_materials(replace(shape, vertices=copy), random_materials(seed)) for seed in (0, 1))
+    meshes = (replace(shape, vertices=copy, materials=random_materials(seed)) for seed in (0, 1))
     one, two = (
         rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
         for seed, mesh in enumerate(meshes)

@@ -1,23 +1,11 @@
 """Objects composed of primitives: parts with materials, in one coordinate frame and of unit size."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from zsp_lite.synthetic.meshes import TexturedMesh, smooth_normals
 from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread
-
-N_MATERIALS = 8
-
-
-@dataclass(frozen=True)
-class Shape:
-    """The mesh of one object: its bounding box is centred at the origin, its `surface_spread` is 1."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    material: Int[np.ndarray, " f"]
 
 
 class Assembly:
@@ -58,10 +46,11 @@ class Assembly:
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
 
 
-def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> Shape:
+def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> TexturedMesh:
     """Return the object that `build` composes, with other proportions if `variation` is given (see `Assembly`).
 
-    Vertex i stays the same point of the same part, if the parts depend on the builder's choices only.
+    Its bounding box is centred at the origin, its `surface_spread` is 1, and its materials are not drawn yet. Vertex i
+    stays the same point of the same part, if the parts depend on the builder's choices only.
     """
     assembly = Assembly(np.random.default_rng(seed), variation)
     build(assembly)
@@ -69,4 +58,6 @@ def make_shape(build: Builder, seed: int | list[int], variation: np.random.Gener
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
     vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))  # a small random scale along each axis
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
-    return Shape(vertices / surface_spread(vertices, faces), faces, material)
+    vertices, n = vertices / surface_spread(vertices, faces), len(faces)
+    uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
+    return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, white, material)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -13,7 +13,7 @@ from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.recording import read_poses, write_labels, write_pairs, write_sequence
@@ -92,7 +92,7 @@ def export_categories(
 def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = _key(seed, category, index)
-    return with_materials(make_shape(builders[category], [key, 0]), random_materials([key, 3]))
+    return replace(make_shape(builders[category], [key, 0]), materials=random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:

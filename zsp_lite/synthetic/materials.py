@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.synthetic.assembly import N_MATERIALS, Shape
-from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
+from zsp_lite.synthetic.meshes import Material
 from zsp_lite.synthetic.textures import hsv
 
 
@@ -53,17 +52,10 @@ class WavePattern:
 
 
 def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Material, ...]:
-    """Draw the materials of one object."""
+    """Draw the materials 0 .. 7 of one object."""
     rng = np.random.default_rng(seed)
-    kinds = rng.choice(len(_KINDS), N_MATERIALS, p=[kind.share for kind in _KINDS])
+    kinds = rng.choice(len(_KINDS), 8, p=[kind.share for kind in _KINDS])
     return tuple(_random_material(_KINDS[kind], rng) for kind in kinds)
-
-
-def with_materials(shape: Shape, materials: tuple[Material, ...]) -> TexturedMesh:
-    """Return the mesh of a shape with materials."""
-    n, normals = len(shape.faces), smooth_normals(shape.vertices, shape.faces)
-    uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
-    return TexturedMesh(shape.vertices, shape.faces, normals, uv, white, shape.material, materials)
 
 
 def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:

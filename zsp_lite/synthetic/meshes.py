@@ -43,7 +43,7 @@ class TexturedMesh:
     uv: Float[np.ndarray, "f 3 2"]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
     colours: Float[np.ndarray, "f 3 3"]  # sRGB in [0, 1] of each corner, a factor of the material's colour
     material: Int[np.ndarray, " f"]  # index of each face
-    materials: tuple[Material, ...]
+    materials: tuple[Material, ...] = ()
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:

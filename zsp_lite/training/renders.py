@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.synthetic.assembly import Assembly, make_shape
-from zsp_lite.synthetic.materials import random_materials, with_materials
+from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
@@ -58,7 +58,7 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(0, 0.9)
         instance = make_shape(build_random_object, [number, 1], variation=rng)
-        mesh = with_materials(instance, random_materials(rng))
+        mesh = replace(instance, materials=random_materials(rng))
         R, t = orbit_pose(
             azimuth=azimuth + (view % 2 - 0.5) * apart,
             elevation=np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1),
