@@ -97,18 +97,20 @@ def test_normals_turn_and_flip_with_the_crop(renders):
 
 
 def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formula():
-    """Two views of the same 24 places, far from each other; each place has a key of its own."""
-    places, keys = torch.arange(72.0).view(24, 3).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
+    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each place has its own key."""
+    line = 0.15 * (3.5 * torch.arange(12)[:, None] + torch.tensor([0, 1])).flatten()
+    places, keys = F.pad(line[:, None], (0, 2)).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
 
     def loss(descriptors):
         return correspondence_loss(descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0))
 
-    normaliser = np.log(np.exp(10) + 23)  # of a softmax over 24 similarities, 1 / 0.1 and zeros
+    target = np.array([1, np.exp(-0.5)]) / (1 + np.exp(-0.5))  # of the place itself and of its neighbour
+    constant = (target * np.log(target)).sum() + np.log(np.exp(10) + 23)  # similarities divided by 0.1, and zeros
     right, accuracy = loss(keys)
-    assert (float(right), accuracy) == (pytest.approx(normaliser - 10, abs=1e-5), 1)
-    keys[1] = keys[1].roll(1, 0)
+    assert (float(right), accuracy) == (pytest.approx(constant - 10 * target[0], abs=1e-4), 1)
+    keys[1] = keys[1].roll(2, 0)
     wrong, accuracy = loss(keys)
-    assert (float(wrong), accuracy) == (pytest.approx(normaliser, abs=1e-5), 0)
+    assert (float(wrong), accuracy) == (pytest.approx(constant, abs=1e-4), 0)
 
 
 def test_no_object_is_compared_with_another():
