@@ -10,9 +10,8 @@ import torch
 import torch.nn.functional as F
 
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.synthetic.assembly import make_shape
+from zsp_lite.synthetic.assembly import make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.sequences import orbit_pose
 from zsp_lite.training import distillation
 from zsp_lite.training import renders as rendering
@@ -97,7 +96,7 @@ def test_normals_turn_and_flip_with_the_crop(renders):
 
 
 def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formula():
-    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each place has its own key."""
+    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each has its own key."""
     line = 0.15 * (3.5 * torch.arange(12)[:, None] + torch.tensor([0, 1])).flatten()
     places, keys = F.pad(line[:, None], (0, 2)).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
 

@@ -11,9 +11,8 @@ import numpy as np
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
-from zsp_lite.synthetic.assembly import Builder, make_shape
+from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.models import list_models
 from zsp_lite.synthetic.recording import read_poses, write_labels, write_pairs, write_sequence

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.assembly import Assembly, make_shape
-from zsp_lite.synthetic.materials import random_materials
+from zsp_lite.synthetic.assembly import Assembly, make_shape, random_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
