@@ -243,10 +243,6 @@ def backbone() -> VisionTransformer:
     return model
 
 
-def weights(run: Distillation) -> list[torch.Tensor]:
-    return [run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()]
-
-
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
     rng = np.random.default_rng(0)
     student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
@@ -321,5 +317,6 @@ def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was
     runs = [Distillation(replace(TINY, seed=seed), backbone, pictures) for seed in (0, 0, 1)]
     figures = [[run.step() for _ in range(3)] for run in runs]
     assert figures[0] == figures[1] != figures[2]
-    assert all(torch.equal(a, b) for a, b in zip(weights(runs[0]), weights(runs[1]), strict=True))
+    weights = [[run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()] for run in runs]
+    assert all(torch.equal(a, b) for a, b in zip(weights[0], weights[1], strict=True))
     assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())
