@@ -179,13 +179,9 @@ with (TOOLS / "concepts.csv").open(newline="") as _file:
 SIDE_OF = {row["name"]: row["side"] for row in ROWS}
 
 
-def test_no_name_is_listed_twice_and_every_side_is_known():
-    assert len(SIDE_OF) == len(ROWS)
+def test_no_name_is_listed_twice_and_no_concept_is_on_two_sides():
+    assert len(SIDE_OF) == len(ROWS) and all(row["name"] and row["concept"] for row in ROWS)
     assert set(SIDE_OF.values()) == {"training", "validation", "evaluation"}
-    assert all(row["name"] and row["concept"] for row in ROWS)
-
-
-def test_no_concept_is_on_two_sides():
     side_of_concept = {row["concept"]: row["side"] for row in ROWS}
     assert [row for row in ROWS if row["side"] != side_of_concept[row["concept"]]] == []
 

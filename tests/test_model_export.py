@@ -16,9 +16,9 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.samples import REPOSITORY
-from zsp_lite.synthetic import model_export
+from zsp_lite.synthetic import export
+from zsp_lite.synthetic.export import RENDERED_FILE, export_models
 from zsp_lite.synthetic.ground_truth import ground_truth_pair, object_poses
-from zsp_lite.synthetic.model_export import RENDERED_FILE, export_models
 
 FRAMES, SIZE = 5, 64
 SETTINGS = {"frames": FRAMES, "seed": 3, "image_size": SIZE}
@@ -76,13 +76,13 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
 
 
 def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path, monkeypatch):
-    rendered, record_sequence = [], model_export.record_sequence
+    rendered, record_sequence = [], export.record_sequence
 
     def counting(mesh, name, *rest):
         rendered.append(name)
         return record_sequence(mesh, name, *rest)
 
-    monkeypatch.setattr(model_export, "record_sequence", counting)
+    monkeypatch.setattr(export, "record_sequence", counting)
     out = tmp_path / "data"
     shutil.copytree(data[0].root, out)
     before = read_labels(out, "chair")["low"].trans

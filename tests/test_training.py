@@ -1,19 +1,24 @@
-"""Training data and losses: renders of one object at a time, batches with their geometry, three losses, a short run."""
+"""Training: renders of one object at a time, batches with their geometry, three losses; self-distillation."""
+
+import copy
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
-from zsp_lite.synthetic.assembly import make_shape
+from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.synthetic.assembly import make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials, with_materials
 from zsp_lite.synthetic.sequences import orbit_pose
+from zsp_lite.training import distillation
+from zsp_lite.training import renders as rendering
 from zsp_lite.training.batches import crop_grids, sample_batch
-from zsp_lite.training.instances import render_instance
+from zsp_lite.training.distillation import Distillation, DistillationConfig, distillation_loss, multi_crop
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, geometry_loss, losses
-from zsp_lite.training.random_object import build_random_object
-from zsp_lite.training.renders import GRID, SIZE, VIEWS, framed_camera, render_object, render_set
+from zsp_lite.training.renders import GRID, SIZE, VIEWS, render_object, render_set
 from zsp_lite.training.trainee import Trainee, as_trainee, initial_backbone
 
 pytestmark = pytest.mark.slow
@@ -23,16 +28,6 @@ pytestmark = pytest.mark.slow
 def renders():
     """The renders of four training objects."""
     return render_set(range(4))
-
-
-def fourier(surface, seed=0):
-    """Descriptors that know the surface point exactly; background patches get noise."""
-    generator = torch.Generator().manual_seed(seed)
-    waves = torch.randn(3, 32, generator=generator) * 3
-    phase = surface.nan_to_num(0) @ waves
-    known = F.normalize(torch.cat([phase.sin(), phase.cos()], -1), dim=-1)
-    noise = F.normalize(torch.randn(known.shape, generator=generator), dim=-1)
-    return torch.where(surface[..., :1].isnan(), noise, known)
 
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
@@ -100,28 +95,32 @@ def test_normals_turn_and_flip_with_the_crop(renders):
         assert nearest.max() < 1e-3
 
 
-def test_perfect_descriptors_match_and_random_ones_do_not(renders):
-    batch = sample_batch(renders, np.random.default_rng(1), 2, VIEWS, 96, (0.8, 1.0))
+def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formula():
+    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each has its own key."""
+    line = 0.15 * (3.5 * torch.arange(12)[:, None] + torch.tensor([0, 1])).flatten()
+    places, keys = F.pad(line[:, None], (0, 2)).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
 
     def loss(descriptors):
-        return correspondence_loss(descriptors, batch.surface, 2, 0.15, 0.1, 256, torch.Generator().manual_seed(0))
+        return correspondence_loss(descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0))
 
-    perfect, accuracy = loss(fourier(batch.surface))
-    noise, chance = loss(F.normalize(torch.randn(batch.surface.shape[:2] + (64,)), dim=-1))
-    assert accuracy > 0.9 > 0.2 > chance
-    assert 0 <= perfect < 0.5 * noise
+    target = np.array([1, np.exp(-0.5)]) / (1 + np.exp(-0.5))  # of the place itself and of its neighbour
+    constant = (target * np.log(target)).sum() + np.log(np.exp(10) + 23)  # similarities divided by 0.1, and zeros
+    right, accuracy = loss(keys)
+    assert (float(right), accuracy) == (pytest.approx(constant - 10 * target[0], abs=1e-4), 1)
+    keys[1] = keys[1].roll(2, 0)
+    wrong, accuracy = loss(keys)
+    assert (float(wrong), accuracy) == (pytest.approx(constant, abs=1e-4), 0)
 
 
-def test_no_object_is_compared_with_another(renders):
+def test_no_object_is_compared_with_another():
     """The loss of two objects is the mean of the losses of each alone."""
-    batch = sample_batch(renders, np.random.default_rng(2), 2, VIEWS, 96, (0.8, 1.0), members=np.array([0, 1]))
-    z = fourier(batch.surface)
-    full = dict(radius=0.15, temperature=0.1, queries=10**6)
-    both = correspondence_loss(z, batch.surface, 2, generator=torch.Generator(), **full)[0]
-    alone = [
-        correspondence_loss(z[part], batch.surface[part], 1, generator=torch.Generator(), **full)[0]
-        for part in (slice(0, VIEWS), slice(VIEWS, 2 * VIEWS))
-    ]
+    generator = torch.Generator().manual_seed(0)
+    z = F.normalize(torch.randn(16, 9, 32, generator=generator), dim=-1)
+    surface = 0.3 * torch.randn(16, 9, 3, generator=generator)
+    full = dict(radius=0.15, temperature=0.1, queries=10**6, generator=generator)
+    both = correspondence_loss(z, surface, 2, **full)[0]
+    alone = [correspondence_loss(z[part], surface[part], 1, **full)[0] for part in (slice(8), slice(8, 16))]
+    assert both > 0
     torch.testing.assert_close(both, torch.stack(alone).mean())
 
 
@@ -140,10 +139,10 @@ def test_losses_of_crops_without_an_object_are_zero_not_nan():
 def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room_and_materials():
     shape, factors, offset = make_shape(CATEGORIES["chair"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
-    camera = framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
-    meshes = (with_materials(shape, random_materials(seed), copy) for seed in (0, 1))
+    camera = rendering.framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
+    meshes = (replace(shape, vertices=copy, materials=random_materials(seed)) for seed in (0, 1))
     one, two = (
-        render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
+        rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
         for seed, mesh in enumerate(meshes)
     )
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
@@ -156,8 +155,8 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
 def test_variants_keep_the_parts_and_change_the_proportions():
     """Vertex i of a variant is the same point of the same part, so that correspondences are known."""
     for seed in range(30):
-        first = make_shape(build_random_object, seed)
-        other = make_shape(build_random_object, seed, variation=np.random.default_rng(1))
+        first = make_shape(rendering.build_random_object, seed)
+        other = make_shape(rendering.build_random_object, seed, variation=np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
         np.testing.assert_array_equal(first.material, other.material)
         assert np.abs(first.vertices - other.vertices).max() > 0.02
@@ -212,3 +211,112 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
         loss.backward()
         optimiser.step()
     assert last["attention"] < 0.9 * figures["attention"] and last["loss"] < 0.9 * figures["loss"]
+
+
+# Self-distillation
+
+TINY = DistillationConfig(steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> np.ndarray:
+    """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and direction."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:48, :48]
+    rgb = np.empty((8, 2, 48, 48, 3), np.uint8)
+    for k in range(8):
+        colour, angle = rng.uniform(60, 255, 3), k * np.pi / 8
+        for view in range(2):
+            phase = 0.6 * (x * np.cos(angle) + y * np.sin(angle)) + rng.uniform(0, 6)
+            rgb[k, view] = (0.5 + 0.5 * np.sin(phase))[..., None] * colour
+    return rgb
+
+
+@pytest.fixture(scope="module")
+def backbone() -> VisionTransformer:
+    """Small, with weights large enough that its output depends on the picture from the start."""
+    torch.manual_seed(1)
+    model = VisionTransformer(32, 8, embed_dim=24, depth=2, num_heads=2)
+    for module in model.modules():
+        if isinstance(module, torch.nn.Linear):
+            torch.nn.init.xavier_uniform_(module.weight)
+    return model
+
+
+def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
+    rng = np.random.default_rng(0)
+    student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
+    terms, entropies = [], []
+    for picture in range(3):
+        for g in range(2):
+            p = np.exp((teacher[g, picture] - centre) / 0.5)
+            p /= p.sum()
+            entropies.append(-sum(p * np.log(p)))
+            for c in range(4):
+                if c != g:
+                    q = np.exp(student[c, picture] / 0.8)
+                    terms.append(-sum(p * np.log(q / q.sum())))
+    arrays = (torch.from_numpy(x) for x in (student, teacher, centre))
+    loss, figures = distillation_loss(*arrays, student_temperature=0.8, teacher_temperature=0.5)
+    assert len(terms) == 18 and float(loss) == pytest.approx(np.mean(terms))
+    assert figures["teacher_entropy"] == pytest.approx(np.mean(entropies))
+    assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
+
+
+def test_crops_come_from_their_own_image_and_differ(pictures):
+    rng = np.random.default_rng
+    large, small = multi_crop(pictures[:3, 0], rng(5), TINY)
+    assert large.shape == (2, 3, 3, 32, 32) and small.shape == (2, 3, 3, 16, 16)
+    assert not torch.equal(large[0], large[1])
+    other = pictures[:3, 0].copy()
+    other[2] = 255 - other[2]
+    for crops, changed in zip((large, small), multi_crop(other, rng(5), TINY), strict=True):
+        assert torch.equal(crops[:, :2], changed[:, :2])
+        assert not torch.equal(crops[:, 2], changed[:, 2])
+
+
+def test_centre_and_teacher_are_running_averages(pictures, backbone):
+    run = Distillation(TINY, backbone, pictures)
+    run.step()  # the first has no learning rate yet
+    centre, before = run.centre.clone(), copy.deepcopy(run.teacher)
+    rng = np.random.default_rng([TINY.seed, 3, 1])
+    chosen = pictures[rng.integers(8, size=8), rng.integers(2, size=8)]
+    large, _ = multi_crop(chosen, rng, TINY)
+    with torch.no_grad():
+        said = before(large)
+    run.step()
+    torch.testing.assert_close(run.centre, centre.lerp(said.mean((0, 1)), 1 - distillation.CENTRE_MOMENTUM))
+    start, end = distillation.TEACHER_MOMENTUM
+    momentum = end + (start - end) * (1 + math.cos(math.pi / 45)) / 2
+    triples = zip(before.parameters(), run.student.parameters(), run.teacher.parameters(), strict=True)
+    for slow, fast, after in triples:
+        torch.testing.assert_close(after, momentum * slow + (1 - momentum) * fast.detach())
+    assert any(not torch.equal(a, b) for a, b in zip(before.parameters(), run.teacher.parameters(), strict=True))
+
+
+def test_it_collapses_without_centring_and_without_sharpening(pictures, backbone, monkeypatch):
+    """DINO, section 5.3: without centring one output for all images, without sharpening a uniform distribution."""
+    monkeypatch.setattr(distillation, "HIDDEN", 64)
+    monkeypatch.setattr(distillation, "TEACHER_MOMENTUM", (0.97, 1.0))
+    last = {}
+    settings = {"both": {}, "no centring": dict(centring=False), "no sharpening": dict(sharpening=False)}
+    for name, changes in settings.items():
+        run = Distillation(replace(TINY, **changes), backbone, pictures)
+        rows = [run.step() for _ in range(TINY.steps)]
+        last[name] = {key: np.mean([row[key] for row in rows[-8:]]) for key in rows[0]}
+    top = math.log(TINY.outputs)
+    assert last["no centring"]["teacher_entropy"] < 0.15 * top
+    assert last["no sharpening"]["teacher_entropy"] > 0.97 * top
+    assert 0.3 * top < last["both"]["teacher_entropy"] < 0.95 * top
+    assert last["both"]["information"] > 3 * last["no centring"]["information"]
+    assert last["both"]["information"] > 3 * last["no sharpening"]["information"]
+
+
+def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures, backbone):
+    before = copy.deepcopy(backbone.state_dict())
+    runs = [Distillation(replace(TINY, seed=seed), backbone, pictures) for seed in (0, 0, 1)]
+    figures = [[run.step() for _ in range(3)] for run in runs]
+    assert figures[0] == figures[1] != figures[2]
+    weights = [[run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()] for run in runs]
+    assert all(torch.equal(a, b) for a, b in zip(weights[0], weights[1], strict=True))
+    assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())

@@ -28,8 +28,7 @@ def demo(data, solver, backbone, out) -> None:
     from zsp_lite.demo import run_demo
     from zsp_lite.io.locks import writing
     from zsp_lite.samples import sample_data
-    from zsp_lite.synthetic.export import SETTINGS_FILE
-    from zsp_lite.synthetic.model_export import RENDERED_FILE
+    from zsp_lite.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows, run_photograph
     from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
 

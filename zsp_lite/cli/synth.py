@@ -41,8 +41,7 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     from tqdm import tqdm
 
     from zsp_lite.io.locks import writing
-    from zsp_lite.synthetic.export import export_categories, export_preset
-    from zsp_lite.synthetic.model_export import export_models
+    from zsp_lite.synthetic.export import export_categories, export_models, export_preset
 
     sequences, frames, left_out = given["sequences"] or 4, given["frames"] or 24, {}
     with writing(out):

@@ -1,23 +1,14 @@
-"""Objects composed of primitives: parts with materials, in one coordinate frame and of unit size."""
+"""Procedural objects: primitives composed to a mesh of unit size, and their random materials."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from zsp_lite.synthetic.primitives import Mesh, joined
-
-N_MATERIALS = 8
-
-
-@dataclass(frozen=True)
-class Shape:
-    """The mesh of one object: its bounding box is centred at the origin, its `surface_spread` is 1."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    material: Int[np.ndarray, " f"]
+from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
+from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread
+from zsp_lite.synthetic.textures import hsv
 
 
 class Assembly:
@@ -48,10 +39,7 @@ class Assembly:
         return int(self.rng.integers(n))
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part; with `mirror`, also its mirror image in the plane y = 0.
-
-        Parts of one number, 0 .. 7, share a material of random look (`materials.random_materials`), and nothing else.
-        """
+        """Add a part of material 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:
@@ -61,19 +49,11 @@ class Assembly:
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
 
 
-def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
-    middle = (a + b + c) / 3
-    mean = (middle * area).sum(0) / area.sum()
-    return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
-
-
-def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> Shape:
+def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> TexturedMesh:
     """Return the object that `build` composes, with other proportions if `variation` is given (see `Assembly`).
 
-    Vertex i stays the same point of the same part, if the parts depend on the builder's choices only.
+    Its bounding box is centred at the origin, its `surface_spread` is 1, and its materials are not drawn yet. Vertex i
+    stays the same point of the same part, if the parts depend on the builder's choices only.
     """
     assembly = Assembly(np.random.default_rng(seed), variation)
     build(assembly)
@@ -81,4 +61,57 @@ def make_shape(build: Builder, seed: int | list[int], variation: np.random.Gener
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
     vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))  # a small random scale along each axis
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
-    return Shape(vertices / surface_spread(vertices, faces), faces, material)
+    vertices, n = vertices / surface_spread(vertices, faces), len(faces)
+    uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
+    return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, white, material)
+
+
+class _Kind(NamedTuple):
+    share: float  # of all materials
+    hue: tuple[float, float]  # degrees
+    saturation: tuple[float, float]
+    value: tuple[float, float]
+    roughness: tuple[float, float]
+    specular: float = 0.04
+    waves: tuple[int, ...] = (5,)  # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
+    frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
+    contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
+
+
+_ANY = (0, 360)
+_KINDS = (
+    _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),  # paint
+    _Kind(0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)),  # printed paint
+    _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), 0.05),  # plastic
+    _Kind(0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)),  # wood
+    _Kind(0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)),  # cloth
+    _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), 0.4),  # metal
+    _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),  # rubber
+)
+
+
+def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Material, ...]:
+    """Draw the materials 0 .. 7 of an object, independently of its category and of its shape."""
+    rng = np.random.default_rng(seed)
+    kinds = rng.choice(len(_KINDS), 8, p=[kind.share for kind in _KINDS])
+    return tuple(_random_material(_KINDS[kind], rng) for kind in kinds)
+
+
+def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
+    """Draw two sRGB colours and sine waves through the object that mix them: stripes, grain, checks or patches."""
+    ranges = (kind.hue, kind.saturation, kind.value)
+    colour, other = (hsv(*(rng.uniform(*limits) for limits in ranges)) for _ in range(2))
+    darker = len(kind.waves) == 1  # a printed pattern has a second colour
+    other = colour + rng.uniform(*kind.contrast) * ((0 if darker else other) - colour)
+    waves = rng.normal(size=(rng.choice(kind.waves), 3))
+    waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
+    phases, warp = rng.uniform(0, 2 * np.pi, len(waves)), rng.normal(0, 2, 3)
+    sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
+
+    def pattern(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        bend = np.sin(points @ warp)[:, None]  # bends all waves
+        value = np.sin(points @ waves.T + phases + bend).mean(1, keepdims=True)
+        share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
+        return (colour + share * (other - colour)).astype(np.float32)
+
+    return Material(np.ones(4), pattern=pattern, specular=kind.specular, roughness=rng.uniform(*kind.roughness))

@@ -1,28 +1,26 @@
-"""Export of procedural categories as a folder in CO3D's layout, with pose labels and evaluation pairs."""
+"""Export of procedural categories or of a folder of models: a data folder in CO3D's layout, with labels and pairs."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zsp_lite.data.co3d import SequenceData
-from zsp_lite.errors import check_choice
-from zsp_lite.io.files import read_json, stable_hash, write_atomic
-from zsp_lite.synthetic.assembly import Builder, make_shape
-from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.materials import random_materials, with_materials
-from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.recording import (
-    check_same_settings,
-    read_poses,
-    record_sequence,
-    write_labels,
-    write_pairs,
-    write_sequence,
-)
-from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence
+import msgspec
+import numpy as np
 
-SETTINGS_FILE = "synthetic.json"  # in the data folder: the settings of the export
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.errors import InputError, check_choice
+from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
+from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
+from zsp_lite.synthetic.categories import CATEGORIES
+from zsp_lite.synthetic.meshes import TexturedMesh
+from zsp_lite.synthetic.models import list_models
+from zsp_lite.synthetic.recording import read_poses, write_labels, write_pairs, write_sequence
+from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
+
+SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
+RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence
+_MODEL_PAIRS, _MODEL_TARGETS = 20, (1, 3, 5)  # pairs per category of models, for each of these numbers of target views
 
 
 @dataclass(frozen=True)
@@ -78,40 +76,97 @@ def export_categories(
         check_choice("category", category, builders)
     out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
-        check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)
+        _check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in progress(jobs):
-        name = sequence_name(seed, category, index)
+        name, key = sequence_name(seed, category, index), _key(seed, category, index)
         if name not in read_poses(out, category):
-            recorded = make_sequence(category, index, frames, seed, image_size, builders, heights)
-            write_sequence(out, category, make_object(category, index, seed, builders), recorded)
+            mesh = make_object(category, index, seed, builders)
+            write_sequence(out, category, mesh, record_sequence(mesh, name, key, frames, image_size, heights))
     for category in categories:
         write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
 
 
-def make_sequence(
-    category: str,
-    index: int,
-    frames: int,
-    seed: int,
-    image_size: int,
-    builders: Mapping[str, Builder] = CATEGORIES,
-    heights: tuple[float, float] = HEIGHTS,
-) -> tuple[SequenceData, RenderedSequence]:
-    """Make sequence number `index` of a category, with simulated sensor errors, and its exact rendering."""
-    name = sequence_name(seed, category, index)
-    key = stable_hash(f"{seed}/{category}/{index}")
-    return record_sequence(make_object(category, index, seed, builders), name, key, frames, image_size, heights)
-
-
 def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
-    key = stable_hash(f"{seed}/{category}/{index}")
-    return with_materials(make_shape(builders[category], [key, 0]), random_materials([key, 3]))
+    key = _key(seed, category, index)
+    return replace(make_shape(builders[category], [key, 0]), materials=random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
     """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
-    digits = stable_hash(f"{seed}/{category}/{index}")
+    digits = _key(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
+
+
+class _Rendered(msgspec.Struct):
+    settings: dict[str, int | str]
+    sequences: dict[str, dict[str, dict]]  # the origin of each rendered sequence, by category and name
+
+
+def export_models(
+    folder: str | Path,
+    out: str | Path,
+    frames: int = 24,
+    seed: int = 0,
+    image_size: int = 256,
+    front: str | None = None,
+    up: str | None = None,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> dict[str, str]:
+    """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
+
+    A sequence has the name of its model, and depends only on the seed, the model and its orientation. An incomplete
+    export is completed; complete sequences are not rendered again, unless the model or its orientation changed. The
+    first model of a category is the reference of its labels. `image_size` is the shorter image side in pixels, `front`
+    and `up` are as of `list_models`; `progress` wraps the loop over models, as tqdm does. Returns the models that were
+    left out ("CATEGORY/NAME"), with the reason. InputError if no model is usable, or if `out` holds other data.
+    """
+    models, out = list_models(folder, front, up), Path(out)
+    settings = {"seed": seed, "frames": frames, "image_size": image_size}
+    rendered, left_out = _Rendered(settings, {}), {}
+    if (out / RENDERED_FILE).is_file():
+        rendered = read_json(out / RENDERED_FILE, _Rendered, "records")
+        _check_same_settings(out, rendered.settings, settings)
+    elif out.is_dir() and Co3D(out).categories():
+        raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
+    for model in progress(models):
+        record = {
+            "file": model.path.relative_to(folder).as_posix(),
+            "sha256": sha256(model.path, "model"),
+            "rotation": np.round(model.info.axes(model.path.suffix), 9).ravel().tolist(),  # to the canonical frame
+            **{name: getattr(model.info, name) for name in ("author", "licence", "source", "changes")},
+        }
+        known = rendered.sequences.get(model.category, {}).get(model.name) == record
+        if known and model.name in read_poses(out, model.category):
+            continue
+        try:
+            mesh = model.read()
+        except InputError as error:
+            left_out[f"{model.category}/{model.name}"] = str(error)
+            continue
+        key = _key(seed, model.category, model.name)
+        write_sequence(out, model.category, mesh, record_sequence(mesh, model.name, key, frames, image_size))
+        # The record is written last; a sequence with a record is complete.
+        rendered.sequences.setdefault(model.category, {})[model.name] = record
+        write_atomic(out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1))
+    if not rendered.sequences:
+        key, reason = next(iter(left_out.items()))
+        raise InputError(f"{folder} holds no usable model; {key}: {reason}")
+    for category, sequences in rendered.sequences.items():
+        write_labels(out, category, sorted(sequences))
+        if len(sequences) > 1:
+            write_pairs(out, category, _MODEL_PAIRS, [n for n in _MODEL_TARGETS if n <= frames], seed)
+    return left_out
+
+
+def _key(seed: int, category: str, sequence: int | str) -> int:
+    """Return the seed of everything random about a sequence: object, room, cameras and noise."""
+    return stable_hash(f"{seed}/{category}/{sequence}")
+
+
+def _check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
+    """Raise InputError if a folder was written with other settings."""
+    if found != settings:
+        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")

@@ -10,8 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import file_size, read_bytes
-from zsp_lite.synthetic.assembly import surface_spread
-from zsp_lite.synthetic.primitives import joined
+from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread
 from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
@@ -44,7 +43,7 @@ class TexturedMesh:
     uv: Float[np.ndarray, "f 3 2"]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
     colours: Float[np.ndarray, "f 3 3"]  # sRGB in [0, 1] of each corner, a factor of the material's colour
     material: Int[np.ndarray, " f"]  # index of each face
-    materials: tuple[Material, ...]
+    materials: tuple[Material, ...] = ()
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:
@@ -65,20 +64,21 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         ]
     except Exception as error:  # trimesh raises many types of exceptions for damaged files
         raise InputError(f"model {path} cannot be read: {type(error).__name__}: {error}") from error
-    n_faces = sum(len(part.faces) for part in parts)
-    if not 0 < n_faces <= MAX_FACES:
-        raise InputError(f"model {path} has {n_faces:,} faces, expected 1 to {MAX_FACES:,}")
-    mesh = _joined(parts)
-    check_magnitude(f"model {path}: vertices", mesh.vertices)
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] / _size(mesh.vertices), 1, 0)
-    opacity = np.array([material.colour[3] for material in mesh.materials])
-    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[mesh.material] >= _INVISIBLE)
+    n_faces = [len(mesh.faces) for mesh, *_ in parts]
+    if not 0 < sum(n_faces) <= MAX_FACES:
+        raise InputError(f"model {path} has {sum(n_faces):,} faces, expected 1 to {MAX_FACES:,}")
+    meshes, uv, colours, materials = zip(*parts, strict=True)
+    (vertices, faces), material = joined(meshes), np.repeat(np.arange(len(parts)), n_faces)
+    check_magnitude(f"model {path}: vertices", vertices)
+    a, b, c = np.moveaxis(vertices[faces] / _size(vertices), 1, 0)
+    opacity = np.array([one.colour[3] for one in materials])
+    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[material] >= _INVISIBLE)
     if not visible.any():
         raise InputError(f"model {path} has no visible face with an area")
-    used, faces = np.unique(mesh.faces[visible], return_inverse=True)
-    vertices, faces = mesh.vertices[used], faces.reshape(-1, 3)
-    corners = {name: getattr(mesh, name)[visible] for name in ("uv", "colours", "material")}
-    return replace(mesh, vertices=vertices, faces=faces, normals=smooth_normals(vertices, faces), **corners)
+    used, faces = np.unique(faces[visible], return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    uv, colours = (np.concatenate(corners)[visible] for corners in (uv, colours))
+    return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials)
 
 
 def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
@@ -109,12 +109,12 @@ def _values(path: Path, key: bytes) -> list[str]:
     return [words[1].decode(errors="replace").strip() for words in found if len(words) == 2 and words[0].lower() == key]
 
 
-def _part(mesh, transform: np.ndarray) -> TexturedMesh:
-    """Convert one geometry of a trimesh scene; its normals are not known yet."""
+def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
+    """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and its material."""
     faces, visual = np.asarray(mesh.faces, np.int64), mesh.visual
     vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
-    corner = np.zeros((len(faces), 3, 3), np.float32)
-    uv, colours, material = corner[..., :2], corner + 1, Material(np.ones(4))
+    uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
+    material = Material(np.ones(4))
     if visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == len(vertices):
             uv = np.nan_to_num(np.asarray(visual.uv, np.float32))[faces]
@@ -123,7 +123,7 @@ def _part(mesh, transform: np.ndarray) -> TexturedMesh:
         material = Material(np.array([0.6, 0.6, 0.6, 1.0]))
     else:
         colours = (np.asarray(visual.vertex_colors)[faces][..., :3] / 255).astype(np.float32)
-    return TexturedMesh(vertices, faces, corner, uv, colours, np.zeros(len(faces), int), (material,))
+    return Mesh(vertices, faces), uv, colours, material
 
 
 def _material(given) -> Material:
@@ -172,13 +172,6 @@ def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
     image = image.convert("RGBA")
     image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
     return np.array(image)
-
-
-def _joined(parts: list[TexturedMesh]) -> TexturedMesh:
-    """Return the parts, each of one material, as one mesh."""
-    corners = [np.concatenate([getattr(part, name) for part in parts]) for name in ("normals", "uv", "colours")]
-    material = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-    return TexturedMesh(*joined(parts), *corners, material, tuple(part.materials[0] for part in parts))
 
 
 def _size(vertices: np.ndarray) -> float:

@@ -53,6 +53,15 @@ def joined(meshes: Sequence) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
 
 
+def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+    """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
+    middle = (a + b + c) / 3
+    mean = (middle * area).sum(0) / area.sum()
+    return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
+
+
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

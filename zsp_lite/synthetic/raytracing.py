@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.open3d import load_open3d
-from zsp_lite.synthetic.lighting import FLOOR_REACH, RoomLight
 from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.sampling import dot, pyramid, sample_image, sample_pyramid, spread_directions, unit
-from zsp_lite.synthetic.textures import srgb_to_linear
+from zsp_lite.synthetic.room import FLOOR_REACH, RoomLight
+from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 
 _LAYERS = 4  # surfaces with holes that a ray passes through
 _OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units
@@ -72,24 +71,28 @@ class MeshScene:
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
         cross = np.cross(second - first, third - first)  # normal, with twice the area of the face as its length
-        self._flat = unit(cross)
+        self._flat = _unit(cross)
         self._coordinates = (mesh.vertices if coordinates is None else coordinates)[mesh.faces].astype(np.float32)
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
         self._properties = np.array([[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32)
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
-        self._texture_scale = np.sqrt(
-            uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12)
-        )  # lengths of the texture per unit, by face
+        # Lengths of the texture per unit, by face.
+        self._texture_scale = np.sqrt(uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12))
         self._shadow, self._shadow_width = self._shadow_on_the_floor()
         self._gain: float | None = None
 
     def render(self, camera: Camera) -> Rendering:
         """Render one view; the exposure is measured on the first view and varies little after it."""
         rays = _pixel_rays(camera, 1)
-        radiance, floor_depth = self._background(camera, rays)
+        radiance, depth = self._background(camera, rays)
         hits = self._cast(camera.centre, rays)
-        exact = self._exact(camera, rays, hits, floor_depth)
+        pixel = np.unravel_index(hits.ray, camera.size)
+        mask, normals = np.zeros(camera.size, bool), np.zeros((*camera.size, 3), np.float32)
+        canonical = np.full_like(normals, np.nan)
+        mask[pixel], depth[pixel] = True, hits.distance  # rays have unit z in the camera frame
+        canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
+        normals[pixel] = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]) @ camera.R.T.astype(np.float32)
         if self._samples > 1:
             rays = _pixel_rays(camera, self._samples)
             hits = self._cast(camera.centre, rays)
@@ -98,7 +101,7 @@ class MeshScene:
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
-        return Rendering(rgb=rgb, camera=camera, **exact)
+        return Rendering(rgb, depth, mask, canonical, normals, camera)
 
     # Geometry
 
@@ -139,19 +142,6 @@ class MeshScene:
         blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
         return 1 - blocked.astype(np.float32) / np.float32(count)
 
-    def _exact(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits, floor_depth: Float[np.ndarray, "h w"]
-    ) -> dict:
-        """Return depth, mask, object coordinates and normals of the pixels."""
-        depth, mask = floor_depth.copy(), np.zeros(camera.size, bool)
-        canonical, normals = np.full((*camera.size, 3), np.nan, np.float32), np.zeros((*camera.size, 3), np.float32)
-        pixel = np.unravel_index(hits.ray, camera.size)
-        mask[pixel] = True
-        depth[pixel] = hits.distance  # rays have unit z in the camera frame
-        canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
-        normals[pixel] = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]) @ camera.R.T.astype(np.float32)
-        return {"depth": depth, "mask": mask, "canonical": canonical, "normals": normals}
-
     # Shading
 
     def _shade(self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits) -> Float[np.ndarray, "h w 4"]:
@@ -160,13 +150,13 @@ class MeshScene:
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)  # width of a sample, in units
         albedo = self._albedo(hits, footprint)
-        view, flat = unit(rays), _towards(self._flat[hits.face], rays)
+        view, flat = _unit(rays), _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
-        normal *= np.where(dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
+        normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         # Visible points do not face away, though their interpolated normals may.
-        normal = unit(normal)
-        normal = unit(normal - np.maximum(dot(normal, view) + 0.02, 0)[:, None] * view)
-        facing = np.maximum(-dot(normal, view), 0.02)
+        normal = _unit(normal)
+        normal = _unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
+        facing = np.maximum(-_dot(normal, view), 0.02)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
         light, light_colour = self.room.light.astype(np.float32), self.room.light_colour.astype(np.float32)
@@ -174,7 +164,7 @@ class MeshScene:
         lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
         of_light[lit] = self._visible_share(point[lit], self._towards_light(len(lit), 1))
         # Directions with a density of the cosine about the normal.
-        towards_room = unit(normal[:, None] + 0.99 * spread_directions(self._rng, len(point), _RAYS))
+        towards_room = _unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         of_room = self._visible_share(point, towards_room)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         shares = np.zeros((*size, 3), np.float32)
@@ -188,7 +178,7 @@ class MeshScene:
         # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its normalisation.
         reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[:, None]
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
-        cosine = np.maximum(dot(normal, unit(light - view)), 0)
+        cosine = np.maximum(_dot(normal, _unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
         mirrored = self.lighting.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
         colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
@@ -218,8 +208,8 @@ class MeshScene:
 
     def _towards_light(self, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
         """Return directions to random points of the key light, `count` for each of n points."""
-        offset = np.float32(np.tan(self.room.light_radius)) * spread_directions(self._rng, n, count)
-        return unit(self.room.light.astype(np.float32) + offset)
+        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, n, count)
+        return _unit(self.room.light.astype(np.float32) + offset)
 
     # Background
 
@@ -232,15 +222,10 @@ class MeshScene:
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
         towards_light = self._towards_light(len(point), _RAYS)
-        towards_room = unit(np.float32([0, 0, 1]) + 0.99 * spread_directions(self._rng, len(point), _RAYS))
+        towards_room = _unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         key = self._visible_share(point, towards_light).reshape(n, n)
         around = self._visible_share(point, towards_room).reshape(n, n)
         return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
-
-    def shadow(self, point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 n"]:
-        """Return the visible shares of the key light and of the room at floor points, relative to the room's origin."""
-        u, v = (point / self._shadow_width + 0.5).T
-        return sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT).T
 
     def _background(
         self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
@@ -249,8 +234,9 @@ class MeshScene:
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
         radiance, reach = self.lighting.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
-        shares = self.shadow((eye + reach[floor, None] * flat_rays[floor])[:, :2])
-        radiance[floor] *= self.lighting.on_the_floor(*shares)
+        u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T
+        shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
+        radiance[floor] *= self.lighting.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
@@ -270,4 +256,23 @@ def _interpolated(weights: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, 
 
 def _towards(normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return normals that point towards the eye of rays."""
-    return normal * -np.sign(dot(normal, rays))[:, None]
+    return normal * -np.sign(_dot(normal, rays))[:, None]
+
+
+def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Return the scalar products of the rows."""
+    return np.einsum("nd,nd->n", one, other)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) scaled to unit length."""
+    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-12)
+
+
+def _spread_directions(rng: np.random.Generator, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
+    """Return n sets of `count` unit vectors that are spread evenly over the sphere, each set turned at random."""
+    index = np.arange(count, dtype=np.float32)
+    z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
+    angle = np.float32(2 * np.pi) * (index * np.float32(0.618034) + rng.random((n, 1), np.float32))  # golden ratio
+    radius = np.sqrt(np.maximum(1 - z**2, 0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)

@@ -1,7 +1,7 @@
 """Recording of one object as a sequence of a data folder, with object pose, labels and evaluation pairs."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
@@ -12,11 +12,9 @@ from scipy.spatial import KDTree
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, write_atomic
 from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.sensor import simulate_capture
-from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence, render_sequence
+from zsp_lite.synthetic.sequences import RenderedSequence
 
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _JPEG_QUALITY = 88
@@ -48,20 +46,6 @@ class ObjectPose(msgspec.Struct):
     def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map world points to box coordinates, 0 to 1 along each object axis."""
         return (self.to_object(world) - self.low) / np.subtract(self.high, self.low)
-
-
-def check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
-    """Raise InputError if a folder was written with other settings."""
-    if found != settings:
-        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
-
-
-def record_sequence(
-    mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
-) -> tuple[SequenceData, RenderedSequence]:
-    """Return a sequence of an object, as the sensor records it and exact; `key` seeds room, cameras and noise."""
-    exact = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, heights)
-    return simulate_capture(exact, name, np.random.default_rng([key, 2]))
 
 
 def write_sequence(

@@ -1,8 +1,12 @@
-"""Colours, smooth noise, and the picture of a floor or of a wall."""
+"""Images: colours, smooth noise, the picture of a floor or of a wall, and sampling between pixels."""
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Float
+
+_FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
 
 
 def srgb_to_linear(colour) -> np.ndarray:
@@ -61,3 +65,40 @@ def surface(
     for sigma, amount in ((1.0, 0.1), (6.0, 0.06), (60.0, 0.05)):
         value += grain * rng.uniform(0.3, 1) * amount * smooth_noise(rng, size, sigma, stretch)
     return srgb_to_linear(np.clip(value[..., None] * colour.astype(np.float32), 0, 0.92))
+
+
+def pyramid(image: np.ndarray) -> list[np.ndarray]:
+    """Return an image and its halvings down to 4 pixels."""
+    levels = [image]
+    while min(levels[-1].shape[:2]) >= 8:
+        height, width = levels[-1].shape[:2]
+        levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    return levels
+
+
+def sample_pyramid(
+    levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, texels: np.ndarray, border: int
+) -> Float[np.ndarray, "n c"]:
+    """Sample each point (u, v) at the level that fits `texels`, the texels of the finest level that it covers."""
+    level = np.clip(np.rint(np.log2(np.maximum(texels, 1))), 0, len(levels) - 1).astype(np.int8)
+    result = np.empty((len(u), levels[0].shape[2]), np.float32)
+    for index in np.unique(level):
+        on = np.flatnonzero(level == index)
+        result[on] = sample_image(levels[index], u[on], v[on], border)
+    return result
+
+
+def sample_image(image: np.ndarray, u: np.ndarray, v: np.ndarray, border: int) -> Float[np.ndarray, "n c"]:
+    """Interpolate an image bilinearly at (u, v) in [0, 1] (v from the top); outside, BORDER_CONSTANT means 1."""
+    if border == cv2.BORDER_WRAP:
+        u, v = u % 1, v % 1
+    height, width = image.shape[:2]
+    padding = -len(u) % _FOLD
+    x, y = (
+        np.pad(where * side - 0.5, (0, padding)).astype(np.float32).reshape(-1, _FOLD)
+        for where, side in ((u, width), (v, height))
+    )
+    if not len(x):
+        return np.empty((0, image.shape[2]), np.float32)
+    found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0, 1.0, 1.0, 1.0))
+    return found.reshape(-1, image.shape[2])[: len(u)].astype(np.float32, copy=False)

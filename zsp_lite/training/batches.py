@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.training.renders import GRID, SIZE, VIEWS, RenderSet
+from zsp_lite.training.renders import VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
 MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
@@ -16,21 +16,13 @@ MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
 
 @dataclass(frozen=True)
 class Batch:
-    """Crops of several objects, the views of an object one after the other; n patches per crop, row by row.
+    """Crops of several objects, the views of an object one after the other; n patches per crop, row by row."""
 
-    Attributes:
-        images: Normalised RGB images.
-        surface: Object coordinates at the centre of each patch, NaN on the background.
-        geometry: Normal in the camera frame, and depth standardised over the object, at the centre of each patch.
-        coverage: Fraction of each patch that the object covers.
-        objects: Number of objects.
-    """
-
-    images: Float[Tensor, "crops 3 side side"]
-    surface: Float[Tensor, "crops n 3"]
-    geometry: Float[Tensor, "crops n 4"]
-    coverage: Float[Tensor, "crops n"]
-    objects: int
+    images: Float[Tensor, "crops 3 side side"]  # normalised RGB
+    surface: Float[Tensor, "crops n 3"]  # object coordinates at the centre of each patch, NaN on the background
+    geometry: Float[Tensor, "crops n 4"]  # there: normal in the camera frame, and depth standardised over the object
+    coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
+    objects: int  # their number
 
 
 def crop_grids(
@@ -88,17 +80,17 @@ def sample_batch(
     The objects are random or the `members`; of each there are 8 views (all), 4 (two pairs, a quarter turn apart) or 2
     (one pair).
     """
-    index = rng.integers(0, len(renders), objects) if members is None else members
+    index = rng.integers(0, len(renders.rgb), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
     if views < VIEWS:
         chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
     pick = (index[:, None], chosen)
-    rgb = torch.from_numpy(renders.rgb[pick].reshape(-1, SIZE, SIZE, 3)).permute(0, 3, 1, 2).float() / 255
-    maps = [torch.from_numpy(m[pick].reshape(-1, GRID, GRID, m.shape[-1]).astype(np.float32)).permute(0, 3, 1, 2)
-            for m in (renders.surface, renders.geometry)]  # fmt: skip
-    n, patches = objects * views, side // PATCH_SIZE
-    grid, turn = crop_grids(rng, n, views, side, scale)
-    images = F.grid_sample(rgb, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
+    rgb, surface, geometry = (
+        torch.from_numpy(maps[pick]).flatten(0, 1).permute(0, 3, 1, 2).float()
+        for maps in (renders.rgb, renders.surface, renders.geometry)
+    )
+    grid, turn = crop_grids(rng, objects * views, views, side, scale)
+    images = F.grid_sample(rgb / 255, grid, padding_mode="reflection", align_corners=False)
 
     def at(resolution):
         return F.interpolate(grid.permute(0, 3, 1, 2), (resolution,) * 2, mode="area").permute(0, 2, 3, 1)
@@ -106,7 +98,7 @@ def sample_batch(
     def sample(values, where):
         return F.grid_sample(values, where, mode="nearest", padding_mode="border", align_corners=False)
 
-    surface, geometry = maps
+    patches = side // PATCH_SIZE
     on_object = (~surface[:, :1].isnan()).float()
     coverage = F.avg_pool2d(sample(on_object, at(2 * patches)), 2).flatten(1)
     centres = at(patches)

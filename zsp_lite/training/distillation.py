@@ -37,7 +37,7 @@ class DistillationConfig:
     seed: int = 0  # of crops and of the random head
     steps: int = 300
     images: int = 16  # per step
-    local_crops: int = 4  # per image, in addition to two global ones
+    local_crops: int = 4  # per image, at least 1, in addition to two global ones
     global_side: int = 96  # of the crops, pixels
     local_side: int = 48
     outputs: int = 512  # K; DINO has 65,536
@@ -90,8 +90,6 @@ def multi_crop(
         return recolour(rng, cut).unflatten(0, (count, len(rgb)))
 
     large = crops(2, config.global_side, GLOBAL_SCALE)
-    if config.local_crops == 0:
-        return large, large.new_empty(0, len(rgb), 3, config.local_side, config.local_side)
     return large, crops(config.local_crops, config.local_side, LOCAL_SCALE)
 
 
@@ -113,7 +111,7 @@ def distillation_loss(
     p = log_p.exp()
     log_q = (student / student_temperature).log_softmax(-1)
     cross = -torch.einsum("gbk,cbk->gc", p, log_q) / p.shape[1]
-    other = ~torch.eye(*cross.shape, dtype=torch.bool, device=cross.device)
+    other = ~torch.eye(*cross.shape, dtype=torch.bool)
     loss = cross[other].mean()
     entropy = -(p * log_p).sum(-1).mean().item()
     mean = p.mean((0, 1))
@@ -139,37 +137,33 @@ class Distillation:
 
     def step(self) -> dict[str, float]:
         """Take one step and return its figures (see `distillation_loss`)."""
-        progress = self.steps_done / self.config.steps
-        rate = self.config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
+        config, progress = self.config, self.steps_done / self.config.steps
+        rate = config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.param_groups[0]["weight_decay"] = cosine(WEIGHT_DECAY, progress)
         self.student.head.directions.requires_grad_(progress >= 0.05)  # DINO fixes the last layer in the first epoch
-        loss, figures, centre = self._loss()
-        self.optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.student.parameters(), MAX_GRADIENT_NORM)
-        self.optimizer.step()
-        with torch.no_grad():
-            for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
-                slow.lerp_(fast, 1 - cosine(TEACHER_MOMENTUM, progress))
-        if self.config.centring:
-            self.centre.lerp_(centre, 1 - CENTRE_MOMENTUM)  # eq. 4
-        self.steps_done += 1
-        return figures
 
-    def _loss(self) -> tuple[Tensor, dict[str, float], Tensor]:
-        """Compute the loss of a batch, its figures, and the mean of the teacher's logits."""
-        config = self.config
         rng = np.random.default_rng([config.seed, 3, self.steps_done])
         objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
         large, small = multi_crop(self.rgb[objects, views], rng, config)
         with torch.no_grad():
             teacher = self.teacher(large)
-        student = torch.cat([self.student(crops) for crops in (large, small) if len(crops)])
+        student = torch.cat([self.student(large), self.student(small)])
         sharp = config.teacher_temperature if config.sharpening else STUDENT_TEMPERATURE
         loss, figures = distillation_loss(student, teacher, self.centre, STUDENT_TEMPERATURE, sharp)
-        return loss, figures, teacher.mean((0, 1))
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.student.parameters(), MAX_GRADIENT_NORM)
+        self.optimizer.step()
+
+        with torch.no_grad():
+            for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
+                slow.lerp_(fast, 1 - cosine(TEACHER_MOMENTUM, progress))
+        if config.centring:
+            self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4
+        self.steps_done += 1
+        return figures
 
 
 def cosine(ends: tuple[float, float], progress: float) -> float:

@@ -33,11 +33,11 @@ def correspondence_loss(
     views = crops // objects
     z = descriptors.reshape(objects, views * n, dim)
     points = surface.reshape(objects, views * n, 3)
-    view = torch.arange(views, device=z.device).repeat_interleave(n)
+    view = torch.arange(views).repeat_interleave(n)
     losses, hits = [], []
     for k in range(objects):
         on_object = (~points[k, :, 0].isnan()).nonzero()[:, 0]
-        query = on_object[torch.randperm(len(on_object), generator=generator)[:queries].to(on_object.device)]
+        query = on_object[torch.randperm(len(on_object), generator=generator)[:queries]]
         if len(query) < 20:
             continue
         same_view = view[query][:, None] == view[None]

@@ -14,10 +14,10 @@ from zsp_lite.training.renders import VIEWS, RenderSet
 
 
 class Trainee(nn.Module):
-    """A transformer with two linear heads, which only training uses, and the running mean of its keys.
+    """A transformer whose keys of block `layer` (from 0) are trained, and the running mean of these keys.
 
-    The heads predict geometry (see `geometry_loss`) from the output tokens and from the input of the keys' projection
-    in block `layer` (from 0), whose keys are trained.
+    Two linear heads, which only training uses, predict geometry (see `geometry_loss`) from the output tokens and from
+    the input of the keys' projection.
     """
 
     def __init__(self, backbone: VisionTransformer, layer: int):
@@ -43,7 +43,7 @@ class Trainee(nn.Module):
 def as_trainee(backbone: VisionTransformer, layer: int, renders: RenderSet, side: int) -> Trainee:
     """Wrap a transformer with the mean key of crops of `side` pixels of at most six objects."""
     trainee = Trainee(backbone, layer)
-    batch = sample_batch(renders, np.random.default_rng(7), min(6, len(renders)), VIEWS, side, (0.85, 1.0))
+    batch = sample_batch(renders, np.random.default_rng(7), min(6, len(renders.rgb)), VIEWS, side, (0.85, 1.0))
     trainee.centred(trainee(batch.images).keys, update_mean=True)
     return trainee
 
