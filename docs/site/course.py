@@ -180,7 +180,9 @@ def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
     for text in list(doctree.findall(nodes.Text)):
         part = text.parent
         table = isinstance(part, nodes.raw) and "<table" in text
-        if table or not isinstance(part, nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block):
+        if table or not isinstance(
+            part, nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
+        ):
             joined = INTERVAL.sub(lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
             part.replace(text, nodes.Text(joined))
 

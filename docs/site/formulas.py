@@ -1,8 +1,8 @@
 """Sphinx extension of the course site: formulas as MathML, with a font for them that comes with the site.
 
-MathML needs no script from the network, but a font with mathematical metrics: without one, brackets do not grow and bars
-touch letters. The font is STIX Two Math of the package `ziamath`, cut down to the characters of formulas. Where the
-package is not installed, the reader's own fonts are used.
+MathML needs no script from the network, but a font with mathematical metrics: without one, brackets do not grow and
+bars touch letters. The font is STIX Two Math of the package `ziamath`, cut down to the characters of formulas. Where
+the package is not installed, the reader's own fonts are used.
 """
 
 import base64
@@ -32,7 +32,8 @@ def math_font() -> bytes:
     if (package := find_spec("ziamath")) is None:
         return b""
     font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
-    subsetter = Subsetter(Options(hinting=False, layout_features=["ssty", "dtls", "flac", "kern", "mark"]))
+    features = ["ssty", "dtls", "flac", "kern", "mark"]
+    subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))  # with its licence
     subsetter.populate(unicodes=[code for first, last in CHARACTERS for code in range(first, last + 1)])
     subsetter.subset(font)
     font.flavor = "woff"
@@ -41,14 +42,16 @@ def math_font() -> bytes:
 
 
 def mathml(latex: str, display: str = "inline") -> str:
-    r"""Convert a formula, with three repairs of what latex2mathml makes.
+    r"""Convert a formula, with four repairs of what latex2mathml makes.
 
     The names of `\operatorname` become text. Bold and script letters become characters of their own, as browsers know
     no `mathvariant`. The bars of a norm do not grow: each would grow by itself, as only one of them has the exponent.
+    A minus after an equals sign is close to its term.
     """
     latex = re.sub(r"\\operatorname\*?\{(.*?)\}", lambda name: rf"\text{{{name[1]}}}".replace(r"\,", " "), latex)
     text = convert(latex, display=display)
     text = re.sub('<mi mathvariant="(bold|script|bold-italic)">(.*?)</mi>', _letter, text)
+    text = re.sub("(<mo>&#x0003D;</mo>)<mo>(&#x02212;)", r'\1<mo form="prefix">\2', text)
     return text.replace("<mo>&#x02016;", '<mo stretchy="false">&#x02016;')
 
 
