@@ -31,11 +31,8 @@ BRANCH = "gh-pages"  # where the workflow publishes the site, and so the noteboo
 
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
-# Pages that lead to others: these are not in the sidebar.
-CHILDREN = {
-    "notebooks/README": "../docs/slides/*",
-    "notebooks/exercises/README": "source/*/*",
-}
+# The pages below a page, which the sidebar leaves out.
+CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "source/*/*"}
 HIDDEN_LINKS = """
 
 ```{toctree}
@@ -76,7 +73,6 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
     if path.suffix == ".ipynb":
         notebook = nbformat.reads(source[0], as_version=4)
         remove_solutions(notebook, app.srcdir)
-        demote_sections(notebook)
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
@@ -108,16 +104,6 @@ def remove_solutions(notebook: NotebookNode, root: Path) -> None:
         config = PyFileConfigLoader("nbgrader_config.py", path=str(root / "notebooks" / "exercises")).load_config()
         for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
             clear(config=config).preprocess(notebook, {})
-
-
-def demote_sections(notebook: NotebookNode) -> None:
-    """Leave one heading of the first level, the title; some notebooks use that level for their sections too."""
-    below = ""
-    for cell in notebook.cells[1:]:
-        if cell.cell_type == "markdown":
-            if cell.source.startswith("# ") or "\n# " in cell.source:
-                below = "#"
-            cell.source = re.sub("^(?=#+ )", below, cell.source, flags=re.MULTILINE)
 
 
 def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
