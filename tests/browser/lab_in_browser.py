@@ -137,20 +137,22 @@ def open_notebook(page, lab: Lab, name: str) -> None:
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=180_000)
 
 
-# Whether some cell has begun to run, and whether all have ended: "[ ]:" has not begun, "[*]:" runs or waits.
+# Whether some cell has begun to run, and whether one still runs or waits: "[ ]:" has not begun, "[*]:" runs.
 _BEGUN = "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => /[*0-9]/.test(e.innerText))"
 _RUNNING = _BEGUN.replace("*0-9", "*")
 
 
 def run_all(page, patience: float) -> None:
     """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
-    deadline = time.monotonic() + patience
-    while not page.evaluate(_BEGUN):  # a notebook that has only just opened may not hear the menu
+    deadline, asked = time.monotonic() + patience, 0.0
+    while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
-        page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
-        page.wait_for_timeout(5000)
+        if time.monotonic() > asked + 20:  # a notebook that has only just opened may not hear the menu
+            page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+            page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
+            asked = time.monotonic()
+        page.wait_for_timeout(500)
     rest = 0
     while rest < 3:  # between two cells there is a moment in which none runs
         rest = 0 if page.evaluate(_RUNNING) else rest + 1
