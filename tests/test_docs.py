@@ -9,7 +9,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import click
-import nbformat
 import numpy as np
 import pytest
 
@@ -56,10 +55,6 @@ def headings(page: Path) -> set[str]:
     text = re.sub(r"```.*?```", "", markdown(page), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
-
-
-def test_the_readme_has_at_most_150_lines():
-    assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 150
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -235,32 +230,14 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "outputs/cups-python/report.html").is_file()
 
 
-@pytest.fixture(scope="module")
-def stored() -> dict[str, ElementTree.Element]:
-    return {path.stem: ElementTree.parse(path).getroot() for path in sorted(drawings.FOLDER.glob("*.svg"))}
-
-
 def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
         assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
 
 
-def test_every_notebook_has_its_place_in_the_method(stored):
-    assert {path.stem[:2] for path in NOTEBOOKS} == set(drawings.HERE)
-    for number in drawings.HERE:
-        texts = ["".join(text.itertext()) for text in stored[f"here_{number}"].iter(f"{SVG}text")]
-        assert sum(words.startswith("you are here") for words in texts) == 1
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_opens_with_its_place_in_the_method(path):
-    title, picture = nbformat.read(path, as_version=4).cells[0].source.split("\n\n")[:2]
-    assert title.startswith("# ") and re.fullmatch(rf"!\[[^]]{{20,}}\]\(figures/here_{path.stem[:2]}\.svg\)", picture)
-
-
-def test_every_drawing_is_described_and_needs_nothing_from_elsewhere(stored):
-    for name, root in stored.items():
-        title, description = root.find(f"{SVG}title").text, root.find(f"{SVG}desc").text
-        assert len(title) > 3 and len(description) > 60, name
-        assert not {f"{SVG}image", f"{SVG}use", f"{SVG}style"} & {element.tag for element in root.iter()}, name
+@pytest.mark.parametrize("path", sorted(drawings.FOLDER.glob("*.svg")), ids=lambda path: path.stem)
+def test_every_drawing_is_described_and_needs_nothing_from_elsewhere(path):
+    root = ElementTree.parse(path).getroot()
+    assert len(root.find(f"{SVG}title").text) > 3 and len(root.find(f"{SVG}desc").text) > 60
+    assert not {f"{SVG}image", f"{SVG}use", f"{SVG}style"} & {element.tag for element in root.iter()}

@@ -1,14 +1,12 @@
 """The course site (`make site`): every link leads somewhere, notebooks are complete, solutions stay out."""
 
-import importlib.util
+import importlib
 import re
 import subprocess
 import sys
-import tomllib
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
 from urllib.parse import unquote, urlsplit
 
 import nbformat
@@ -21,7 +19,6 @@ NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
 DRAWINGS = sorted((REPOSITORY / "notebooks" / "figures").glob("*.svg"))
 DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
-URLS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"].get("urls", {})
 
 
 class Page(HTMLParser):
@@ -67,15 +64,6 @@ def pages(site):
     return {str(path.relative_to(site)): Page(path) for path in paths}
 
 
-@pytest.fixture(scope="module")
-def course() -> ModuleType:
-    """The site's extension of Sphinx for notebooks, as a module."""
-    spec = importlib.util.spec_from_file_location("course", REPOSITORY / "docs" / "site" / "course.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def page_of(source: Path) -> str:
     return str(source.relative_to(REPOSITORY).with_suffix(".html"))
 
@@ -83,46 +71,53 @@ def page_of(source: Path) -> str:
 pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
 
 
-def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_every_anchor_to_an_element(site, pages):
-    broken = []
+def test_every_link_leads_to_a_file_and_every_anchor_to_an_element_and_no_page_is_beyond_reach(site, pages):
+    broken, reached = [], {"index.html", "search.html", "docs/index.html"}
     for name, page in pages.items():
         for link in page.links:
             parts = urlsplit(link)
             if parts.scheme or parts.netloc:
                 continue
             path = ((site / name).parent / unquote(parts.path)).resolve() if parts.path else site / name
-            target = pages.get(str(path.relative_to(site.resolve()))) if path.suffix == ".html" else None
+            target = str(path.relative_to(site.resolve()))
+            reached.add(target)
             anchor = unquote(parts.fragment)
-            if not path.is_file() or (anchor and target and anchor not in target.anchors):
+            if not path.is_file() or (anchor and target in pages and anchor not in pages[target].anchors):
                 broken.append(f"{name}: {link}")
     assert not broken, "\n".join(broken)
+    assert set(pages) <= reached
+
+
+def test_about_twenty_entries_stand_at_the_side(pages):
+    assert 18 <= pages["docs/index.html"].html.count('class="toctree-l1') <= 22
 
 
 def test_no_page_loads_anything_from_elsewhere(site, pages):
     for name, page in pages.items():
         for source in page.loaded:
             path = urlsplit(source)
-            if path.scheme == "data":
-                continue
-            assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
+            if path.scheme != "data":
+                assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
+
+
+def test_letters_of_formulas_are_bold_and_intervals_do_not_break(pages):
+    assert "<mi>\N{MATHEMATICAL BOLD CAPITAL R}</mi>" in pages["notebooks/05_metrics.html"].html
+    assert not [name for name, page in pages.items() if 'mathvariant="bold' in page.html]
+    results = pages["docs/results.html"].text
+    assert "[47.6,\N{NO-BREAK SPACE}66.2]" in results and "[47.6, 66.2]" not in results
 
 
 @pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
 def test_a_deck_of_slides_is_a_single_file_with_the_pictures_of_the_notebooks(pages, path):
     page, text = pages[page_of(path)], path.read_text(encoding="utf-8")
     assert page.loaded == [picture["src"] for picture in page.pictures]
-    assert all(re.match("data:image/(png|jpeg|svg)", source) for source in page.loaded)
-    assert len(page.pictures) == text.count("```{picture}") and all(
-        len(picture["alt"]) > 20 for picture in page.pictures
-    )
+    assert all(slide.count("```{picture}") <= 1 for slide in text.split("\n## "))
+    assert len(page.pictures) == text.count("```{picture}")
     stored = "".join(notebook.read_text(encoding="utf-8").replace("\\n", "") for notebook in NOTEBOOKS)
     text += unescape("".join(drawing.read_text(encoding="utf-8") for drawing in DRAWINGS))
     for picture in page.pictures:
-        form, data = picture["src"].split(";base64,")
-        assert data in stored or picture["alt"] in text, picture["alt"]
-    assert "<math" in page.html or path.stem == "lab_90_minutes"
-    for heading in re.findall("^## (.*)$", text, re.MULTILINE):
-        assert heading in page.text
+        data = re.fullmatch("data:image/(?:png|jpeg|svg.xml);base64,(.*)", picture["src"])[1]
+        assert len(picture["alt"]) > 20 and (data in stored or picture["alt"] in text), picture["alt"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -169,18 +164,18 @@ def test_the_reference_describes_every_public_class_and_function(pages):
         assert f"{homes[name]}.{name}" in anchors, name
 
 
-def test_every_notebook_can_be_downloaded_and_opens_in_colab_only_if_the_repository_has_an_address(site, pages):
+def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
     for path in (*NOTEBOOKS, *EXERCISES):
-        page = pages[page_of(path)]
-        assert any(link.endswith(f"run/{path.relative_to(REPOSITORY)}") for link in page.links), path.name
-        assert ("colab.research.google.com" in page.html) == ("Repository" in URLS), path.name
+        links = pages[page_of(path)].links
+        assert any(link.endswith(f"run/{path.relative_to(REPOSITORY)}") for link in links), path.name
         copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
-        assert ("google.colab" in copy.cells[0].source) == ("Repository" in URLS), path.name
         for drawing in re.findall(r"\]\((figures/[^)]+)\)", "\n".join(cell.source for cell in copy.cells)):
             assert (site / "run" / path.relative_to(REPOSITORY).parent / drawing).is_file(), f"{path.name}: {drawing}"
 
 
-def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(course):
+def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monkeypatch):
+    monkeypatch.syspath_prepend(REPOSITORY / "docs" / "site")
+    course = importlib.import_module("course")
     address = "https://github.com/someone/zsp"
     links = course.run_links("notebooks/00_quickstart", address)
     branch = f"https://colab.research.google.com/github/someone/zsp/blob/{course.BRANCH}"

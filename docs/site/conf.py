@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "course",
+    "formulas",
     "slides",
 ]
 root_doc = "docs/index"
@@ -48,6 +49,7 @@ default_role = "py:obj"  # `name` in docstrings: a link if the name is documente
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 80
 napoleon_use_ivar = True
 
 # Address of the repository on GitHub, for the links "Open in Colab"; without it there are none.
@@ -64,6 +66,7 @@ html_math_renderer = "mathml"
 html_copy_source = False  # the sources of the exercises hold their solutions
 html_show_sourcelink = False
 html_domain_indices = False
+html_use_index = False
 html_context = {"default_mode": "auto"}  # light or dark as in the system
 html_theme_options = {
     "repository_url": course_repository,

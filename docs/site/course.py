@@ -4,7 +4,7 @@
 - Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own preprocessors.
 - Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an install cell.
 - Docstrings keep their indented examples.
-- Formulas become MathML, which needs no script from the network.
+- Intervals such as [47.6, 66.2] never break over two lines.
 """
 
 import json
@@ -19,16 +19,29 @@ import nbformat
 import plotly
 import plotly.io
 from docutils import nodes
-from latex2mathml.converter import convert
 from nbformat import NotebookNode
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from sphinx.application import Sphinx
-from sphinx.writers.html5 import HTML5Translator
+from sphinx.environment import BuildEnvironment
 from traitlets.config import PyFileConfigLoader
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
+
+INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
+
+# The pages below a page, which the sidebar leaves out.
+CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "source/*/*"}
+HIDDEN_LINKS = """
+
+```{toctree}
+:hidden:
+:glob:
+
+%s
+```
+"""
 
 # A line "- `zsp_lite.NAME`" of a page of the reference becomes a section with the docstrings of this module.
 MODULE = r"""
@@ -60,7 +73,6 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
     if path.suffix == ".ipynb":
         notebook = nbformat.reads(source[0], as_version=4)
         remove_solutions(notebook, app.srcdir)
-        demote_sections(notebook)
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
@@ -80,6 +92,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
             lambda link: link[1] if (path.parent / link[2]).is_dir() else link[0],
             source[0],
         )
+    if docname in CHILDREN:
+        source[0] += HIDDEN_LINKS % CHILDREN[docname]
     if docname.startswith("docs/api/"):
         source[0] = re.sub(r"^- `zsp_lite\.(\S+)`$", MODULE, source[0], flags=re.MULTILINE)
 
@@ -90,16 +104,6 @@ def remove_solutions(notebook: NotebookNode, root: Path) -> None:
         config = PyFileConfigLoader("nbgrader_config.py", path=str(root / "notebooks" / "exercises")).load_config()
         for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
             clear(config=config).preprocess(notebook, {})
-
-
-def demote_sections(notebook: NotebookNode) -> None:
-    """Leave one heading of the first level, the title; some notebooks use that level for their sections too."""
-    below = ""
-    for cell in notebook.cells[1:]:
-        if cell.cell_type == "markdown":
-            if cell.source.startswith("# ") or "\n# " in cell.source:
-                below = "#"
-            cell.source = re.sub("^(?=#+ )", below, cell.source, flags=re.MULTILINE)
 
 
 def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
@@ -155,6 +159,26 @@ def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
     pictures = [node for node in doctree.findall(nodes.image) if "jupyter_execute" in node["uri"]]
     for node, alt in zip(pictures, app.env.temp_data.get("alternative texts", []), strict=True):
         node["alt"] = alt
+
+
+def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
+    """Join the ends of intervals in text, and in the HTML tables of outputs, by a no-break space (`doctree-read`)."""
+    for text in list(doctree.findall(nodes.Text)):
+        part = text.parent
+        table = isinstance(part, nodes.raw) and "<table" in text
+        if table or not isinstance(
+            part, nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
+        ):
+            joined = INTERVAL.sub(lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+            part.replace(text, nodes.Text(joined))
+
+
+def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
+    """Leave the part before the colon of the notebooks' titles in the sidebar (Sphinx's event `env-updated`)."""
+    for name, contents in env.tocs.items():
+        if name.startswith("notebooks/"):
+            title = next(contents.findall(nodes.Text))
+            title.parent.replace(title, nodes.Text(title.partition(":")[0]))
 
 
 def run_links(docname: str, repository: str) -> str:
@@ -218,21 +242,12 @@ def mark_examples(app: Sphinx, kind: str, name: str, thing: object, options: obj
     lines[:] = text
 
 
-def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
-    translator.body.append(convert(node.astext()))
-    raise nodes.SkipNode
-
-
-def visit_displayed_math(translator: HTML5Translator, node: nodes.math_block) -> None:
-    translator.body.append(f'<div class="formula">{convert(node.astext(), display="block")}</div>')
-    raise nodes.SkipNode
-
-
 def setup(app: Sphinx) -> dict[str, bool]:
     app.add_config_value("course_repository", "", "env", str)
-    app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))
     app.connect("source-read", read_source)
     app.connect("doctree-read", describe_pictures)
+    app.connect("doctree-read", keep_intervals)
+    app.connect("env-updated", shorten_titles)
     app.connect("autodoc-process-docstring", mark_examples, priority=400)
     app.connect("html-page-context", add_plotly)
     app.connect("build-finished", write_files)

@@ -8,8 +8,8 @@ one. The directive `picture` embeds a picture that a notebook shows, so that the
     ```
 
 is the first picture below the heading that contains these words. `:number: 2` is the second one. The path may also be
-that of a drawing, which has its description inside, or of a photograph (`:alt:` describes it). With `:beside:` the text
-of the slide stands to the right of the picture.
+that of a drawing, which has its description inside, or of a photograph (`:alt:` describes it). What stands in the
+directive `notes` is shown in the presenter's view only.
 """
 
 import base64
@@ -36,7 +36,6 @@ class Picture(SphinxDirective):
         "heading": directives.unchanged,
         "number": directives.positive_int,
         "alt": directives.unchanged,
-        "beside": directives.flag,
     }
 
     def run(self) -> list[nodes.Node]:
@@ -62,9 +61,17 @@ class Picture(SphinxDirective):
         else:
             form, data = FORMATS[path.suffix], base64.b64encode(path.read_bytes()).decode()
             alt = self.options.get("alt") or unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
-        kind = "picture beside" if "beside" in self.options else "picture"
-        image = f'<img class="{kind}" src="data:{form};base64,{data}" alt="{escape(alt)}">'
+        image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
+
+
+class Notes(SphinxDirective):
+    """Notes for the lecturer, in Markdown."""
+
+    has_content = True
+
+    def run(self) -> list[nodes.Node]:
+        return [nodes.container("", *self.parse_content_to_nodes(), classes=["notes"])]
 
 
 def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str, str]]:
@@ -100,5 +107,6 @@ def choose_template(app: Sphinx, pagename: str, templatename: str, context: dict
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("picture", Picture)
+    app.add_directive("notes", Notes)
     app.connect("html-page-context", choose_template)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -137,38 +137,29 @@ def open_notebook(page, lab: Lab, name: str) -> None:
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=180_000)
 
 
+# Whether some cell has begun to run, and whether one still runs or waits: "[ ]:" has not begun, "[*]:" runs.
+_BEGUN = "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => /[*0-9]/.test(e.innerText))"
+_RUNNING = _BEGUN.replace("*0-9", "*")
+
+
 def run_all(page, patience: float) -> None:
     """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
-    deadline = time.monotonic() + patience
-    begun = False
-    while not begun:  # a notebook that has only just opened may not hear the menu
+    deadline, asked = time.monotonic() + patience, 0.0
+    while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
-        page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
-        begun = _begun(page, patience=20)
+        if time.monotonic() > asked + 20:  # a notebook that has only just opened may not hear the menu
+            page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+            page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
+            asked = time.monotonic()
+        page.wait_for_timeout(500)
     rest = 0
     while rest < 3:  # between two cells there is a moment in which none runs
-        running = [number for number, prompt in enumerate(_prompts(page)) if "*" in prompt]
-        rest = 0 if running else rest + 1
+        rest = 0 if page.evaluate(_RUNNING) else rest + 1
         if time.monotonic() > deadline:
-            raise TimeoutError(f"code cells {running} had not run after {patience:.0f} s")
-        time.sleep(1)
+            raise TimeoutError(f"code cells still ran after {patience:.0f} s")
+        page.wait_for_timeout(1000)
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=60_000)
-
-
-def _begun(page, patience: float) -> bool:
-    """Whether a code cell has a number or a star before `patience` seconds are over."""
-    deadline = time.monotonic() + patience
-    while time.monotonic() < deadline:
-        if any(prompt.strip("[]: ") for prompt in _prompts(page)):
-            return True
-        time.sleep(0.5)
-    return False
-
-
-def _prompts(page) -> list[str]:
-    return page.locator(".jp-Notebook .jp-CodeCell .jp-InputPrompt").all_inner_texts()
 
 
 def saved(page, lab: Lab, name: str) -> dict:

@@ -32,14 +32,6 @@ MINUTES = 20  # a notebook may take on a busy machine
 
 pytestmark = pytest.mark.browser
 
-BROKEN = """\
-import io, ipywidgets, matplotlib.pyplot as plt
-drawn = io.BytesIO()
-plt.figure(figsize=(1, 1)).savefig(drawn, format="png")
-plt.close("all")
-display(ipywidgets.VBox([ipywidgets.IntSlider(), ipywidgets.Image(value=drawn.getvalue())]))
-"""
-
 
 @pytest.fixture(scope="module")
 def browser():
@@ -59,9 +51,8 @@ def lab(browser, tmp_path_factory):
             if cell.cell_type == "code":
                 cell.outputs, cell.execution_count = [], None
         nbformat.write(notebook, path)
-    cells = [new_code_cell(source) for source in (BROKEN, "1 / 0", "'never reached'")]
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
-    broken = new_notebook(cells=cells, metadata=python)
+    broken = new_notebook(cells=[new_code_cell("1 / 0"), new_code_cell("2")], metadata=python)
     nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
     check = new_code_cell('from zsp_lite.widgets import self_check\nself_check("00", 1)')
     asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
@@ -90,11 +81,9 @@ def test_errors_of_a_broken_notebook_are_found(page, lab):
     open_notebook(page, lab, "broken.ipynb")
     run_all(page, patience=300)
     assert errors(page, saved(page, lab, "broken.ipynb")) == [
-        "cell 1: ZeroDivisionError: division by zero",
-        "cell 2 did not run",
+        "cell 0: ZeroDivisionError: division by zero",
+        "cell 1 did not run",
     ]
-    (output,) = slider_outputs(page)
-    assert not slider_moves_picture(output, patience=3)
 
 
 def test_a_self_check_gives_feedback_without_a_network(page, lab):

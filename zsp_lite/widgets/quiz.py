@@ -17,9 +17,11 @@ _COLOURS = {
     **{f"--jq-{kind}-bg": BLUE for kind in ("multiple-choice", "many-choice", "numeric")},
     "--jq-correct-color": "#007A5A",
     "--jq-incorrect-color": "#C24E00",
-    "--jq-numeric-input-bg": "#333333",
     "--jq-numeric-input-label": "currentColor",
 }
+_FIELDS = """<style>
+input.Input-text, input.Input-text:focus { border: 1px solid #555555; background: white; color: #222222; }
+</style>"""
 
 
 def read_questions(notebook: str) -> list[list[dict]]:
@@ -40,7 +42,7 @@ def self_check(notebook: str, number: int) -> None:
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
     form, script = (output.data for output in captured.outputs)
-    ipython.display.display(ipython.display.HTML(form["text/html"] + "</div>"))  # jupyterquiz leaves it open
+    ipython.display.display(ipython.display.HTML(form["text/html"] + _FIELDS + "</div>"))  # jupyterquiz leaves it open
     # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from the script.
     hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
     ipython.display.display(ipython.display.Javascript(hidden))

@@ -1,0 +1,59 @@
+"""The course site in Chromium: pages fit a phone, fields can be read, the class does not see the presenter's notes."""
+
+import subprocess
+import sys
+
+import pytest
+from lab_in_browser import REPOSITORY, running_chromium
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with running_chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Folder of the site, without the data of the playground, which has a test of its own."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-c", "docs/site", "-d", folder / "doctrees", ".", folder / "html"]
+    subprocess.run(command, cwd=REPOSITORY, check=True)
+    return folder / "html"
+
+
+def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
+    page, wide = browser.new_page(viewport={"width": 390, "height": 800}), {}
+    for path in sorted(site.rglob("*.html")):
+        name = str(path.relative_to(site))
+        if "_static" not in path.parts and name != "index.html":  # which leads on to the start page
+            page.goto(path.as_uri())
+            if (width := page.evaluate("document.documentElement.scrollWidth")) > 390:
+                wide[name] = width
+    assert not wide
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_an_answer_can_be_read_while_it_is_typed(browser, site, scheme):
+    page = browser.new_page(color_scheme=scheme)
+    page.goto((site / "notebooks" / "04_umeyama_ransac.html").as_uri())
+    field = page.locator("input.Input-text").first
+    field.fill("0.008")
+    colours = field.evaluate("field => [getComputedStyle(field).color, getComputedStyle(field).backgroundColor]")
+    assert colours == ["rgb(34, 34, 34)", "rgb(255, 255, 255)"]
+
+
+def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
+    page = browser.new_page()
+    page.goto((site / "docs" / "slides" / "lab_2.html").as_uri())
+    with page.expect_popup() as opened:
+        page.keyboard.press("n")
+    presenter = opened.value
+    assert "Questions on exercise 02" in presenter.inner_text("article")
+    for key, window in (("ArrowRight", page), ("ArrowRight", presenter)):
+        window.keyboard.press(key)
+    assert page.inner_text("#place") == presenter.inner_text("header b") == "3 / 12"
+    assert "equation 3" in presenter.inner_text("article") and "Taken literally" in presenter.inner_text("article")
+    assert "equation 3" not in page.inner_text("main") and "Taken literally" not in page.inner_text("main")
