@@ -4,10 +4,8 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Real, UInt8
 
-from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-MAX_POINTS = 4000  # of both clouds together; more points slow down browsers and enlarge notebooks
 STYLES = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))  # colour, symbol and size of both clouds
 _AXIS_LABELS = "x (right)", "y (down)", "z (forward)"
 
@@ -19,29 +17,20 @@ def aligned_clouds(
 ) -> go.Figure:
     """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
 
-    A random subset is drawn of each; the clouds differ in colour, if no `colours` are given, and in their markers.
+    The clouds differ in colour, if no `colours` are given, and in their markers. More than a few thousand points slow
+    down browsers and enlarge notebooks.
     """
-    rng = np.random.default_rng(0)
-    traces, drawn = [], []
-    clouds = {"reference, aligned": reference, "target": target}
+    traces, clouds = [], {"reference, aligned": reference, "target": target}
     for (name, cloud), own, (colour, symbol, size) in zip(clouds.items(), colours or (None, None), STYLES):
-        cloud = np.asarray(cloud, dtype=np.float64)
-        if len(cloud) == 0 or not np.isfinite(cloud).all():
-            raise InputError(f"point cloud {name!r} of shape {cloud.shape} is empty or not finite")
-        if len(cloud) > MAX_POINTS // 2:
-            kept = np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))
-            cloud, own = cloud[kept], None if own is None else own[kept]
         if own is not None:
             colour = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in own.tolist()]
         # For a cloud of unit standard deviation three decimals are finer than a pixel; they keep the page small.
-        cloud = np.round(cloud, 3).astype(np.float32)
-        drawn.append(cloud)
-        x, y, z = cloud.T
+        x, y, z = np.round(cloud, 3).astype(np.float32).T
         marker = {"size": size, "color": colour, "symbol": symbol, "opacity": 0.75}
         traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker))
 
     # Ranges of equal length, from percentiles, which are robust to outliers.
-    low, high = np.percentile(np.concatenate(drawn), [1, 99], axis=0)
+    low, high = np.percentile(np.concatenate([reference, target]), [1, 99], axis=0)
     middle, half = (low + high) / 2, 0.6 * float((high - low).max())
     axes = {
         f"{label[0]}axis": {"title": {"text": label}, "range": [float(x - half), float(x + half)], "nticks": 5}
