@@ -112,7 +112,7 @@ def test_two_poses_are_shown_side_by_side_where_the_answer_is_one_of_two(results
     plt.close(figure)
 
 
-def test_the_scene_has_every_pose_in_one_frame_the_pictures_colours_and_leaves_the_wheel_to_the_page(results, text):
+def test_the_scene_has_every_pose_in_one_frame_and_leaves_the_wheel_to_the_page(results, text):
     (result,) = results
     (content,) = re.findall(r'<script type="application/json">(.*?)</script>', text)
     content = json.loads(content)
@@ -122,8 +122,6 @@ def test_the_scene_has_every_pose_in_one_frame_the_pictures_colours_and_leaves_t
     np.testing.assert_allclose(content["poses"][0], result.estimate.sim3.matrix[:3], atol=1e-5)
     moved = result.estimates["verified"].propagate([result.estimate.target_camera])[0]
     np.testing.assert_allclose(content["poses"][1], moved.matrix[:3], atol=1e-5)
-    assert len(content["points"]) == len(content["pictures"][0]) and len(set(content["pictures"][0])) > 50
-    assert all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in content["pictures"][0])
     assert '"scrollZoom": false' in text
 
 

@@ -29,7 +29,7 @@ from zsp_lite.data.depth import unproject_depth
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
-from zsp_lite.points import axis_deviation, near_median, object_pixels
+from zsp_lite.points import axis_deviation, near_median
 from zsp_lite.views import View
 
 Cell = Sequence[int] | np.ndarray  # (row, col)
@@ -49,7 +49,6 @@ _JOINED = 15  # matches with a line
 _OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]  # for lines and texts on dark images
 BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]  # for white lines on light images
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-_INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
 
 
 def show_images(
@@ -446,12 +445,23 @@ def draw_moved_cloud(
 
 def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4, columns: int | None = None) -> Figure:
     """Show the reference under its own points, and for each estimate its target view under the moved points."""
-    reference = next(iter(estimates.values())).reference_view
-    frames = [reference.frame, *(one.target_views[one.view].frame for one in estimates.values())]
-    figure, axes = show_images([one.rgb for one in frames], ["reference, its own points", *estimates], columns, size)
-    moves = [Sim3.identity(), *(one.sim3 for one in estimates.values())]
-    draw_moved_cloud(axes, [one.camera for one in frames], object_cloud(reference, most=1500), moves, None, size=5)
+    views = chosen_views(estimates.values())
+    titles = ["reference, its own points", *estimates]
+    figure, axes = show_images([view.frame.rgb for view in views], titles, columns, size)
+    draw_estimates(axes, estimates.values(), most=1500, size=5)
     return figure
+
+
+def chosen_views(estimates: Iterable[PoseEstimate]) -> list[View]:
+    """Return the reference of estimates, and for each its target view."""
+    first, *_ = estimates
+    return [first.reference_view, *(one.target_views[one.view] for one in estimates)]
+
+
+def draw_estimates(axes: Iterable[Axes], estimates: Iterable[PoseEstimate], most: int = 20000, size: float = 3) -> None:
+    """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each estimate."""
+    views, poses = chosen_views(estimates), [Sim3.identity(), *(one.sim3 for one in estimates)]
+    draw_moved_cloud(axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size)
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -470,23 +480,15 @@ def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
 
     The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
     """
-    return coloured_cloud(view, most)[0]
-
-
-def coloured_cloud(view: View, most: int = 2000) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Gather the points of `object_cloud` with their RGB colours in the image."""
     frame = view.frame
-    pixels = object_pixels(frame, _INTERIOR)
-    if frame.mask is None:
-        rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
-        pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
-    points, colours = unproject_depth(frame.depth, frame.camera)[pixels], frame.rgb[pixels]
+    inside = view.soft_mask > 0.5 if frame.mask is None else frame.mask > 0.9
+    points = unproject_depth(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
     kept = np.flatnonzero(near_median(points, 2.5))
     if len(kept) > most:
         kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), most, replace=False))]
-    return points[kept], colours[kept]
+    return points[kept]
 
 
 def _panels(number: int, columns: int | None, width: float, height: float) -> tuple[Figure, list[Axes]]:

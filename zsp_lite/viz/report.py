@@ -18,18 +18,16 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.samples import REPOSITORY
-from zsp_lite.views import View
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PhotographResult, photograph_figure, photograph_rows
 from zsp_lite.viz.pose_picture import pose_picture
-from zsp_lite.viz.scene3d import STYLES, aligned_clouds
+from zsp_lite.viz.scene3d import aligned_clouds
 
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
 _MEANINGS = {
@@ -138,18 +136,12 @@ def table_rows(result: PairResult) -> list[tuple[str, ...]]:
     """Format the estimate of each solver (see `COLUMNS`)."""
     rows = []
     for solver, estimate in result.estimates.items():
-        error = result.errors.get(solver)
-        rows.append(
-            (
-                result.title,
-                solver,
-                f"{estimate.view + 1} of {len(estimate.target_views)}",
-                f"{int(estimate.inliers.sum())} of {len(estimate.inliers)}",
-                "–" if error is None else f"{error:.1f}°",
-                "–" if estimate.confidence is None else f"{estimate.confidence:.2f}",
-                f"{sum(estimate.timings.values()):.2f} s",
-            )
-        )
+        view = f"{estimate.view + 1} of {len(estimate.target_views)}"
+        inliers = f"{int(estimate.inliers.sum())} of {len(estimate.inliers)}"
+        error = f"{result.errors[solver]:.1f}°" if solver in result.errors else "–"
+        confidence = "–" if estimate.confidence is None else f"{estimate.confidence:.2f}"
+        seconds = f"{sum(estimate.timings.values()):.2f} s"
+        rows.append((result.title, solver, view, inliers, error, confidence, seconds))
     return rows
 
 
@@ -170,20 +162,16 @@ def overview(results: Sequence[PairResult]) -> Figure:
     The colour of a point is its position along the reference object. The poses are marked as right or wrong.
     """
     titles = ["reference", *(f"{solver} solver" for solver in results[0].estimates)]
-    images, cameras = [], []
+    images = []
     for result in results:
-        views = [_chosen_views(estimate)[1] for estimate in result.estimates.values()]
-        frames = [result.estimate.reference_view.frame, *(view.frame for view in views)]
-        images += [frames[0].rgb, *(plots.pale(frame.rgb) for frame in frames[1:])]
-        cameras.append([frame.camera for frame in frames])
+        reference, *targets = (view.frame.rgb for view in plots.chosen_views(result.estimates.values()))
+        images += [reference, *map(plots.pale, targets)]
     figure, axes = plots.show_images(images, columns=len(titles), size=2.4)
     figure.set_layout_engine("compressed")
     for axis, title in zip(axes, titles):
         axis.set_title(title, fontsize=14)
-    for result, row, panels in zip(results, cameras, np.reshape(axes, (-1, len(titles)))):
-        cloud = plots.object_cloud(result.estimate.reference_view, most=20000)
-        moves = [Sim3.identity(), *(estimate.sim3 for estimate in result.estimates.values())]
-        plots.draw_moved_cloud(panels, row, cloud, moves, names=None)
+    for result, panels in zip(results, np.reshape(axes, (-1, len(titles)))):
+        plots.draw_estimates(panels, result.estimates.values())
         plots.mark(panels[0], result.title, "none", 14)
         for axis, error in zip(panels[1:], result.errors.values()):
             word, colour = ("right", plots.BLUE) if error < _RIGHT else ("wrong", plots.VERMILLION)
@@ -193,7 +181,7 @@ def overview(results: Sequence[PairResult]) -> Figure:
 
 def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
     """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the page."""
-    views, names = _chosen_views(result.estimate), ("reference", "chosen target")
+    views, names = plots.chosen_views([result.estimate]), ("reference", "chosen target")
     images = [view.frame.rgb for view in views]
     saliency = dict(zip(names, (view.features.saliency.cpu().numpy() for view in views)))
     cycles, sim = {}, similarity(views[0].features, views[1].features)
@@ -212,16 +200,16 @@ def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
 
 
 def _scene_html(result: PairResult, scene_id: str) -> Markup:
-    """Draw both clouds, with a menu of all poses and a choice of the colours; the page's script serves both."""
-    first, second = _chosen_views(result.estimate)
-    (cloud, colours), (target, target_colours) = map(plots.coloured_cloud, (first, second))
+    """Draw both clouds, with a menu of all poses that the page's script serves."""
+    first, second = plots.chosen_views([result.estimate])
+    cloud = plots.object_cloud(first)
     poses = {}
     for solver, estimate in result.estimates.items():
         poses[f"{solver} solver"] = estimate
         for rank, one in enumerate(estimate.alternatives, 2):
             poses[f"{solver} solver, hypothesis {rank}"] = replace(estimate, sim3=one.sim3, view=one.view)
     moves = [one.propagate([second.frame.camera])[0] for one in poses.values()]
-    scene = aligned_clouds(moves[0].apply(cloud), target, colours=(colours, target_colours))
+    scene = aligned_clouds(moves[0].apply(cloud), plots.object_cloud(second))
     scene.update_layout(
         height=400, paper_bgcolor="rgba(0,0,0,0)", font={"color": _GREY},
         legend={"x": 0.5, "xanchor": "center", "y": 0, "yanchor": "top", "bgcolor": "rgba(0,0,0,0)"},
@@ -234,8 +222,6 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     content = {
         "points": np.round(cloud, 4).tolist(),
         "poses": [move.matrix[:3].round(6).tolist() for move in moves],
-        "plain": [style[0] for style in STYLES],
-        "pictures": [list(trace.marker.color) for trace in scene.data],
     }
     plot = scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config)
     return Markup(_template("scene.html").render(names=list(poses), plot=Markup(plot), content=content))
@@ -248,11 +234,6 @@ def _two_poses_figure(estimate: PoseEstimate) -> Figure:
     title = f"turned by {estimate.angle_to(second):.0f}°, probability {second.confidence:.2f}"
     poses = {f"probability {estimate.confidence:.2f}": estimate, title: replace(estimate, sim3=moved)}
     return plots.moved_points(poses)
-
-
-def _chosen_views(estimate: PoseEstimate) -> tuple[View, View]:
-    """Return the reference and the chosen target view."""
-    return estimate.reference_view, estimate.target_views[estimate.view]
 
 
 def _data_uri(figure: Figure) -> str:

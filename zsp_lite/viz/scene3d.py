@@ -2,32 +2,24 @@
 
 import numpy as np
 import plotly.graph_objects as go
-from jaxtyping import Real, UInt8
+from jaxtyping import Real
 
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-STYLES = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))  # colour, symbol and size of both clouds
 _AXIS_LABELS = "x (right)", "y (down)", "z (forward)"
 
 
-def aligned_clouds(
-    reference: Real[np.ndarray, "n 3"],
-    target: Real[np.ndarray, "m 3"],
-    colours: tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]] | None = None,
-) -> go.Figure:
+def aligned_clouds(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, "m 3"]) -> go.Figure:
     """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
 
-    The clouds differ in colour, if no `colours` are given, and in their markers. More than a few thousand points slow
-    down browsers and enlarge notebooks.
+    More than a few thousand points slow down browsers and enlarge notebooks.
     """
-    traces, clouds = [], {"reference, aligned": reference, "target": target}
-    for (name, cloud), own, (colour, symbol, size) in zip(clouds.items(), colours or (None, None), STYLES):
-        if own is not None:
-            colour = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in own.tolist()]
+    traces = []
+    styles = {"color": BLUE, "symbol": "circle", "size": 2.2}, {"color": ORANGE, "symbol": "diamond-open", "size": 2.6}
+    for name, cloud, style in zip(("reference, aligned", "target"), (reference, target), styles):
         # For a cloud of unit standard deviation three decimals are finer than a pixel; they keep the page small.
         x, y, z = np.round(cloud, 3).astype(np.float32).T
-        marker = {"size": size, "color": colour, "symbol": symbol, "opacity": 0.75}
-        traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker))
+        traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker={"opacity": 0.75, **style}))
 
     # Ranges of equal length, from percentiles, which are robust to outliers.
     low, high = np.percentile(np.concatenate([reference, target]), [1, 99], axis=0)
