@@ -6,7 +6,7 @@ cell (row, col) of a grid (rows, columns). Colours are distinguishable with colo
 are no TeX.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -378,18 +378,14 @@ def pca_colours(
     colours mean similar features, also between images. The components are fitted to the `foreground` patches; others
     are white. The result has an RGB image in [0, 1] for each map, with one pixel per patch.
     """
-    features = [np.asarray(features, dtype=np.float64) for features in maps]
-    if foreground is None:
-        foreground = [np.ones(features.shape[:2], bool) for features in features]
-    inside = np.concatenate([feature[np.asarray(where, bool)] for feature, where in zip(features, foreground)])
-    mean = inside.mean(axis=0)
-    axes = np.linalg.eigh((inside - mean).T @ (inside - mean))[1][:, :-4:-1]
-    low, high = np.percentile((inside - mean) @ axes, [2, 98], axis=0)
-    span = np.where(high > low, high - low, 1.0)
-    return [
-        np.where(np.asarray(where, bool)[..., None], (((feature - mean) @ axes - low) / span).clip(0, 1), 1.0)
-        for feature, where in zip(features, foreground)
-    ]
+    features = [np.asarray(one, dtype=np.float64) for one in maps]
+    on = [np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)]
+    inside = np.concatenate([one[where] for one, where in zip(features, on)])
+    centred = inside - inside.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1][:, :-4:-1]
+    low, high = np.percentile(inside @ axes, [2, 98], axis=0)
+    colours = [((one @ axes - low) / np.maximum(high - low, 1e-12)).clip(0, 1) for one in features]
+    return [np.where(where[..., None], own, 1.0) for own, where in zip(colours, on)]
 
 
 def draw_points(
@@ -452,13 +448,15 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4, colum
     return figure
 
 
-def chosen_views(estimates: Iterable[PoseEstimate]) -> list[View]:
+def chosen_views(estimates: Collection[PoseEstimate]) -> list[View]:
     """Return the reference of estimates, and for each its target view."""
     first, *_ = estimates
     return [first.reference_view, *(one.target_views[one.view] for one in estimates)]
 
 
-def draw_estimates(axes: Iterable[Axes], estimates: Iterable[PoseEstimate], most: int = 20000, size: float = 3) -> None:
+def draw_estimates(
+    axes: Iterable[Axes], estimates: Collection[PoseEstimate], most: int = 20000, size: float = 3
+) -> None:
     """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each estimate."""
     views, poses = chosen_views(estimates), [Sim3.identity(), *(one.sim3 for one in estimates)]
     draw_moved_cloud(axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size)

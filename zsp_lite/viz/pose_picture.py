@@ -105,14 +105,12 @@ def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "refe
 def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: np.ndarray) -> None:
     """Draw world points of the target (grey) and of the reference, the arc of the target cameras, and its gap."""
     begin, end = seen.gap
-    several = len(seen.targets) > 1
     axis.images[0].remove()
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
-    empty = f"no target view in these {end - begin:.0f}°" if several else "only one target view"
+    axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
+    empty, spanned = f"no target view in these {end - begin:.0f}°", f"the target views span {360 - end + begin:.0f}°"
     axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
-    if several:
-        axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
-        axis.plot([], [], color=plots.BLUE, linewidth=4, label=f"the target views span {360 - end + begin:.0f}°")
+    axis.plot([], [], color=plots.BLUE, linewidth=4, label=spanned)
     flat = [(points - seen.centre) @ seen.axes.T for points in (target[:: -(-len(target) // _POINTS)], reference)]
     scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
     for points, colours in zip(flat, ("0.6", plots.coordinate_colours(reference))):

@@ -112,8 +112,7 @@ def render_page(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
         own=own, labelled=any(result.errors for result in results) or not own, photograph=photograph,
         photograph_columns=PHOTOGRAPH_COLUMNS, photograph_rows=photograph_rows(photograph),
-        photograph_picture=picture,
-        link=lambda name: _notebook_link(name, folder),
+        photograph_picture=picture, link=lambda name: _notebook_link(name, folder),
     )  # fmt: skip
 
 
@@ -124,12 +123,12 @@ def _template(name: str) -> Template:
 
 def _notebook_link(name: str, folder: Path) -> Markup:
     """Link to a notebook of the clone; its number alone if there is none, or if it is on another drive."""
-    label, local = f"notebook {name[:2]}", REPOSITORY / "notebooks" / f"{name}.ipynb"
+    label, local = Markup("notebook {}").format(name[:2]), REPOSITORY / "notebooks" / f"{name}.ipynb"
     try:
         address = Path(os.path.relpath(local, folder)).as_posix()
     except ValueError:
-        return Markup("{}").format(label)
-    return Markup('<a href="{}">{}</a>').format(address, label) if local.is_file() else Markup("{}").format(label)
+        return label
+    return Markup('<a href="{}">{}</a>').format(address, label) if local.is_file() else label
 
 
 def table_rows(result: PairResult) -> list[tuple[str, ...]]:
@@ -210,13 +209,10 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
             poses[f"{solver} solver, hypothesis {rank}"] = replace(estimate, sim3=one.sim3, view=one.view)
     moves = [one.propagate([second.frame.camera])[0] for one in poses.values()]
     scene = aligned_clouds(moves[0].apply(cloud), plots.object_cloud(second))
-    scene.update_layout(
-        height=400, paper_bgcolor="rgba(0,0,0,0)", font={"color": _GREY},
-        legend={"x": 0.5, "xanchor": "center", "y": 0, "yanchor": "top", "bgcolor": "rgba(0,0,0,0)"},
-        margin={"l": 0, "r": 0, "t": 0, "b": 28},
-        # The clouds fill the scene. The eye is above the target camera, to its right.
-        scene_camera={"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}},
-    )  # fmt: skip
+    # The clouds fill the scene. The eye is above the target camera, to its right.
+    camera = {"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
+    ground = {"paper_bgcolor": "rgba(0,0,0,0)", "font_color": _GREY, "legend_bgcolor": "rgba(0,0,0,0)"}
+    scene.update_layout(height=400, scene_camera=camera, **ground)
     scene.update_layout({f"scene_{axis}axis": {"visible": False} for axis in "xyz"})
     config = {"displaylogo": False, "responsive": True, "scrollZoom": False, "displayModeBar": False}
     content = {

@@ -35,7 +35,7 @@ def aligned_clouds(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, 
     }
     return go.Figure(traces).update_layout(
         height=440,
-        margin={"l": 0, "r": 0, "t": 0, "b": 10},
-        legend={"itemsizing": "constant", "orientation": "h", "x": 0, "y": 0, "bgcolor": "rgba(255,255,255,0.8)"},
+        margin={"l": 0, "r": 0, "t": 0, "b": 28},
+        legend={"itemsizing": "constant", "orientation": "h", "x": 0.5, "xanchor": "center", "y": 0, "yanchor": "top"},
         scene={**axes, "aspectmode": "cube", "camera": camera},
     )
