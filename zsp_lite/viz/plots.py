@@ -22,6 +22,7 @@ from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
@@ -458,8 +459,14 @@ def draw_estimates(
     axes: Iterable[Axes], estimates: Collection[PoseEstimate], most: int = 20000, size: float = 3
 ) -> None:
     """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each estimate."""
-    views, poses = chosen_views(estimates), [Sim3.identity(), *(one.sim3 for one in estimates)]
+    views, poses = chosen_views(estimates), [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)]
     draw_moved_cloud(axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size)
+
+
+def _rounded(pose: Sim3) -> Sim3:
+    """Round a pose: the number of threads changes its last digits, and should not change a picture."""
+    turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
+    return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -12,6 +12,7 @@ from matplotlib.patches import Arc, Wedge
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes
 from zsp_lite.data.frames import ON_OBJECT
+from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz import plots
@@ -83,6 +84,8 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], None)
     plots.draw_moved_cloud(axes[2:], cameras, cloud, estimate.propagate(cameras), None)
     target_cloud = world_cloud(result.targets)[0]
+    if not len(target_cloud):
+        raise InputError("no depth is known on the target object, expected some for a picture of the pose")
     # The reference camera is the origin of its own frame.
     place = estimate.target_camera.to_world(estimate.sim3.t)
     seen = coverage({int(view) + 1: frames[view].camera for view in used}, place, np.median(target_cloud, axis=0))
