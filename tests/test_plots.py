@@ -55,14 +55,22 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
     assert [line in ("-", "solid") for line in lines.values()] == [False, True, True]  # outliers first, below
 
 
+def test_of_many_matches_fifteen_are_joined_with_the_same_share_of_inliers():
+    cells = np.stack([np.arange(60) // 10, np.arange(60) % 10], axis=1)
+    figure = plots.show_matches([IMAGE, IMAGE], [cells, cells], (6, 10), np.arange(60) % 5 == 0)
+    assert [line.get_linestyle() in ("-", "solid") for line in figure.artists] == 12 * [False] + 3 * [True]
+    assert sum(len(marks.get_offsets()) for marks in figure.axes[0].collections) == 60
+
+
 def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():
     _, (axis,) = plots.show_images([IMAGE])
     # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of the latter.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
     np.testing.assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
-    plots.draw_axes(axis, CAMERA, lambda points: points + [0, 0, 2], np.zeros(3), 0.2)
+    assert axis.get_xlim() == (0, 80) and axis.get_ylim() == (60, 0)
+    plots.draw_axes(axis, CAMERA, np.array([0, 0, 2]), np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]]), "xyz")
     at = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
-    assert at["x"] == pytest.approx((50, 30)) and at["y"] == pytest.approx((40, 40))
+    assert at == {"x": pytest.approx((50, 30)), "y": pytest.approx((40, 40))}
 
 
 def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects():

@@ -51,7 +51,8 @@ def align(
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_labels
-    from zsp_lite.viz.category_sheet import COLUMNS, object_rows, write_category_report
+    from zsp_lite.viz.category_sheet import COLUMNS, object_rows
+    from zsp_lite.viz.report import write_category_report
 
     dataset, out = Co3D(data), out or Path("outputs/align") / category
     found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers, **again)

@@ -1,26 +1,21 @@
 """Contact sheet of a category: its objects seen by one camera, as scanned and in their common frame."""
 
-from base64 import b64encode
 from collections.abc import Sequence
-from io import BytesIO
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION
 
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
-DOUBTFUL = 0.8  # an object with a lower probability should be looked at
-_PER_LINE = 10
+_DOUBTFUL = 0.8  # an object with a lower probability should be looked at
+MOST = 10  # objects of a sheet
 
 
 def contact_sheet(
@@ -31,15 +26,15 @@ def contact_sheet(
     The camera is that of the first frame of the most probable object of the category. Doubtful objects are shown in
     their next best turn, too. At most ten objects are shown.
     """
-    names = list(names or alignment.objects)[:_PER_LINE]
+    names = list(names or alignment.objects)[:MOST]
     objects = {name: alignment.objects[name] for name in names}
     surest, first = max(alignment.objects.items(), key=lambda item: item[1].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ first.sim3.R.T
     rows = {"as scanned": dict.fromkeys(names, camera)}
     rows["aligned"] = {name: common @ one.sim3.R for name, one in objects.items()}
-    doubtful = {name: one.alternative for name, one in objects.items() if one.probability < DOUBTFUL}
-    if turned := {name: common @ other.R for name, other in doubtful.items() if other}:
+    others = {name: objects[name].alternative for name in doubtful(alignment) if name in names}
+    if turned := {name: common @ other.R for name, other in others.items() if other}:
         rows["or turned"] = turned
     size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
     figure, axes = plt.subplots(len(rows), len(names), figsize=size, layout="constrained", squeeze=False)
@@ -50,9 +45,14 @@ def contact_sheet(
             if name in cameras:
                 axis.imshow(_nearest(dataset, category, name, cameras[name]))
     for axis, (name, one) in zip(axes[1], objects.items()):
-        colour = VERMILLION if name in doubtful else "black"
-        axis.set_xlabel(f"{name[:16]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour)
+        colour = VERMILLION if name in others else "black"
+        axis.set_xlabel(f"{name[:16]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour, parse_math=False)
     return figure
+
+
+def doubtful(alignment: CategoryAlignment) -> list[str]:
+    """Return the names of the objects whose pose should be looked at."""
+    return [name for name, one in alignment.objects.items() if one.probability < _DOUBTFUL]
 
 
 def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
@@ -60,28 +60,9 @@ def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
     rows = []
     for name, one in alignment.objects.items():
         other = (f"{one.turn:.0f}°", f"{100 * one.alternative_probability:.0f}") if one.alternative else ("", "")
-        flag = "" if one.probability >= DOUBTFUL else " (look)"
+        flag = " (look)" if name in doubtful(alignment) else ""
         rows.append((f"{name}{flag}", f"{100 * one.probability:.0f}", *other))
     return rows
-
-
-def write_category_report(path: str | Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
-    """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
-    names, sheets = list(alignment.objects), []
-    for start in range(0, len(names), _PER_LINE):
-        figure, data = contact_sheet(dataset, category, alignment, names[start : start + _PER_LINE]), BytesIO()
-        figure.savefig(data, format="jpg", dpi=150, pil_kwargs={"quality": 90})
-        plt.close(figure)
-        sheets.append(data.getvalue())
-    page = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
-    text = page.get_template("category.html").render(
-        category=category, columns=COLUMNS, rows=object_rows(alignment),
-        images=[f"data:image/jpeg;base64,{b64encode(sheet).decode()}" for sheet in sheets],
-        doubtful=[name for name, one in alignment.objects.items() if one.probability < DOUBTFUL],
-    )  # fmt: skip
-    write_atomic(Path(path).with_name("objects.jpg"), sheets[0])
-    write_atomic(path, text.encode())
-    return Path(path)
 
 
 def _frames(dataset: Co3D, category: str, name: str) -> list:

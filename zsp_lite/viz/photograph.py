@@ -9,7 +9,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.photograph import (
@@ -28,10 +27,10 @@ from zsp_lite.synthetic.ground_truth import object_poses
 from zsp_lite.synthetic.recording import POSES_FILE
 from zsp_lite.viz import plots
 
-PHOTOGRAPH_CREDIT = "Photograph and depth: Middlebury stereo data 2014 (Scharstein et al.), from scikit-image."
 PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
-_FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}
-_POINTS = 1500
+_FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}  # settings of `ZeroShotPose`, and their names here
+_SOLVERS = ("paper", "verified")
+_POINTS = 1500  # drawn of the aligned cloud
 _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
 
 
@@ -54,31 +53,24 @@ class PhotographResult:
     up_error: float  # degrees between the estimated top and the normal of the floor
 
 
-def run_photograph(
-    dataset: Co3D,
-    backbone: FeatureExtractor,
-    sequence: str | None = None,
-    foregrounds: Sequence[str] = ("mask", "saliency"),
-    solvers: Sequence[str] = ("paper", "verified"),
-) -> Iterator[PhotographResult]:
+def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[PhotographResult]:
     """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
 
-    There is one result for each of the settings `foreground` and `solver` of `ZeroShotPose`, and none without a
-    category of synthetic motorcycles. By default the sequence is `PHOTOGRAPH_TARGET`, or the first of other data; both
-    are independent of the results.
+    There is one result for each foreground and solver, and none without a category of synthetic motorcycles. The
+    sequence is `PHOTOGRAPH_TARGET`, or the first of other data; both are independent of the results.
     """
     if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
         return
     poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
-    sequence = sequence or (PHOTOGRAPH_TARGET if PHOTOGRAPH_TARGET in poses else min(poses))
+    sequence = PHOTOGRAPH_TARGET if PHOTOGRAPH_TARGET in poses else min(poses)
     frames = dataset.frames(PHOTOGRAPH_CATEGORY, sequence)
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
     photograph, pose = motorcycle_photograph(), poses[sequence]
     points, _ = dataset.point_cloud(PHOTOGRAPH_CATEGORY, sequence)
-    for foreground in foregrounds:
+    for foreground in _FOREGROUNDS:
         method = ZeroShotPose(backbone, foreground=foreground)
         reference, *views = method.views([photograph, *targets])
-        for solver in solvers:
+        for solver in _SOLVERS:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)
             camera, to_photograph = estimate.target_camera, estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R
@@ -97,52 +89,34 @@ def photograph_rows(results: Sequence[PhotographResult]) -> list[tuple[str, str,
     return rows
 
 
-def photograph_figure(results: Sequence[PhotographResult], size: float = 3.6) -> Figure:
+def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     """Draw the aligned cloud and the estimated front, left and up on the photograph, one panel per result.
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye. The colour of a point is
     its position from the rear (dark) to the front (bright) of the synthetic motorcycle.
     """
-    photograph, sequence = results[0].photograph, results[0].sequence
-    view = results[0].estimate.target_views[results[0].estimate.view].frame.rgb
-    height, width = photograph.rgb.shape[:2]
+    photograph, estimate = results[0].photograph, results[0].estimate
+    view, (height, width) = estimate.target_views[estimate.view].frame.rgb, photograph.camera.size
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)  # to the aspect of the photograph
-    left = [np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255), photograph.rgb]
-    titles = [f"a view of the synthetic motorcycle,\n{sequence}", "directions judged by eye\n"]
-    columns, pictures, texts = len({result.solver for result in results}), [], []
-    for row, start in enumerate(range(0, len(results), columns)):
-        found = results[start : start + columns]
-        pictures += [left[row], *[photograph.rgb] * columns]
-        texts += [titles[row], *map(_title, found)]
-    figure, axes = plots.show_images(pictures, texts, columns=1 + columns, size=size)
+    view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
+    titles = [_title(result) for result in results]
+    titles.insert(len(_SOLVERS), "directions judged by eye\n")
+    titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
+    images = [view, *[photograph.rgb] * (len(titles) - 1)]
+    figure, (_, *axes) = plots.show_images(images, titles, columns=1 + len(_SOLVERS), size=3.6)
     up, front = np.array(PHOTOGRAPH_UP), np.array(PHOTOGRAPH_FRONT)
-    centre = np.median(object_points(photograph), axis=0)
-    _draw(axes[1 + columns], photograph.camera, np.stack([front, np.cross(up, front), up], axis=1), centre)
-    for index, result in enumerate(results):
-        draw_result(axes[index // columns * (1 + columns) + 1 + index % columns], result)
+    centre, directions = np.median(object_points(photograph), axis=0), np.stack([front, np.cross(up, front), up])
+    _draw_directions(axes.pop(len(_SOLVERS)), photograph, centre, directions)
+    for axis, result in zip(axes, results):
+        chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
+        colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
+        plots.draw_points(axis, photograph.camera, result.cloud[chosen], colours, size=6)
+        _draw_directions(axis, photograph, result.cloud.mean(axis=0), result.axes.T)
     return figure
 
 
-def draw_result(axis: Axes, result: PhotographResult) -> None:
-    """Draw points of the aligned cloud and the estimated directions."""
-    chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
-    colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
-    plots.draw_points(axis, result.photograph.camera, result.cloud[chosen], colours, size=6)
-    _draw(axis, result.photograph.camera, result.axes, result.cloud.mean(axis=0))
-
-
-def _draw(axis: Axes, camera: Camera, directions: np.ndarray, origin: np.ndarray) -> None:
-    """Draw three directions, the columns of a matrix, as arrows."""
-    plots.draw_axes(
-        axis, camera, lambda ends: origin + ends @ directions.T, np.zeros(3), _LENGTH, ("front", "left", "up")
-    )
-    size = np.array(camera.size[::-1])
-    for artist in axis.texts:  # arrows that leave the picture do not move the panels, and their names stay inside
-        artist.set_in_layout(False)
-        if artist.get_text():
-            artist.set_position(np.clip(artist.get_position(), 0.08 * size, 0.92 * size))
-        else:
-            artist.arrow_patch.set_clip_path(axis.patch)
+def _draw_directions(axis: Axes, frame: Frame, origin: np.ndarray, directions: np.ndarray) -> None:
+    plots.draw_axes(axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up"))
 
 
 def _title(result: PhotographResult) -> str:

@@ -1,11 +1,12 @@
-"""Plots of every stage of the method, as primitives to combine.
+"""Plots of every stage of the method, as pieces to combine.
 
 `show_...` makes a figure: images in a grid, maps over images, matches between two, curves, points, intervals, dots by
 category, histograms. `draw_...`, `overlay_map` and the marks add to axes, so that a figure is a few calls. A patch is a
-cell (row, col) of a grid (rows, columns). Colours are distinguishable with colour-vision deficiencies.
+cell (row, col) of a grid (rows, columns). Colours are distinguishable with colour-vision deficiencies. Titles and names
+are no TeX.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -21,13 +22,15 @@ from matplotlib.patches import ConnectionPatch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import offset_copy
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.errors import InputError
+from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
-from zsp_lite.points import axis_deviation, near_median, object_pixels
+from zsp_lite.points import axis_deviation, near_median
 from zsp_lite.views import View
 
 Cell = Sequence[int] | np.ndarray  # (row, col)
@@ -43,15 +46,10 @@ _CLOUD_MARKERS = "oxs^"  # crosses let discs below them be seen
 _AXIS_COLOURS = VERMILLION, GREEN, BLUE
 _FONT = 10
 _MARKED = 20  # points of a curve; more have no markers
+_JOINED = 15  # matches with a line
 _OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]  # for lines and texts on dark images
 BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]  # for white lines on light images
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-_INTERIOR = 0.9  # a pixel is on the object and not at its border if its mask probability is above this
-
-
-def plain_text(text: str) -> str:
-    """Escape a text for matplotlib, which reads what is between two dollar signs as TeX."""
-    return text.encode(errors="replace").decode().replace("$", r"\$")
 
 
 def show_images(
@@ -71,14 +69,20 @@ def show_images(
         axis.set_axis_off()
         draw_image(axis, image, cmap)
     for axis, title in zip(axes, titles):
-        axis.set_title(plain_text(title), fontsize=_FONT)
+        axis.set_title(title, fontsize=_FONT, parse_math=False)
     return figure, axes
 
 
 def draw_image(axis: Axes, image: np.ndarray, cmap: str = "gray") -> None:
-    """Draw an image, with pixel (x, y) at (x, y) of the axes."""
+    """Draw an image, with pixel (x, y) at (x, y) of the axes; what is drawn over it does not move their limits."""
     height, width = np.shape(image)[:2]
     axis.imshow(image, cmap=cmap, extent=(0, width, height, 0), interpolation="nearest")
+    axis.autoscale(False)
+
+
+def pale(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Mix an image with white, so that what is drawn over it stands out."""
+    return 255 - (255 - image) // 2
 
 
 def overlay_map(
@@ -95,7 +99,7 @@ def overlay_map(
     """
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
-    values = np.ma.masked_invalid(np.asarray(values, dtype=np.float64))
+    values = np.asarray(values, dtype=np.float64)
     low, high = limits or (None, None)
     drawn = axis.imshow(
         values, cmap=cmap, alpha=alpha, extent=(left, right, bottom, top), interpolation="nearest", vmin=low, vmax=high
@@ -107,12 +111,12 @@ def overlay_map(
     return drawn
 
 
-def mark(axis: Axes, text: str, colour: str = CHOSEN) -> None:
-    """Draw a coloured frame around the image of an axis and write `text` in its corner."""
-    axis.add_patch(
-        Rectangle((0, 0), 1, 1, transform=axis.transAxes, fill=False, edgecolor=colour, linewidth=5, zorder=10)
-    )
-    axis.text(0.04, 0.95, text, transform=axis.transAxes, va="top", fontsize=_FONT, weight="bold", bbox=_WHITE_BOX)
+def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> None:
+    """Draw a coloured frame around the image of an axis and write `text` in its corner, `size` points high."""
+    frame = {"transform": axis.transAxes, "fill": False, "edgecolor": colour, "linewidth": 5}
+    axis.add_patch(Rectangle((0, 0), 1, 1, zorder=10, **frame))
+    font = {"fontsize": size, "weight": "bold", "va": "top", "parse_math": False}
+    axis.text(0.04, 0.95, text, transform=axis.transAxes, bbox=_WHITE_BOX, zorder=11, **font)
 
 
 def patch_centres(
@@ -191,7 +195,7 @@ def show_matches(
     titles: Sequence[str] = ("reference", "target"),
     size: float = 3.4,
 ) -> Figure:
-    """Show two images with a line for each match of patches (row, col), as `draw_matches` draws it."""
+    """Show two images and matches of their patches (row, col), as `draw_matches` draws them."""
     figure, axes = show_images(images, titles, size=size)
     draw_matches(axes, [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)], inliers)
     return figure
@@ -200,10 +204,15 @@ def show_matches(
 def draw_matches(
     axes: Sequence[Axes], pixels: Sequence[Real[np.ndarray, "n 2"]], inliers: Bool[np.ndarray, " n"] | None = None
 ) -> list[Artist]:
-    """Draw a line for each match, between pixels (x, y) of two images: inliers solid, blue; others dashed, red."""
+    """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others dashed, red.
+
+    Of more than 15 matches, 15 have a line, with the same share of inliers.
+    """
     inliers = np.ones(len(pixels[0]), bool) if inliers is None else inliers
+    joined = np.argsort(inliers, kind="stable")  # inliers last, above
+    joined = joined[np.linspace(0, len(joined) - 1, min(len(joined), _JOINED)).astype(int)]
     drawn = []
-    for a, b, good in sorted(zip(*pixels, inliers, strict=True), key=lambda match: match[2]):
+    for a, b, good in zip(*(part[joined] for part in (*pixels, inliers))):
         style = {"color": VERMILLION, "linewidth": 1.2, "linestyle": (0, (4, 2))}
         if good:  # with a white outline, to be visible on dark images
             style = {"color": BLUE, "linewidth": 1.8, "path_effects": _OUTLINE}
@@ -271,7 +280,7 @@ def show_points(
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             style = {"marker": marker, "linewidths": 0.3 + 0.03 * area, "label": name}
             axis.scatter(*points.T[:2], area, colour, **style)
-        axis.set_title(plain_text(title), fontsize=_FONT)
+        axis.set_title(title, fontsize=_FONT, parse_math=False)
         y_limits = (y + half[1], y - half[1]) if down else (y - half[1], y + half[1])
         axis.set(**{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels)
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
@@ -370,18 +379,14 @@ def pca_colours(
     colours mean similar features, also between images. The components are fitted to the `foreground` patches; others
     are white. The result has an RGB image in [0, 1] for each map, with one pixel per patch.
     """
-    features = [np.asarray(features, dtype=np.float64) for features in maps]
-    if foreground is None:
-        foreground = [np.ones(features.shape[:2], bool) for features in features]
-    inside = np.concatenate([feature[np.asarray(where, bool)] for feature, where in zip(features, foreground)])
-    mean = inside.mean(axis=0)
-    axes = np.linalg.eigh((inside - mean).T @ (inside - mean))[1][:, :-4:-1]
-    low, high = np.percentile((inside - mean) @ axes, [2, 98], axis=0)
-    span = np.where(high > low, high - low, 1.0)
-    return [
-        np.where(np.asarray(where, bool)[..., None], (((feature - mean) @ axes - low) / span).clip(0, 1), 1.0)
-        for feature, where in zip(features, foreground)
-    ]
+    features = [np.asarray(one, dtype=np.float64) for one in maps]
+    on = [np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)]
+    inside = np.concatenate([one[where] for one, where in zip(features, on)])
+    centred = inside - inside.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1][:, :-4:-1]
+    low, high = np.percentile(inside @ axes, [2, 98], axis=0)
+    colours = [((one @ axes - low) / np.maximum(high - low, 1e-12)).clip(0, 1) for one in features]
+    return [np.where(where[..., None], own, 1.0) for own, where in zip(colours, on)]
 
 
 def draw_points(
@@ -394,31 +399,25 @@ def draw_points(
     pixels, _ = camera.project(camera.to_world(points[order]))
     colours = colours if isinstance(colours, str) else np.asarray(colours)[order]
     axis.scatter(*pixels.T, s=size, c=colours, linewidths=0, alpha=0.85, zorder=3)
-    _keep_limits(axis, camera.size)
 
 
 def draw_axes(
-    axis: Axes,
-    camera: Camera,
-    to_camera: Callable[[np.ndarray], np.ndarray],
-    origin: Real[np.ndarray, "3"],
-    length: float,
-    names: Sequence[str] = ("x", "y", "z"),
+    axis: Axes, camera: Camera, origin: Real[np.ndarray, "3"], ends: Real[np.ndarray, "3 3"], names: Sequence[str]
 ) -> None:
-    """Draw the three axes of a coordinate frame in the image of a camera; `to_camera` maps the frame to the camera's.
+    """Draw arrows from an origin to three ends (rows), points of a camera's frame, in its image, with their names.
 
-    Axes with an end behind the camera are left out.
+    Arrows with an end behind the camera are left out; names stay inside the image.
     """
-    ends = np.asarray(to_camera(np.asarray(origin) + length * np.vstack([np.zeros(3), np.eye(3)])))
-    pixels, depth = camera.project(camera.to_world(ends))
+    pixels, depth = camera.project(camera.to_world(np.vstack([origin, ends])))
+    inside = np.array(camera.size[::-1])
     for name, colour, end, near in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
-        if min(near, depth[0]) <= 0:
-            continue
-        arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
-        axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow)
-        style = {"fontsize": _FONT, "weight": "bold", "ha": "center", "va": "center", "path_effects": _OUTLINE}
-        axis.text(*end, name, color=colour, zorder=7, **style)
-    _keep_limits(axis, camera.size)
+        if min(near, depth[0]) > 0:
+            arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
+            drawn = axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow)
+            drawn.set_in_layout(False)
+            drawn.arrow_patch.set_clip_path(axis.patch)
+            style = {"fontsize": _FONT, "weight": "bold", "ha": "center", "va": "center", "path_effects": _OUTLINE}
+            axis.text(*np.clip(end, 0.08 * inside, 0.92 * inside), name, color=colour, zorder=7, **style)
 
 
 def draw_moved_cloud(
@@ -431,13 +430,43 @@ def draw_moved_cloud(
 ) -> None:
     """Draw points of the reference camera's frame, and its axes, over the images of cameras, each with its own pose.
 
-    `names` are the labels of the axes; None draws no axes.
+    The colour of a point is its position along the object. `names` are the labels of the axes; None draws no axes.
     """
-    colours, length = coordinate_colours(cloud), 2 * axis_deviation(cloud)
+    colours, middle = coordinate_colours(cloud), cloud.mean(axis=0)
+    ends = middle + 2 * axis_deviation(cloud) * np.eye(3)
     for axis, camera, pose in zip(axes, cameras, poses):
         draw_points(axis, camera, pose.apply(cloud), colours, size)
         if names is not None:
-            draw_axes(axis, camera, pose.apply, cloud.mean(axis=0), length, names)
+            draw_axes(axis, camera, pose.apply(middle), pose.apply(ends), names)
+
+
+def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4, columns: int | None = None) -> Figure:
+    """Show the reference under its own points, and for each estimate its target view under the moved points."""
+    views = chosen_views(estimates.values())
+    titles = ["reference, its own points", *estimates]
+    figure, axes = show_images([view.frame.rgb for view in views], titles, columns, size)
+    draw_estimates(axes, estimates.values(), most=1500, size=5)
+    return figure
+
+
+def chosen_views(estimates: Collection[PoseEstimate]) -> list[View]:
+    """Return the reference of estimates, and for each its target view."""
+    first, *_ = estimates
+    return [first.reference_view, *(one.target_views[one.view] for one in estimates)]
+
+
+def draw_estimates(
+    axes: Iterable[Axes], estimates: Collection[PoseEstimate], most: int = 20000, size: float = 3
+) -> None:
+    """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each estimate."""
+    views, poses = chosen_views(estimates), [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)]
+    draw_moved_cloud(axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size)
+
+
+def _rounded(pose: Sim3) -> Sim3:
+    """Round a pose: the number of threads changes its last digits, and should not change a picture."""
+    turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
+    return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -451,30 +480,20 @@ def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     return plt.get_cmap("viridis")((along - along.min()) / max(np.ptp(along), 1e-12))[:, :3]
 
 
-def object_cloud(view: View, most: int = 2000, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
     """Gather a view's object points for display, without outliers.
 
     The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
     """
-    return coloured_cloud(view, most, seed)[0]
-
-
-def coloured_cloud(
-    view: View, most: int = 2000, seed: int = 0
-) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Gather the points of `object_cloud` with their RGB colours in the image."""
     frame = view.frame
-    pixels = object_pixels(frame, _INTERIOR)
-    if frame.mask is None:
-        rows, cols = (np.arange(n) * m // n for n, m in zip(pixels.shape, view.foreground.shape))
-        pixels &= view.foreground.cpu().numpy()[np.ix_(rows, cols)]
-    points, colours = unproject_depth(frame.depth, frame.camera)[pixels], frame.rgb[pixels]
+    inside = view.soft_mask > 0.5 if frame.mask is None else frame.mask > 0.9
+    points = unproject_depth(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
     kept = np.flatnonzero(near_median(points, 2.5))
     if len(kept) > most:
-        kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), most, replace=False))]
-    return points[kept], colours[kept]
+        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), most, replace=False))]
+    return points[kept]
 
 
 def _panels(number: int, columns: int | None, width: float, height: float) -> tuple[Figure, list[Axes]]:
@@ -501,8 +520,3 @@ def _lines_of(titles: Iterable[str]) -> int:
 def _size(axis: Axes) -> tuple[int, int]:
     """Return the size (H, W) of the image that covers an axis."""
     return round(axis.get_ylim()[0]), round(axis.get_xlim()[1])
-
-
-def _keep_limits(axis: Axes, size: tuple[int, int]) -> None:
-    axis.set_xlim(0, size[1])
-    axis.set_ylim(size[0], 0)

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest
+from scipy.stats import binomtest, mannwhitneyu
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,15 +24,12 @@ class Reliability:
     interval: Float[np.ndarray, "2 bins"]  # lower and upper ends of its 95 % interval (Wilson)
 
     def __str__(self) -> str:
-        lines = [f"{'n':>5} {'confidence':>11} {'correct':>8}"]
-        lines += [
-            f"{n:5d} {100 * c:10.1f}% {100 * a:7.1f}%" for n, c, a in zip(self.count, self.confidence, self.accuracy)
-        ]
-        lines.append(
+        shares = {"n": self.count, "confidence (%)": 100 * self.confidence, "correct (%)": 100 * self.accuracy}
+        return (
+            f"{pd.DataFrame(shares).round(1).to_string(index=False)}\n"
             f"AUROC {self.auroc:.3f}, expected calibration error {100 * self.calibration_error:.1f} points, "
             f"accuracy of the more confident half {100 * self.top_half_accuracy:.1f} %"
         )
-        return "\n".join(lines)
 
 
 def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
@@ -62,5 +60,4 @@ def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) 
     positive, negative = np.asarray(confidence)[correct], np.asarray(confidence)[~correct]
     if not len(positive) or not len(negative):
         return float("nan")
-    difference = positive[:, None] - negative
-    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
+    return float(mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative)))

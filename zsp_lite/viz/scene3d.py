@@ -2,46 +2,27 @@
 
 import numpy as np
 import plotly.graph_objects as go
-from jaxtyping import Real, UInt8
+from jaxtyping import Real
 
-from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-MAX_POINTS = 4000  # of both clouds together; more points slow down browsers and enlarge notebooks
-STYLES = ((BLUE, "circle", 2.2), (ORANGE, "diamond-open", 2.6))  # colour, symbol and size of both clouds
 _AXIS_LABELS = "x (right)", "y (down)", "z (forward)"
 
 
-def aligned_clouds(
-    reference: Real[np.ndarray, "n 3"],
-    target: Real[np.ndarray, "m 3"],
-    colours: tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]] | None = None,
-) -> go.Figure:
+def aligned_clouds(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, "m 3"]) -> go.Figure:
     """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
 
-    A random subset is drawn of each; the clouds differ in colour, if no `colours` are given, and in their markers.
+    More than a few thousand points slow down browsers and enlarge notebooks.
     """
-    rng = np.random.default_rng(0)
-    traces, drawn = [], []
-    clouds = {"reference, aligned": reference, "target": target}
-    for (name, cloud), own, (colour, symbol, size) in zip(clouds.items(), colours or (None, None), STYLES):
-        cloud = np.asarray(cloud, dtype=np.float64)
-        if len(cloud) == 0 or not np.isfinite(cloud).all():
-            raise InputError(f"point cloud {name!r} of shape {cloud.shape} is empty or not finite")
-        if len(cloud) > MAX_POINTS // 2:
-            kept = np.sort(rng.choice(len(cloud), MAX_POINTS // 2, replace=False))
-            cloud, own = cloud[kept], None if own is None else own[kept]
-        if own is not None:
-            colour = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in own.tolist()]
+    traces = []
+    styles = {"color": BLUE, "symbol": "circle", "size": 2.2}, {"color": ORANGE, "symbol": "diamond-open", "size": 2.6}
+    for name, cloud, style in zip(("reference, aligned", "target"), (reference, target), styles):
         # For a cloud of unit standard deviation three decimals are finer than a pixel; they keep the page small.
-        cloud = np.round(cloud, 3).astype(np.float32)
-        drawn.append(cloud)
-        x, y, z = cloud.T
-        marker = {"size": size, "color": colour, "symbol": symbol, "opacity": 0.75}
-        traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker))
+        x, y, z = np.round(cloud, 3).astype(np.float32).T
+        traces.append(go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker={"opacity": 0.75, **style}))
 
     # Ranges of equal length, from percentiles, which are robust to outliers.
-    low, high = np.percentile(np.concatenate(drawn), [1, 99], axis=0)
+    low, high = np.percentile(np.concatenate([reference, target]), [1, 99], axis=0)
     middle, half = (low + high) / 2, 0.6 * float((high - low).max())
     axes = {
         f"{label[0]}axis": {"title": {"text": label}, "range": [float(x - half), float(x + half)], "nticks": 5}
@@ -54,7 +35,7 @@ def aligned_clouds(
     }
     return go.Figure(traces).update_layout(
         height=440,
-        margin={"l": 0, "r": 0, "t": 0, "b": 10},
-        legend={"itemsizing": "constant", "orientation": "h", "x": 0, "y": 0, "bgcolor": "rgba(255,255,255,0.8)"},
+        margin={"l": 0, "r": 0, "t": 0, "b": 28},
+        legend={"itemsizing": "constant", "orientation": "h", "x": 0.5, "xanchor": "center", "y": 0, "yanchor": "top"},
         scene={**axes, "aspectmode": "cube", "camera": camera},
     )

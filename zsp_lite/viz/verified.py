@@ -17,7 +17,7 @@ POINT_CLASSES: dict[str, tuple[str, str]] = {
     "outside the silhouette": (VERMILLION, "X"),
     "depth unknown": ("white", "s"),
 }
-_SURFACE, _OCCLUDED, _FREE_SPACE, _OUTSIDE, _UNKNOWN = range(5)
+_DRAWN = 1, 4, 0, 2, 3  # contradictions last, so that no other point covers them
 
 
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
@@ -29,8 +29,7 @@ def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     projection = terms.projection
     distance, weight = projection.silhouette_distance[pose].numpy(), projection.weight[pose].numpy()
     surface, free_space = terms.surface[pose].numpy(), terms.free_space[pose].numpy()
-    conditions = [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0]
-    return np.select(conditions, [_OUTSIDE, _UNKNOWN, _SURFACE, _FREE_SPACE], _OCCLUDED)
+    return np.select([distance > 0, weight <= 0, surface >= weight / 2, free_space > 0], [3, 4, 0, 2], 1)
 
 
 def show_point_classes(
@@ -45,11 +44,10 @@ def show_point_classes(
     figure, axes = show_images(images, titles, columns, size)
     for axis, image, places, found in zip(axes, images, pixels, classes):
         places = np.clip(places, 0, image.shape[1::-1])
-        # Violations are drawn last, so that no other point covers them.
-        for index in (_OCCLUDED, _UNKNOWN, _SURFACE, _FREE_SPACE, _OUTSIDE):
+        for index in _DRAWN:
             name, (colour, marker) = list(POINT_CLASSES.items())[index]
-            style = {"marker": marker, "edgecolors": "black", "linewidths": 0.4, "zorder": 3, "label": name}
-            axis.scatter(*places[found == index].T, 6 if index == _UNKNOWN else 14, colour, **style)
+            style = {"marker": marker, "edgecolors": "black", "linewidths": 0.4, "label": name}
+            axis.scatter(*places[found == index].T, 6 if name == "depth unknown" else 14, colour, **style)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, handletextpad=0.1)
     return figure
