@@ -60,11 +60,11 @@ def test_bad_picks_are_refused(reference, picks, message):
 def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
     labelling = Labelling(root, "chair")
     assert labelling.reference == "best" == labelling.sequences[0]
-    pick_all(labelling, "best", corners())
-    labelling.rename(1, "left arm")
+    labelling.pick("best", corners()[0], "left arm")
+    pick_all(labelling, "best", corners()[1:])
     pick_all(labelling, "a", corners()[:2])
     again = Labelling(root, "chair")
-    assert again.names == ("keypoint 1", "left arm", "keypoint 3", "keypoint 4", "keypoint 5")
+    assert again.names == ("left arm", "keypoint 2", "keypoint 3", "keypoint 4", "keypoint 5")
     np.testing.assert_array_equal(again.picks("a"), corners()[:2])
     assert [(row.sequence, row.state, row.picks) for row in again.progress()] == [
         ("best", "reference", 5), ("a", "open", 2), ("b", "open", 0),
@@ -96,8 +96,6 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
         labelling.pick("a", (0, 0, 0))
     labelling.undo("a")
     assert len(labelling.picks("a")) == 4
-    labelling.move("a", 0, (9, 9, 9))
-    np.testing.assert_array_equal(labelling.picks("a")[0], (9, 9, 9))
     with pytest.raises(InputError, match="keypoints of the reference best are in use on a; clear those first"):
         labelling.undo("best")
     labelling.clear("a")
@@ -120,22 +118,10 @@ def test_a_change_that_is_refused_leaves_a_skipped_sequence_skipped(root):
     labelling = Labelling(root, "chair")
     labelling.skip("b")
     labelling.undo("b")
-    with pytest.raises(InputError, match="guess on a by 0 keypoints of the reference best"):
-        labelling.guess("a", Sim3.identity())
     with pytest.raises(InputError, match="all 0 keypoints are picked"):
         labelling.pick("b", (0, 0, 0))
     assert labelling.progress() == Labelling(root, "chair").progress()
     assert labelling.progress()[-1].state == "skipped"
-
-
-def test_a_guess_puts_the_picks_on_the_cloud(root):
-    labelling = Labelling(root, "chair")
-    cloud = labelling.cloud("a")[0]
-    pick_all(labelling, "best", cloud[:5] + 1e-4)
-    labelling.guess("a", Sim3.identity())
-    np.testing.assert_array_equal(labelling.picks("a"), cloud[:5])
-    labelling.guess("a", Sim3(1e-3, np.eye(3), np.full(3, 50.0)))  # all keypoints near one point of the cloud
-    assert len(np.unique(labelling.picks("a"), axis=0)) == 5
 
 
 def test_invalid_categories_sequences_and_picks_are_refused(root):
@@ -149,11 +135,6 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
         (lambda: labelling.skip("best"), "best cannot be skipped: it is the reference"),
         (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
         (lambda: labelling.pick("a", (0, 1)), "picks on a is .*, expected real numbers of shape .n, 3."),
-        (lambda: labelling.move("a", 0, (0, np.inf, 0)), "picks on a holds inf, expected finite"),
-        (lambda: labelling.move("a", 0, (1, 2, 3, 4)), "picks on a is .*, expected real numbers"),
-        (lambda: labelling.move("a", -1, (0, 1, 2)), "index of a pick is -1, expected an integer from 0 to 2"),
-        (lambda: labelling.rename(5, "top"), "index of a keypoint is 5, expected an integer from 0 to 4"),
-        (lambda: labelling.guess("best", Sim3.identity()), "guess on best by 5 .* and another sequence"),
         (lambda: Labelling(root, "chair", reference="a"), "expected one reference sequence"),
         (lambda: Labelling(root, "chair", ["c"]), "has no point cloud"),
         (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),

@@ -1,7 +1,6 @@
 """The labelling widget without a browser: clicks are sent as messages, and every change is on disk at once."""
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,7 +105,7 @@ def test_a_large_residual_is_accepted_by_a_second_press_only(labelling):
     box.buttons["accept"].click()
     assert re.fullmatch("Not done: residual of .* above 15 %.* press accept again .*", message(box))
     assert "a" not in read_labels(labelling.root, "chair")
-    labelling.move("a", 0, picks[2] + 0.01)  # other picks are asked about anew
+    labelling.put("a", [picks[2] + 0.01, *labelling.picks("a")[1:]])  # other picks are asked about anew
     box.buttons["accept"].click()
     assert "Not done: residual" in message(box)
     box.buttons["accept"].click()
@@ -122,52 +121,15 @@ def test_a_new_widget_continues_an_earlier_session_and_shows_an_imported_label(r
     box = label_poses(again)
     assert message(box) == "The earlier keypoints are loaded." and box.controls["sequence"].value == "a"
     assert len(box.views["sequence"].widget.marks) == 2 and len(box.views["reference"].widget.marks) == 5
-    box.buttons["undo"].click()  # earlier picks can be undone one by one
-    assert len(Labelling(root, "chair").picks("a")) == 1
+    for button, left in (("undo", 1), ("redo", 0)):
+        box.buttons[button].click()
+        assert len(Labelling(root, "chair").picks("a")) == left
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "best"))
     box.controls["sequence"].value = "b"
     assert not box.controls["overlay"].disabled
     box.controls["overlay"].value = True
     colours = np.frombuffer(box.views["sequence"].widget.colours, np.uint8).reshape(-1, 3)
     assert len(np.unique(colours, axis=0)) == 2
-
-
-def test_undo_reverts_picks_moves_and_redo(labelling):
-    box = label_poses(labelling)
-    click_all(box, labelling, "reference", "best")
-    box.controls["keypoint"].value = 1
-    box.name.value = "seat"
-    assert labelling.names[1] == "seat"
-    box.controls["keypoint"].value = -1
-    box.buttons["undo"].click()
-    assert len(labelling.picks("best")) == 4 and labelling.names[1] == "seat"
-    box.buttons["next"].click()
-    click_all(box, labelling, "sequence", "a", 4)
-    before = labelling.picks("a")
-    box.controls["keypoint"].value = 2
-    click(box, "sequence", corners(labelling, "a", 9)[8])
-    assert not np.array_equal(labelling.picks("a")[2], before[2]) and box.controls["keypoint"].value == -1
-    assert message(box) == "Keypoint 3, keypoint 3, moved on a."
-    box.buttons["undo"].click()
-    np.testing.assert_array_equal(labelling.picks("a"), before)
-    box.buttons["redo"].click()
-    assert len(labelling.picks("a")) == 0 and not box.controls["overlay"].value
-    box.buttons["undo"].click()
-    np.testing.assert_array_equal(labelling.picks("a"), before)
-
-
-def test_a_guess_gives_keypoints_which_can_be_undone(labelling, monkeypatch):
-    guess = SimpleNamespace(between=lambda *_: Sim3(1.3, TURN, np.full(3, 2.0) + 0.001))
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: guess)
-    box = label_poses(labelling, backbone=object())
-    assert box.buttons["guess"].disabled
-    click_all(box, labelling, "reference", "best")
-    box.buttons["next"].click()
-    box.buttons["guess"].click()
-    assert "Alignment proposed" in message(box) and box.controls["overlay"].value
-    np.testing.assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
-    box.buttons["undo"].click()
-    assert len(labelling.picks("a")) == 0
 
 
 def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelling):

@@ -24,7 +24,7 @@ from zsp_lite.data.labels import (
     rigid_label,
     write_label,
 )
-from zsp_lite.errors import InputError, check_choice, check_integer, check_magnitude, real_array
+from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
@@ -162,29 +162,6 @@ class Labelling:
         """Remove all picks of a sequence. An accepted label is kept until another one is accepted."""
         self.put(sequence, [])
 
-    def move(self, sequence: str, index: int, point: Point) -> None:
-        """Move pick `index` (from 0) of a sequence to another point (3,)."""
-        picks = list(self.picks(sequence))
-        check_integer("index of a pick", index, 0, len(picks) - 1)
-        picks[index] = point
-        self.put(sequence, picks, self.names)
-
-    def guess(self, sequence: str, sim3: Sim3) -> None:
-        """Set the picks of a sequence by transforming the keypoints of the reference.
-
-        Each transformed keypoint is moved to the nearest point of the cloud that no other pick has taken. `sim3` maps
-        the world of the reference to that of the sequence.
-        """
-        if sequence == self.reference or len(self.names) < MIN_KEYPOINTS:
-            found = f"{len(self.names)} keypoints of the reference {self.reference}"
-            raise InputError(f"guess on {sequence} by {found}, expected {MIN_KEYPOINTS} or more, and another sequence")
-        cloud, taken = self.cloud(sequence)[0], []
-        for point in sim3.apply(self.picks(self.reference)):
-            distance = np.square(cloud - point).sum(axis=1)
-            distance[taken] = np.inf
-            taken.append(int(distance.argmin()))
-        self.put(sequence, cloud[taken])
-
     def proposal(self, sequence: str) -> Sim3 | None:
         """Return the proposed similarity from the world of the reference to that of a sequence; None without one."""
         if not {self.reference, self._known(sequence)} <= self._proposals.keys():
@@ -208,12 +185,6 @@ class Labelling:
             self._stored.names[:] = names
         self._stored.picks[sequence] = points.tolist()
         self._save(sequence)
-
-    def rename(self, index: int, name: str) -> None:
-        """Rename keypoint `index` (from 0)."""
-        check_integer("index of a keypoint", index, 0, len(self.names) - 1)
-        self._stored.names[index] = name
-        self._save()
 
     def alignment(self, sequence: str) -> Alignment | None:
         """Align the reference with a sequence by the picks; None before all keypoints are picked."""

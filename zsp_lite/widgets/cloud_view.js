@@ -65,7 +65,7 @@ function render({ model, el }) {
     canvas.style.width = canvas.style.height = `${side}px`;
     const depth = spots(n, ratio);
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    for (const mark of model.get("marks")) drawMark(mark, depth, n, ratio);
+    model.get("marks").forEach((at, i) => drawMark(at, i + 1, depth, n, ratio));
     const cursor = model.get("cursor");
     if (cursor.length) drawCursor(project(cursor));
     canvas.dataset.marks = model.get("marks").length;
@@ -100,7 +100,7 @@ function render({ model, el }) {
   }
 
   // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
-  function drawMark({ at, label, chosen }, depth, n, ratio) {
+  function drawMark(at, number, depth, n, ratio) {
     const [x, y, z] = project(at);
     const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
     const hidden = z > depth[pixel] + 0.12;
@@ -119,14 +119,14 @@ function render({ model, el }) {
     }
     pen.beginPath();
     pen.arc(left, top, 9, 0, 7);
-    pen.fillStyle = chosen ? "black" : "white";
+    pen.fillStyle = "white";
     pen.fill();
     pen.stroke();
     pen.setLineDash([]);
-    pen.fillStyle = chosen ? "white" : "black";
+    pen.fillStyle = "black";
     pen.font = "bold 12px sans-serif";
     [pen.textAlign, pen.textBaseline] = ["center", "middle"];
-    pen.fillText(label, left, top + 0.5);
+    pen.fillText(number, left, top + 0.5);
     pen.globalAlpha = 1;
   }
 

@@ -124,13 +124,10 @@ class CloudView:
             self.widget.points = self.widget.colours = self.widget.crosses = b""
             self.widget.marks, self.widget.cursor, self.widget.alt = [], [], alt
 
-    def mark(self, points: Real[np.ndarray, "k 3"], chosen: int | None = None) -> None:
-        """Draw the numbers 1, 2, ... beside world points; the number with index `chosen` is highlighted."""
+    def mark(self, points: Real[np.ndarray, "k 3"]) -> None:
+        """Draw the numbers 1, 2, ... beside world points."""
         if self._box is not None:
-            self.widget.marks = [
-                {"at": at, "label": str(index + 1), "chosen": index == chosen}
-                for index, at in enumerate(self._box.to_view(points).tolist())
-            ]
+            self.widget.marks = self._box.to_view(points).tolist()
 
     def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
         """Draw a cross-hair at a world point; None removes it."""

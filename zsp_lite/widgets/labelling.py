@@ -6,8 +6,6 @@ once, so that the work continues after a restart.
 
 import html
 from collections.abc import Callable
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,18 +16,12 @@ from zsp_lite.labelling.session import OPEN, Labelling
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.cloud_view import subsample
 from zsp_lite.widgets.common import Widget
-from zsp_lite.widgets.labelling_panel import NEW_KEYPOINT, Panel
-
-if TYPE_CHECKING:
-    from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.widgets.labelling_panel import Panel
 
 
-def label_poses(labelling: Labelling, backbone: "Backbone | None" = None) -> Widget:
-    """Label a category: the point cloud of the reference on the left, that of the current sequence on the right.
-
-    The button "guess" uses `backbone`, by default that of `load_backbone`.
-    """
-    return _LabellingWidget(labelling, backbone).panel.box
+def label_poses(labelling: Labelling) -> Widget:
+    """Label a category: the point cloud of the reference on the left, that of the current sequence on the right."""
+    return _LabellingWidget(labelling).panel.box
 
 
 _PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints, or skip."
@@ -38,15 +30,14 @@ _PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; 
 class _LabellingWidget:
     """The actions of the widget, each of which returns the message to show, and what it displays after each."""
 
-    def __init__(self, labelling: Labelling, backbone: "Backbone | None"):
-        self.labelling, self.backbone = labelling, backbone
-        self.history: list[tuple[str, np.ndarray, tuple[str, ...]]] = []
+    def __init__(self, labelling: Labelling):
+        self.labelling = labelling
         self.shown: dict[str, object] = {}
         self.asked: tuple[str, str, bytes] | None = None  # the label in doubt that accept was pressed for
         self.refreshing = False
         self.actions = {
-            "undo": self.undo, "redo": self.redo, "guess": self.guess, "accept": self.accept, "skip": self.skip,
-            "next": self.next, "pick": lambda: self.pick(self.current, self._slider_point()),
+            "undo": self.undo, "redo": self.redo, "accept": self.accept, "skip": self.skip, "next": self.next,
+            "pick": lambda: self.pick(self.current, self._slider_point()),
         }  # fmt: skip
         self.panel = Panel(labelling.sequences, self._clicked, self._changed, lambda name: self._do(self.actions[name]))
         self.controls, self.views = self.panel.controls, self.panel.views
@@ -63,61 +54,29 @@ class _LabellingWidget:
         return self.current == self.labelling.reference
 
     def pick(self, sequence: str, point: np.ndarray | None) -> str:
-        """Add the next keypoint, or move the chosen one."""
+        """Add the next keypoint."""
         if point is None:
             return "There is no point of the cloud at the click."
-        labelling, chosen = self.labelling, self.controls["keypoint"].value
+        labelling, number = self.labelling, len(self.labelling.picks(sequence)) + 1
         same = np.flatnonzero((labelling.picks(sequence) == point).all(axis=1))
-        if len(same) and same[0] != chosen:
+        if len(same):
             raise InputError(f"keypoint {same[0] + 1}, {labelling.names[same[0]]}, is at this point already")
-        if chosen != NEW_KEYPOINT:
-            with self._undoable(sequence):
-                labelling.move(sequence, chosen, point)
-            self.controls["keypoint"].value, self.controls["name"].value = NEW_KEYPOINT, ""
-            return f"Keypoint {chosen + 1}, {labelling.names[chosen]}, moved on {sequence}."
         if sequence != labelling.reference and len(labelling.names) < MIN_KEYPOINTS:
             raise InputError(f"the reference has {len(labelling.names)} keypoints, expected {MIN_KEYPOINTS} first")
-        name = self.controls["name"].value.strip() if sequence == labelling.reference else ""
-        with self._undoable(sequence):
-            labelling.pick(sequence, point, name)
+        labelling.pick(sequence, point, self.controls["name"].value.strip())
         self.controls["name"].value = ""
-        number = len(labelling.picks(sequence))
         if sequence != labelling.reference and number == len(labelling.names):
             self.controls["overlay"].value = labelling.alignment(sequence) is not None
             return self._instruction()
         return f"Keypoint {number}, {labelling.names[number - 1]}, picked on {sequence}."
 
     def undo(self) -> str:
-        """Undo the last change of the current sequence; after a restart, its last pick."""
-        index = max((i for i, (name, *_) in enumerate(self.history) if name == self.current), default=None)
-        if index is None:
-            self.labelling.undo(self.current)
-        else:
-            sequence, points, names = self.history.pop(index)
-            renamed = self.labelling.names[: len(names)]  # names changed since are kept
-            self.labelling.put(sequence, points, (*renamed, *names[len(renamed) :]))
+        self.labelling.undo(self.current)
         return f"{len(self.labelling.picks(self.current))} keypoints on {self.current}."
 
     def redo(self) -> str:
-        with self._undoable(self.current):
-            self.labelling.clear(self.current)
-        return f"All keypoints of {self.current} removed; undo restores them."
-
-    def guess(self) -> str:
-        labelling, sequence = self.labelling, self.current
-        if (sim3 := labelling.proposal(sequence)) is None:
-            self.panel.show_message("Estimating the alignment. This takes some seconds.")
-            from zsp_lite.align import align_category
-            from zsp_lite.backbones.load import load_backbone
-
-            self.backbone = self.backbone or load_backbone()
-            both = labelling.reference, sequence
-            found = align_category(labelling.dataset, labelling.category, self.backbone, both)
-            sim3 = found.between(*both)
-        with self._undoable(sequence):
-            labelling.guess(sequence, sim3)
-        self.controls["overlay"].value = True
-        return "Alignment proposed. Check it: correct single keypoints, or redo all."
+        self.labelling.clear(self.current)
+        return f"All keypoints of {self.current} removed."
 
     def accept(self) -> str:
         """Write the label; one in doubt only if accept is pressed twice in a row."""
@@ -146,27 +105,15 @@ class _LabellingWidget:
         now = f"Now {following}. {_PROPOSED if self._proposed(following) else ''}".strip()
         return now if is_open else "No sequence is open."
 
-    def rename(self) -> str:
-        index, name = self.controls["keypoint"].value, self.controls["name"].value.strip()
-        if name in ("", self.labelling.names[index]):
-            return self._instruction()
-        self.labelling.rename(index, name)
-        return f"Keypoint {index + 1} is now named {self.labelling.names[index]}."
-
     def _clicked(self, view: str, point: np.ndarray | None) -> None:
         self._do(lambda: self.pick(self.labelling.reference if view == "reference" else self.current, point))
 
     def _changed(self, control: str) -> None:
-        index = self.controls["keypoint"].value
-        if self.refreshing or index is None:
+        if self.refreshing or control == "name":
             return
         if control == "point":
             self._move_cursor()
-        elif control == "name" and index != NEW_KEYPOINT:
-            self._do(self.rename)
-        elif control != "name":
-            if control == "keypoint":
-                self.controls["name"].value = "" if index == NEW_KEYPOINT else self.labelling.names[index]
+        else:
             self._do(self._instruction)
 
     def _do(self, action: Callable[[], str]) -> None:
@@ -186,14 +133,6 @@ class _LabellingWidget:
             self.refreshing = False
         self.panel.show_message(text or self._instruction(), problem)
 
-    @contextmanager
-    def _undoable(self, sequence: str):
-        """Record the keypoints of a sequence before a change, unless the change fails."""
-        names = self.labelling.names if sequence == self.labelling.reference else ()
-        before = sequence, self.labelling.picks(sequence), names
-        yield
-        self.history.append(before)
-
     def _next_open(self, sequence: str) -> str:
         """Return the next open sequence after this one, cyclically; itself if none is open."""
         rows = self.labelling.progress()
@@ -209,8 +148,6 @@ class _LabellingWidget:
         """Return what the user can do next."""
         labelling, names = self.labelling, self.labelling.names
         picked = len(labelling.picks(self.current))
-        if (index := self.controls["keypoint"].value) not in (NEW_KEYPOINT, None):
-            return f"Click the new position of keypoint {index + 1}, {names[index]}, or enter another name."
         if self.on_reference:
             missing = MIN_KEYPOINTS - len(names)
             more = f"at least {missing} more" if missing > 0 else "enough; add more, or go on with next"
@@ -229,22 +166,19 @@ class _LabellingWidget:
         rows = labelling.progress()
         row = next(row for row in rows if row.sequence == self.current)
         picks, names = labelling.picks(self.current), labelling.names
-        self._fill_keypoint_menu(names, len(picks))
         alignment = None if self.on_reference or row.problem else labelling.alignment(self.current)
         aligned = self._aligned_reference(alignment)
         controls["overlay"].value &= aligned is not None
         controls["overlay"].disabled = aligned is None
-        chosen = None if controls["keypoint"].value == NEW_KEYPOINT else controls["keypoint"].value
-        controls["name"].disabled = not self.on_reference and chosen is None
+        controls["name"].disabled = not self.on_reference
         waiting = not self.on_reference and self._proposed(self.current)
         panel.buttons["accept"].disabled = alignment is None and not waiting
         panel.buttons["skip"].disabled = self.on_reference
-        panel.buttons["guess"].disabled = self.on_reference or len(names) < MIN_KEYPOINTS
         panel.show_progress(rows, self.current)
         panel.show_keypoints(names, len(picks), alignment)
         panel.captions["reference"].value = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
         self._show_cloud("reference", labelling.reference, None)
-        self.views["reference"].mark(labelling.picks(labelling.reference), chosen)
+        self.views["reference"].mark(labelling.picks(labelling.reference))
         if self.on_reference:
             self.shown.pop("sequence", None)
             self.views["sequence"].clear("Empty: no other sequence is chosen")
@@ -254,22 +188,11 @@ class _LabellingWidget:
             suffix = "" if overlay is None else f" and {_dot(BLUE, '✕')} the aligned reference"
             panel.captions["sequence"].value = f"{_dot(ORANGE)} {html.escape(self.current)}{suffix}"
             self._show_cloud("sequence", self.current, overlay)
-            self.views["sequence"].mark(picks, chosen)
+            self.views["sequence"].mark(picks)
         controls["point"].max = max(len(self._slider_points()) - 1, 0)
         self._move_cursor(only_if_shown=True)
         if row.problem:
             raise InputError(row.problem)
-
-    def _fill_keypoint_menu(self, names: tuple[str, ...], picked: int) -> None:
-        """Fill the menu with the next keypoint and those picked on the current sequence."""
-        menu = self.controls["keypoint"]
-        following = f"next: {picked + 1}"
-        if not self.on_reference:
-            following = f"next: {picked + 1} {names[picked]}" if picked < len(names) else "all picked"
-        options = (following, NEW_KEYPOINT), *((f"{i + 1} {name}", i) for i, name in enumerate(names[:picked]))
-        if options != menu.options:
-            chosen = menu.value if menu.value in dict(options).values() else NEW_KEYPOINT
-            menu.options, menu.value = options, chosen
 
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
         """Return the reference cloud in the world of the sequence, by its keypoints, its label, or a proposal."""

@@ -11,13 +11,10 @@ from zsp_lite.labelling.session import ACCEPTED, OPEN, SKIPPED, Progress
 from zsp_lite.widgets.cloud_view import CloudView
 from zsp_lite.widgets.common import load_package
 
-NEW_KEYPOINT = -1  # value of the keypoint menu for a keypoint that is not picked yet
-
 _STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
 _TOOLTIPS = {
-    "undo": "Undo the last change of this sequence",
+    "undo": "Remove the last keypoint of this sequence",
     "redo": "Remove all keypoints of this sequence",
-    "guess": "Propose an alignment by pose estimation",
     "accept": "Write the label of this sequence",
     "skip": "Leave this sequence without a label",
     "next": "Go to the next open sequence",
@@ -59,7 +56,6 @@ class Panel:
         }
         self.controls = {
             "sequence": widgets.Dropdown(options=options, description="sequence", style=style),
-            "keypoint": widgets.Dropdown(options=[("next", NEW_KEYPOINT)], description="keypoint", style=style),
             "name": widgets.Text(description="name", placeholder="for example: left arm", continuous_update=False,
                                  style=style, layout={"width": "16em"}),
             "overlay": widgets.ToggleButton(description="overlay", tooltip="Show both clouds, aligned, in two colours",
@@ -87,9 +83,7 @@ class Panel:
 
     def _rows(self, widgets) -> list:
         controls, buttons = self.controls, self.buttons
-        edit, finish = (
-            [buttons[name] for name in names] for names in (("undo", "redo", "guess"), ("accept", "skip", "next"))
-        )
+        edit, finish = ([buttons[name] for name in names] for names in (("undo", "redo"), ("accept", "skip", "next")))
         clouds = [
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
@@ -98,7 +92,7 @@ class Panel:
         centred = wrap | {"align_items": "center"}
         return [
             widgets.HTML(_STYLE),
-            widgets.HBox([controls["sequence"], controls["keypoint"], controls["name"]], layout=centred),
+            widgets.HBox([controls["sequence"], controls["name"]], layout=centred),
             widgets.HBox([*edit, controls["overlay"], *finish], layout=centred),
             self.message,
             widgets.HBox(clouds, layout=wrap),
