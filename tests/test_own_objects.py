@@ -312,15 +312,15 @@ def test_a_target_that_is_seen_from_one_side_and_masks_without_a_plane_are_flagg
 
 def test_depth_in_another_unit_is_questioned(image, frames, tmp_path):
     np.save(tmp_path / "z.npy", frames[0].depth)  # in metres
-    with pytest.raises(InputError, match=r"0.00\d+ m from the camera, expected 0.05 to 20 m; .* --depth-unit"):
-        open_source(image, INTRINSICS, depth=tmp_path / "z.npy").load([0])
-    chosen = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=30.0)
-    (flag,) = chosen.unit_flags(chosen.load([0]))
-    assert "m from the camera, expected 0.05 to 20 m" in flag
-    right = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=1.0)
-    (frame,) = right.load([0])
+    for unit, question in ((None, "0.00"), (30.0, "the object is "), (1.0, None)):
+        source = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=unit)
+        (frame,) = source.load([0])
+        flags = source.flags([frame])
+        assert len(flags) == bool(question)
+        if question:
+            assert question in flags[0] and "m from the camera, expected 0.05 to 20 m; " in flags[0]
+            assert "--depth-unit" in flags[0]
     np.testing.assert_array_equal(frame.depth, frames[0].depth)
-    assert right.unit_flags([frame]) == ()
 
 
 def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, tmp_path, capsys):

@@ -92,6 +92,7 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None) -> np.ndarray | 
 
 
 def _rotations(name: str, values: ArrayLike) -> Float[np.ndarray, "*batch 3 3"]:
+    """Convert and check rotation matrices."""
     matrices = real_array(f"rotation_error: {name}", values)
     if matrices.shape[-2:] != (3, 3):
         raise InputError(f"rotation_error: {name} has shape {matrices.shape}, expected (..., 3, 3)")

@@ -38,9 +38,7 @@ _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
 _TAKEN = {"open": (), "image": ("mask", "box", "intrinsics", "depth", "depth_unit")}
 _TAKEN |= {"sequence": ("mask", "box"), "nerfstudio": ("mask", "box"), "lists": ("mask", "box", "depth_unit")}
-# What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
-_UNIT_OPTION = "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)"
-_UNITS = {"nerfstudio": "set depth_unit_scale_factor in transforms.json"}
+_UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
@@ -56,7 +54,6 @@ class Source:
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    unit_given: bool = True  # whether the unit of the depth is not the default, but the user's or the format's
 
     @property
     def name(self) -> str:
@@ -81,8 +78,6 @@ class Source:
         others = {"given": [], "box": [0], "auto": np.linspace(0, len(self.numbers) - 1, _CONTEXT).round()}[self.mask]
         frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
-        if not self.unit_given and (flags := self.unit_flags(some)):
-            raise InputError(flags[0])
         if self.mask != "given":
             frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
         elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
@@ -90,21 +85,16 @@ class Source:
             raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
         return [frames[position] for position in positions]
 
-    def unit_flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length if the object, or what is near in frames without masks, is implausibly far."""
-        if self.format == "sequence":
-            return ()
+    def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
+        """Question the unit of length where the object is implausibly far, and the masks of frames if not given."""
+        found = [] if self.mask == "given" else list(mask_flags(frames))
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
-        if _NEAREST <= distance <= _FARTHEST:
-            return ()
-        cure = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {_UNITS.get(self.format, _UNIT_OPTION)}"
-        return (f"{self.path}: the object is {distance:.3g} m from the camera, {cure}",)
-
-    def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length, and the masks of frames if they were not given."""
-        masks = () if self.mask == "given" else mask_flags(frames)
-        return *self.unit_flags(frames), *(f"{self.path}: {flag}" for flag in masks)
+        if self.format != "sequence" and not _NEAREST <= distance <= _FARTHEST:
+            cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit (0.001: millimetres, 1: metres)")
+            expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; the unit of its depth is given by {cure}"
+            found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
+        return tuple(f"{self.path}: {flag}" for flag in found)
 
     def reference(self, number: int | None) -> tuple[int, Frame]:
         """Return the position and the frame of a number; by default, of the first usable one among some."""
@@ -243,9 +233,8 @@ def open_source(
     if layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])
-        frames = dataset.frames(folder.parent.name, folder.name)
-        frames = [one for one in frames if one.viewpoint is not None and one.depth is not None]
-        if not frames:
+        every = dataset.frames(folder.parent.name, folder.name)
+        if not (frames := [one for one in every if one.viewpoint is not None and one.depth is not None]):
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
@@ -253,7 +242,7 @@ def open_source(
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box, depth_unit is not None or "depth_unit" not in _TAKEN[layout])
+    return Source(path, layout, numbers, read, mask, box)
 
 
 def open_pair(

@@ -77,18 +77,12 @@ class ZeroShotPose:
     upright: bool = True
 
     def __post_init__(self):
-        names = {
-            "matcher": ("cyclical", *MATCHERS),
-            "view_selector": tuple(VIEW_SELECTORS),
-            "solver": ("paper", *SOLVER_CLASSES),
-            "foreground": ("saliency", "mask"),
-            "cycle_from": ("reference", "target"),
-            "kmeans": (None, True, False),
-        }
-        for name, allowed in names.items():
+        stages = {"matcher": ("cyclical", *MATCHERS), "view_selector": VIEW_SELECTORS}
+        stages["solver"] = ("paper", *SOLVER_CLASSES)
+        options = {"foreground": ("saliency", "mask"), "cycle_from": ("reference", "target")}
+        for name, allowed in (stages | options | {"kmeans": (None, True, False)}).items():
             value = getattr(self, name)
-            plugged_in = name in ("matcher", "view_selector", "solver") and callable(value)
-            if not plugged_in:
+            if name not in stages or not callable(value):  # else a plug-in
                 check_choice(name, value, allowed)
         for name, *limits in (("k", 1), ("trials", 1, MOST_TRIALS), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), *limits)
@@ -128,7 +122,7 @@ class ZeroShotPose:
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
         size = crop_size(self.backbone)
-        return self._views([object_crop(frame, size) for frame in frames])
+        return extract_views(self.backbone, [object_crop(frame, size) for frame in frames], self.foreground)
 
     def match_views(
         self,
@@ -138,11 +132,7 @@ class ZeroShotPose:
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
-        Args:
-            reference: Reference view.
-            targets: Target views.
-            similarities: For each target view, the cosines between the reference's patches and its own, if they are
-                known already.
+        `similarities` are the cosines of the reference's patches with those of each view, if they are known already.
         """
         if similarities is None:
             compare = cosine_similarities if self.binning else key_similarities
@@ -162,12 +152,8 @@ class ZeroShotPose:
     ) -> PoseEstimate:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
-        If the reference is not `upright`, the features of its other three turns are extracted here.
-
-        Args:
-            reference: Reference view (see `views`).
-            targets: Target views.
-            matched: The result of `match_views`, for the reference as it is, if it is known already.
+        `matched` is the result of `match_views`, if it is known already; the reference is then taken as it is. Else, if
+        it is not `upright`, the features of its other three turns are extracted here.
         """
         if not targets:
             raise InputError("no target views, expected at least one")
@@ -175,7 +161,8 @@ class ZeroShotPose:
             raise InputError(f"reference {reference.frame.name or 'view'}: {defect}")
         if self.upright or matched is not None:
             return self._solve(reference, targets, matched)
-        turns = [reference, *self._views([turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)])]
+        turned = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
+        turns = [reference, *extract_views(self.backbone, turned, self.foreground)]
         found, failures, timings = [], [], Counter()
         for quarters, view in enumerate(turns):
             try:
@@ -191,9 +178,6 @@ class ZeroShotPose:
         _, quarters, best = max(found, key=lambda one: one[0])
         best = turn_reference_back(best, reference, quarters) if quarters else best
         return replace(best, timings=dict(timings))
-
-    def _views(self, crops: Sequence[Frame]) -> list[View]:
-        return extract_views(self.backbone, crops, self.foreground)
 
     def _solve(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None
