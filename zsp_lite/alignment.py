@@ -180,10 +180,8 @@ def ransac(
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        raise InputError(
-            f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
-            f"collinear, or scale outside {scale_range}"
-        )
+        found = f"no usable sample in {trials} trials over {len(source)} points"
+        raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
 
     linear = scale[:, None, None] * rotation
@@ -203,12 +201,9 @@ def ransac(
 
 
 def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:
-    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials.
-
-    The k-th draw is a rank among the n - k indices left: it is moved up past each earlier index that is not larger.
-    """
+    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials."""
     samples = np.empty((trials, size), dtype=np.int64)
-    for k in range(size):
+    for k in range(size):  # a rank among the n - k indices left, moved up past each earlier index that is not larger
         draw = rng.integers(n - k, size=trials)
         for earlier in np.sort(samples[:, :k], axis=1).T:
             draw += draw >= earlier
@@ -227,7 +222,6 @@ def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np
         check_magnitude(name, points)
         longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _COLLINEAR_CLOUD * longest:
-            raise InputError(
-                f"the {len(points)} {name} points are all equal or collinear, expected points that span a plane"
-            )
+            found = f"the {len(points)} {name} points are all equal or collinear"
+            raise InputError(f"{found}, expected points that span a plane")
     return source, target

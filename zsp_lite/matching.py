@@ -13,7 +13,6 @@ P S: a dozen additions of S to itself.
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -225,21 +224,12 @@ def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w
 
 
 def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
-    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border."""
+    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its border."""
     total = x.clone()
     for shift in (-step, step):
-        for (to1, from1), (to2, from2) in product(*(_clamped_shift(n, shift) for n in (x.shape[0], x.shape[2]))):
-            total[to1, :, to2].add_(x[from1, :, from2])
+        index1, index2 = ((torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2])
+        total.add_(x.index_select(0, index1).index_select(2, index2))
     return total
-
-
-def _clamped_shift(n: int, shift: int) -> list[tuple[slice, slice]]:
-    """Return the entries of an axis that read others `shift` away, and those, clamped, that read its first or last."""
-    size = min(abs(shift), n)
-    front, back = slice(0, n - size), slice(size, n)
-    if shift > 0:
-        return [(front, back), (slice(n - size, n), slice(n - 1, n))]
-    return [(back, front), (slice(0, size), slice(0, 1))]
 
 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
@@ -251,11 +241,7 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 
 def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
-    """Compute the cosines between the descriptors of a few patches, which are few enough to build.
-
-    They are rounded to six decimals: greedy k-means++ has exact ties (of two points that are each other's nearest,
-    either lowers the sum of squares by the same amount), which rounding errors would break differently each time.
-    """
+    """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
     keys = features.keys.cpu().double()
     index = torch.from_numpy(index)
     descriptors = keys.flatten(0, 1)[index]
@@ -264,6 +250,8 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = Tr
         descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
         descriptors = descriptors.transpose(0, 1).flatten(1)
     descriptors = F.normalize(descriptors, dim=1)
+    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest, either lowers the
+    # sum of squares by the same amount), which rounding errors would break differently each time.
     return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
@@ -271,13 +259,11 @@ _thread_pools = lru_cache(ThreadpoolController)
 
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
-    """Cluster m points, given by their inner products, by k-means; returns their labels.
-
-    The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
-    products, hence the same distances. k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
-    One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
-    """
+    """Cluster m points, given by their inner products, by k-means; returns their labels."""
+    # One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
     with _thread_pools().limit(limits=1, user_api="blas"), warnings.catch_warnings():
+        # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same inner products,
+        # hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
         values, vectors = np.linalg.eigh(gram)
         points = vectors * np.sqrt(np.maximum(values, 0.0))
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.

@@ -1,6 +1,4 @@
-"""Pose errors, and the paper's figures of them.
-
-Source: sec. 5.1; supplement, "Choice of evaluation metrics".
+"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation metrics").
 
 `benchmark.statistics` has their intervals and tests. A bootstrap replicate is a row of weights, one per pair.
 """

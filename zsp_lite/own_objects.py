@@ -105,9 +105,8 @@ class Source:
             (frame,) = self.load([position])
             if not (defect := frame_defect(frame)):
                 return position, frame
-        raise InputError(
-            f"{self.path}: no usable reference frame: {defect}, expected another --reference-frame, --mask or --box"
-        )
+        expected = "another --reference-frame, --mask or --box"
+        raise InputError(f"{self.path}: no usable reference frame: {defect}, expected {expected}")
 
 
 def estimate_pose(
@@ -146,7 +145,7 @@ def estimate_pose(
     check_integer("targets", targets, 1)
     given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
-        first, second = open_pair(reference, target, given)
+        first, second = sources = open_pair(reference, target, given)
         position, frame = first.reference(reference_frame)
         positions = second.spread(targets)
         frames = second.load(positions)
@@ -154,9 +153,8 @@ def estimate_pose(
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        spreads = [axis_deviation(cloud) if len(cloud) > 1 else 0.0 for cloud in clouds]
-        unscaled = [one.format == "sequence" for one in (first, second)]
-        scales = [1.0 if known else 1 / (spread or 1) for known, spread in zip(unscaled, spreads)]
+        unscaled = [one.format == "sequence" or not len(cloud) for one, cloud in zip(sources, clouds)]
+        scales = [1.0 if done else 1 / (axis_deviation(cloud) or 1) for done, cloud in zip(unscaled, clouds)]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
         solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
@@ -226,10 +224,8 @@ def open_source(
         if name not in _TAKEN[layout]:
             raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
     if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
-        raise InputError(
-            f"{path}: mask is {mask!r} and box is {box}, expected --mask given, --mask auto, or --mask box with --box "
-            "TOP,LEFT,HEIGHT,WIDTH"
-        )
+        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
+        raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
     if layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])
@@ -250,8 +246,8 @@ def open_pair(
 ) -> list[Source]:
     """Open two sources with the options of a command line, by the names of arguments of `open_source`.
 
-    An option has one value for each path that takes it, or one for all of them: but one `depth` for each image, and a
-    single `box` is for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
+    An option has one value for each path that takes it (`depth`: each image), or one for all of them. A single `box` is
+    for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
     """
     sides = reference, target
     formats = ["open" if isinstance(side, Source) else _format(Path(side)) for side in sides]
@@ -303,9 +299,8 @@ def _open_image(
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
     camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}")
     if not all(0 < place < side for place, side in zip(camera.principal_point, camera.size[::-1])):
-        raise InputError(
-            f"image {path}: CX,CY is {intrinsics[2:]}, expected a point inside its {camera.size[::-1]} pixels"
-        )
+        expected = f"a point inside its {camera.size[::-1]} pixels"
+        raise InputError(f"image {path}: CX,CY is {intrinsics[2:]}, expected {expected}")
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 

@@ -52,10 +52,9 @@ class ZeroShotPose:
             "verified", or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
         upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
-            degrees, because the features of a turned image are others and phones may store images turned. The estimate
-            with the highest score is kept, and its pose is that of the image as given. The score is that of the first
-            hypothesis, or that of the chosen view where a solver has none. Confidence and alternatives are those within
-            the chosen turn. Keep True where images are upright: fewer wrong poses compete.
+            degrees, since phones may store images turned, and keeps the estimate with the highest score: that of the
+            first hypothesis, or of the chosen view where a solver has none. The pose is that of the image as given.
+            Keep True where images are upright: fewer wrong poses compete.
 
     Raises:
         InputError: A setting is out of range.
@@ -212,10 +211,7 @@ class ZeroShotPose:
 def solve_pair(
     method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
 ) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own.
-
-    Crops and features are computed once.
-    """
+    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with shared features."""
     first, *others = method.views([reference, *targets])
     if solvers is None:
         name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
@@ -263,13 +259,12 @@ def align_best_view(
 def view_alignment(reference: View, target: View) -> Sim3:
     """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
 
-    Returns:
-        Identity rotation, with the scale and translation that map the standard deviation and the centroid of the
-        reference's foreground points onto those of the target's.
+    The rotation is the identity. Scale and translation map the standard deviation and the centroid of the reference's
+    foreground points onto those of the target's.
     """
     first, second = _foreground_points(reference), _foreground_points(target)
-    spread, target_spread = standard_deviation(first), standard_deviation(second)
-    scale = target_spread / spread if spread > 0 and target_spread > 0 else 1.0
+    spreads = standard_deviation(first), standard_deviation(second)
+    scale = spreads[1] / spreads[0] if min(spreads) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 
 

@@ -118,10 +118,7 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
 
 
 def soft_saliency(features: FeatureMap, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on.
-
-    `size` is (height, width) in pixels; values are interpolated between the patches' centres.
-    """
+    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on."""
     ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
