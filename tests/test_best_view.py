@@ -30,10 +30,8 @@ def test_missing_matches_count_as_orthogonal():
     assert correspondence_score(matches([0.99] * 2), 50) < correspondence_score(matches([0.5] * 50), 50)
 
 
-def feature_map(global_feature, saliency=None) -> FeatureMap:
-    saliency = torch.ones(2, 2) if saliency is None else torch.as_tensor(saliency)
-    keys = torch.ones(*saliency.shape, 3)
-    return FeatureMap(keys, saliency, torch.as_tensor(global_feature, dtype=torch.float32))
+def feature_map(global_feature) -> FeatureMap:
+    return FeatureMap(torch.ones(2, 2, 3), torch.ones(2, 2), torch.tensor(global_feature))
 
 
 def test_the_global_score_is_the_cosine_whatever_the_lengths():
