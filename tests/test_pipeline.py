@@ -75,6 +75,10 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
     cameras = [frame.camera for frame in targets]
     poses = estimate.propagate(cameras)
     np.testing.assert_allclose(poses[estimate.view].matrix, estimate.sim3.matrix, atol=1e-12)
+    point = np.array([0.1, 0.2, 4.0])
+    world = estimate.target_camera.to_world(estimate.sim3.apply(point))
+    for pose, camera in zip(poses, cameras):
+        np.testing.assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
     truths = [true_pose(reference.camera, AT_HOME, camera, ELSEWHERE) for camera in cameras]
     errors = [rotation_error(pose.R, truth.R) for pose, truth in zip(poses, truths)]
     np.testing.assert_allclose(errors, errors[estimate.view], atol=1e-6)  # one rigid target: equal in every view

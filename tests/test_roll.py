@@ -69,6 +69,7 @@ def test_the_pose_of_a_turned_reference_is_that_of_the_image_as_given(frames, so
     np.testing.assert_array_equal(found.reference_view.frame.rgb, crop.rgb)
     assert found.reference_view.frame.camera.size == crop.camera.size
     np.testing.assert_array_equal(found.reference_view.frame.camera.matrix, crop.camera.matrix)
+    assert np.abs(found.reference_view.soft_mask - crop.mask).mean() < 0.1
     first, second = found.points
     at_home = rolled.camera.to_world(first)
     elsewhere = ELSEWHERE.inverse().apply(found.target_camera.to_world(second))

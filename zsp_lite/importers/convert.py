@@ -73,8 +73,10 @@ def import_capture(
         files = files_by_stem(masks)
         capture = [replace(frame, mask=files.get(frame.image.stem)) for frame in capture]
     if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
-        ways = "a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH) or masks named like the pictures (--masks DIR)"
-        raise InputError(f"{missing[0]} has no mask, expected {ways}")
+        raise InputError(
+            f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
+            "of masks that are named like the pictures (--masks DIR)"
+        )
     frames = [frame.load() for frame in capture]
     frames = frames if box is None else masks_from_box(frames, box)
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
