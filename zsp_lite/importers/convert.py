@@ -51,7 +51,7 @@ def import_capture(
     """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
-    whose mask is empty are left out. An interrupted import can be repeated.
+    whose mask is empty are left out.
 
     Args:
         capture: Frames of one reader in `READERS`.
@@ -66,8 +66,7 @@ def import_capture(
         InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    unfinished = folder / ".unfinished"
-    if folder.exists() and not unfinished.is_file():
+    if folder.exists():
         raise InputError(f"{folder} exists already, expected another sequence name")
     capture = evenly_spaced(capture, max_frames)
     if masks is not None and box is None:
@@ -79,8 +78,7 @@ def import_capture(
             "of masks that are named like the pictures (--masks DIR)"
         )
     frames = [frame.load() for frame in capture]
-    if box is not None:
-        frames = masks_from_box(frames, box)
+    frames = frames if box is None else masks_from_box(frames, box)
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
     if not seen:
         raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
@@ -91,10 +89,7 @@ def import_capture(
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
     data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):
-        folder.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()
         write_co3d(root, category, [data])
-        unfinished.unlink()
     return ImportResult(len(frames), empty, len(points), scale, flags)
 
 
@@ -140,7 +135,7 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
     points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
-    if len(points) < 4:
+    if not len(points):
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))
     return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise
