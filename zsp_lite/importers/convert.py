@@ -51,7 +51,7 @@ def import_capture(
     """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
-    whose mask is empty are left out.
+    whose mask is empty are left out. An interrupted import can be repeated.
 
     Args:
         capture: Frames of one reader in `READERS`.
@@ -66,7 +66,8 @@ def import_capture(
         InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    if folder.exists():
+    unfinished = folder / ".unfinished"
+    if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     capture = evenly_spaced(capture, max_frames)
     if masks is not None and box is None:
@@ -89,7 +90,10 @@ def import_capture(
     scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
     data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):
+        folder.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
         write_co3d(root, category, [data])
+        unfinished.unlink()
     return ImportResult(len(frames), empty, len(points), scale, flags)
 
 

@@ -36,6 +36,7 @@ _MIN_PIXELS = 100
 _UNKNOWN_PADDING, _CONTEXT_PADDING = 0.1, 0.8
 # A mask is flagged beyond these values, which were chosen on renderings.
 _BORDERS = 2  # number of the image's borders that a mask may not touch at once
+_MOST = 0.5  # share of the image
 _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.4  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
@@ -179,6 +180,8 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     width = max(mask.shape) // 100 + 1  # of the border, pixels
     if sum(edge.any() for edge in (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:])) >= _BORDERS:
         yield "several borders of the image are touched"
+    if mask.mean() > _MOST:
+        yield "most of the image is covered"
     if largest_region(mask).sum() < (1 - _PARTS) * mask.sum():
         yield "several separate parts"
     found = largest_region(_colours_around(frame, mask, certain=False))
