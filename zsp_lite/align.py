@@ -21,7 +21,6 @@ from torch import get_num_threads
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
 from zsp_lite.benchmark.problem import Problem
@@ -57,6 +56,11 @@ class _Line(msgspec.Struct):
     centre: list[float]
     matrices: list[list[list[float]]]
     probabilities: list[float]
+
+
+def hypotheses(problem: Problem) -> PairHypotheses:
+    """Find the hypotheses of the verified solver between the worlds of both objects."""
+    return world_hypotheses(problem.pair, problem.estimate(settings={"solver": "verified"}))
 
 
 class PairSolver:

@@ -1,19 +1,15 @@
-"""The paper's baselines (sec. 5.2 and supplement), and a solver of whole categories, as rows of the benchmark."""
-
-from contextlib import suppress
+"""The paper's baselines (sec. 5.2 and supplement) as rows of the benchmark."""
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import PairHypotheses, category_pairs, synchronise, world_hypotheses
 from zsp_lite.errors import InputError
 
 _K = 50  # number of matches, as in "Ours"
@@ -54,25 +50,3 @@ def posecontrast(problem: Problem) -> Answer:
     similarity = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
     view = int(np.argmax(similarity))
     return Answer(others[view].rotation @ first.rotation.T, view)
-
-
-def category(problem: Problem) -> Answer:
-    """Run "category": the pose from the alignment of all objects of the category, which needs no label of any."""
-    store, views = problem.store, len(problem.pair.target_frames)
-
-    own = hypotheses(problem)
-    if ("category", views) not in store.lasting:
-        others: list[PairHypotheses] = []
-        for pair in category_pairs(store.dataset, store.category, None, None, views, seed=0):
-            with suppress(InputError):  # the views determine no pose
-                others.append(hypotheses(Problem(pair, store)))
-        store.lasting["category", views] = others
-    alignment = synchronise([*store.lasting["category", views], own])
-    first, second = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
-    sim3 = second @ alignment.between(own.reference, own.target) @ first.inverse()
-    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
-
-
-def hypotheses(problem: Problem) -> PairHypotheses:
-    """Find the hypotheses of the verified solver between the worlds of both objects."""
-    return world_hypotheses(problem.pair, problem.estimate(settings={"solver": "verified"}))

@@ -3,24 +3,23 @@
 import dataclasses
 import functools
 import hashlib
-import os
 import platform
 import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import scipy
 import torch
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
 
 _PACKAGE = Path(__file__).parents[1]
-_DEPENDENCIES = {"torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d"}
 
 
 def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
@@ -31,7 +30,8 @@ def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
             part = part.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
         elif isinstance(part, np.ndarray):
             found.update(f"{part.dtype}{part.shape}".encode())
-        found.update(part.encode() if isinstance(part, str) else part if isinstance(part, bytes) else part.tobytes())
+            part = np.ascontiguousarray(part)
+        found.update(part.encode() if isinstance(part, str) else part)
     return found.hexdigest()[:16]
 
 
@@ -76,12 +76,11 @@ def library_version() -> dict[str, str | None]:
 
 
 def environment() -> dict[str, Any]:
-    """Describe this call: time, command, versions of the library's dependencies, and machine."""
-    program, installed = Path(sys.argv[0]).name, {one.name for one in distributions()}
-    words = ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]]
+    """Describe this call: time, command, and versions of the library's dependencies."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": [text.encode(errors="replace").decode() for text in words],
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _DEPENDENCIES & installed},
-        "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "versions": {one.__name__: one.__version__ for one in (torch, np, scipy, cv2)}
+        | {"python": platform.python_version(), "machine": platform.platform()},
     }

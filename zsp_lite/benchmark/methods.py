@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -48,7 +47,7 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-_MASK, _VERIFIED = {"foreground": "mask"}, {"solver": "verified"}
+_MASK = {"foreground": "mask"}
 _MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
 
 METHODS: dict[str, Method] = {
@@ -83,10 +82,8 @@ METHODS: dict[str, Method] = {
     "swav": Method("swav", settings=_MUTUAL),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
     # Beyond the paper.
-    "verified": Method(settings=_VERIFIED),
-    "verified-mask": Method(settings=_VERIFIED | _MASK),
-    # Sees all other objects of the category, too, without labels.
-    "category": Method(solve=baseline_rows.category),
+    "verified": Method(settings={"solver": "verified"}),
+    "verified-mask": Method(settings={"solver": "verified"} | _MASK),
 }
 
 
@@ -140,10 +137,9 @@ def _method(name: str, meant: Any) -> Method:
         if meant.endswith(".csv"):
             return Method("none", solve=read_poses(meant))
         if ":" not in meant:
-            close = get_close_matches(meant, [*METHODS, *GROUPS])
             raise InputError(
-                f"method {meant!r} is unknown{', close are ' if close else ''}{', '.join(close)}; "
-                "`zsp-lite benchmark --list` lists all, NAME=module:thing and NAME=poses.csv are your own"
+                f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, NAME=module:thing and "
+                "NAME=poses.csv are your own"
             )
         meant = import_object(meant)
     if isinstance(meant, Method):

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from torch import nn
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
@@ -35,22 +34,19 @@ def kind_of(name: str, thing: Any) -> str:
     The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
     InputError if it is none of these.
     """
-    found = f"of type {type(thing).__name__}"
-    if not isinstance(thing, type) and callable(getattr(thing, "estimate", None)):
-        return "estimator"
-    if (kind := getattr(thing, "kind", None)) in KINDS:
-        return kind
-    if callable(thing) and not isinstance(thing, type):
-        with suppress(TypeError, ValueError):  # some functions of compiled modules have no signature
-            signature = inspect.signature(thing.forward if isinstance(thing, nn.Module) else thing)
-            found = f"a function of {signature}"
-            parameters = signature.parameters.values()
+    if not isinstance(thing, type):
+        if callable(getattr(thing, "estimate", None)):
+            return "estimator"
+        if (kind := getattr(thing, "kind", None)) in KINDS:
+            return kind
+        with suppress(TypeError, ValueError):  # no function, or one of a compiled module, which has no signature
+            parameters = inspect.signature(getattr(thing, "forward", thing)).parameters.values()
             needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
             if all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed):
                 return KINDS[range(1, 4).index(len(needed))]
     raise InputError(
-        f"method {name!r} is {found}, expected a function of one argument (problem), two (two images) or three "
-        "(similarities, two foregrounds), or an object with estimate(reference, targets)"
+        f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
+        "images) or three (similarities, two foregrounds), or an object with estimate(reference, targets)"
     )
 
 
@@ -92,10 +88,8 @@ class KeypointMatcher:
         reference, *targets = problem.frames()
         found = [self.own(reference.rgb, target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
-        if any((one < 0).any() for one in scores):
-            raise FatalError(
-                "scores of matches are negative, expected 0 or more: the view of the highest sum is chosen"
-            )
+        if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
+            raise FatalError("scores of matches are negative, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
         return fit_keypoints(problem, view, *found[view][:2])
 
@@ -124,9 +118,7 @@ class StoredPoses:
         if not (found := self.of(problem.pair)):
             raise InputError(f"{self.path} has no pose")
         if len(found) > 1:
-            raise FatalError(
-                f"poses {self.path}: {len(found)} target views of the pair {problem.pair.key}, expected one"
-            )
+            raise FatalError(f"{self.path} has {len(found)} poses of the pair {problem.pair.key}, expected one")
         return found[0]
 
     def of(self, pair: Pair) -> list[Answer]:

@@ -1,10 +1,12 @@
 """Argument and results of a benchmark row: `Problem` and `Answer`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
@@ -14,12 +16,10 @@ from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.estimates import PoseEstimate
+from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
-
-# What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
-_MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,8 @@ class Problem:
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
         # (sequence, frame number) of the reference and of each target
         self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
+        self._estimates: dict[tuple, PoseEstimate] = {}
+        self._similarity = cache(self._compare)
 
     @property
     def reference(self) -> View:
@@ -110,37 +112,24 @@ class Problem:
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
     ) -> PoseEstimate:
-        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index.
-
-        Rows that differ in later stages only share the similarities and the matches.
-        """
-        settings, store = settings or {}, self.store
-        first, *others = self.keys if target is None else (self.keys[0], self.keys[1 + target])
-        method = ZeroShotPose(store.extractors[features], **settings, seed=self.seed)
-        matching = [getattr(method, name) for name in _MATCH_SETTINGS]
-
-        def match(key: FrameKey, reference: View, view: View) -> ViewMatch:
-            @store.timed("similarity")
-            def compare() -> list[Any]:
-                return (similarities if method.binning else key_similarities)(reference.features, [view.features])
-
-            @store.timed("matching")
-            def select() -> ViewMatch:
-                return method.match_views(reference, [view], similarity)[0]
-
-            similarity = self._shared(("similarity", key, features, method.binning), compare)
-            return self._shared(("matches", key, self.seed, features, *matching), select)
-
-        def solve() -> PoseEstimate:
-            reference, *targets = (store.view(features, key, method.foreground) for key in (first, *others))
+        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index."""
+        settings = settings or {}
+        name = (features, target, *sorted(settings.items()))
+        if name not in self._estimates:
+            method = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
+            keys = self.keys if target is None else [self.keys[0], self.keys[1 + target]]
+            reference, *targets = (self.store.view(features, key, method.foreground) for key in keys)
             # A reference that may stand on its side is matched in four turns, by the method itself.
-            matched = [match(key, reference, view) for key, view in zip(others, targets)] if method.upright else None
-            found = method.estimate_from_views(reference, targets, matched)
-            for stage, seconds in found.timings.items():
-                store.timings.setdefault(stage, []).append(seconds)
-            return found
+            matched = [self._match(method, reference, view) for view in targets] if method.upright else None
+            self._estimates[name] = method.estimate_from_views(reference, targets, matched)
+            for stage, seconds in self._estimates[name].timings.items():
+                self.store.timings.setdefault(stage, []).append(seconds)
+        return self._estimates[name]
 
-        return self._shared(("estimate", *others, self.seed, features, *sorted(settings.items())), solve)
+    def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
+        similarity = self._similarity(reference.features, target.features, method.binning)
+        return self.store.timed("matching", method.match_views, reference, [target], similarity)[0]
 
-    def _shared(self, name: tuple, make: Callable[[], Any]) -> Any:
-        return self.store.shared((self.keys[0], self.pair.target_sequence), name, make)
+    def _compare(self, reference: FeatureMap, target: FeatureMap, binning: bool) -> list[torch.Tensor]:
+        compare = similarities if binning else key_similarities
+        return self.store.timed("similarity", compare, reference, [target])

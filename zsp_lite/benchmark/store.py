@@ -2,8 +2,8 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from functools import lru_cache
+from contextlib import contextmanager
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,9 +26,8 @@ class FrameStore:
         """Make an empty store; `threads` are torch's during feature extraction, None leaves them as they are."""
         self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
         self.timings: dict[str, list[float]] = {}
-        self.lasting: dict[Any, Any] = {}  # what was computed for a sequence or for the whole category
         self._kept = lru_cache(CAPACITY)(self._read)
-        self._subject, self._shared = (), dict[tuple, Any]()
+        self.extent = cache(self._extent)
 
     def full_frame(self, key: FrameKey) -> Frame:
         """Read a frame from disk, uncropped."""
@@ -40,14 +39,14 @@ class FrameStore:
 
     def describe(self, features: str, key: FrameKey) -> Any:
         """Return what an extractor computes from a frame's crop."""
-        kept = self._kept(key)
+        kept, extractor = self._kept(key), self.extractors[features]
         if features not in kept:
-            extractor = self.extractors[features]
             # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
-            with self.timed(features), torch_threads(self.threads):
-                crop = kept["crop"]
-                found = extractor.describe([crop]) if hasattr(extractor, "describe") else extractor([crop.rgb])
-                (kept[features],) = found
+            with torch_threads(self.threads):
+                if hasattr(extractor, "describe"):
+                    (kept[features],) = self.timed(features, extractor.describe, [kept["crop"]])
+                else:
+                    (kept[features],) = self.timed(features, extractor, [kept["crop"].rgb])
         return kept[features]
 
     def view(self, features: str, key: FrameKey, foreground: str) -> View:
@@ -57,38 +56,29 @@ class FrameStore:
             kept[name] = frame_view(self.frame(key), self.describe(features, key), foreground)
         return kept[name]
 
-    def extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
+    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function, and add the time that it takes to the `timings` of a stage."""
+        start = time.perf_counter()
+        found = function(*arguments)
+        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
+        return found
+
+    def _read(self, key: FrameKey) -> dict[Any, Any]:
+        """Read a frame: its crop, to which is added by name what is computed from it."""
+        size = crop_size(self.extractors.get("backbone"))
+        return {"crop": self.timed("reading", lambda: object_crop(self.full_frame(key), size))}
+
+    def _extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
         """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
 
         They are those of the box of the cloud's points, without the outermost 2 % on each side.
         """
-        if sequence not in self.lasting:
-            self.lasting[sequence] = None
-            with suppress(InputError):
-                points, _ = self.dataset.point_cloud(self.category, sequence)
-                low, high = np.quantile(points, (0.02, 0.98), axis=0)
-                self.lasting[sequence] = (low + high) / 2, float(np.linalg.norm(high - low))
-        return self.lasting[sequence]
-
-    def shared(self, subject: tuple, name: tuple, make: Callable[[], Any]) -> Any:
-        """Return what `make` returned for a name at first. Only results of the last subject are kept."""
-        if subject != self._subject:
-            self._subject, self._shared = subject, {}
-        if name not in self._shared:
-            self._shared[name] = make()
-        return self._shared[name]
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the duration of a block to the `timings` of a stage."""
-        start = time.perf_counter()
-        yield
-        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
-
-    def _read(self, key: FrameKey) -> dict[Any, Any]:
-        """Read a frame: its crop, to which is added by name what is computed from it."""
-        with self.timed("reading"):
-            return {"crop": object_crop(self.full_frame(key), crop_size(self.extractors.get("backbone")))}
+        try:
+            points, _ = self.dataset.point_cloud(self.category, sequence)
+        except InputError:
+            return None
+        low, high = np.quantile(points, (0.02, 0.98), axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
 
 
 @contextmanager

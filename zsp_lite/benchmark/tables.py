@@ -18,7 +18,6 @@ from zsp_lite.io.files import write_atomic
 
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "published on CO3D (other data)"
-WITH_OTHERS = ("category",)  # rows that see other objects than the two of the pair
 _PUBLISHED_NOTE = "Published figures are the paper's, of DINO ViT-S/8 on CO3D."
 _LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
 _FEATURED = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster")  # with their Acc30 in Table 1
@@ -63,30 +62,23 @@ class Table:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    shown = [all_rows(summary, metrics), all_rows(summary, metrics, with_others=True), *paper_tables(summary)]
-    return [table for table in (*shown, *(by_category(summary, one) for one in PAPER)) if len(table.cells)]
+    return [all_rows(summary, metrics), *paper_tables(summary), *(by_category(summary, one) for one in PAPER)]
 
 
-def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, with_others: bool = False) -> Table:
-    """Return every row of the run: its figures, failed pairs, and its difference to "ours".
-
-    Rows that see other objects than the two of the pair are in a table of their own, that `with_others`.
-    """
+def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> Table:
+    """Return every row of the run: its figures, failed pairs, and its difference to "ours"."""
     rows = {}
     for name, row in summary["methods"].items():
-        if (library_row(name) in WITH_OTHERS) != with_others:
-            continue
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
-        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, None, None]
+        difference = p = None
         if test := summary.get("against", {}).get(name):
             difference = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
-            rows[name][-2:] = [difference, Cell(test["accuracy_gain_p"], decimals=3)]
+            p = Cell(test["accuracy_gain_p"], decimals=3)
+        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, difference, p]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    name, title = "all_rows", "All rows"
-    if with_others:
-        name, title = "with_others", "With other unlabelled objects of the category"
-    return Table(name, title, _frame(rows, titles), _note(summary, metrics, gain), titles[1:4], _data(summary))
+    note = _note(summary, metrics, gain)
+    return Table("all_rows", "All rows", _frame(rows, titles), note, titles[1:4], _data(summary))
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -152,10 +144,9 @@ def own_rows(summary: Mapping[str, Any]) -> list[str]:
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that see the pair only, "ours" and one's own first."""
+    """List the rows of a run, "ours" and one's own first."""
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
-    names = [name for name in summary["methods"] if library_row(name) not in WITH_OTHERS]
-    return sorted(names, key=lambda name: first.index(name) if name in first else len(first))
+    return sorted(summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
 
 
 def library_row(name: str) -> str:
@@ -222,16 +213,13 @@ def as_latex(table: Table) -> str:
     The paper's figures of these columns follow below a line.
     """
     shown = table.cells[list(table.compact)].dropna(how="all")
-    best = {name: _best(cells) for name, cells in (shown.iterrows() if table.across else shown.items())}
-    lines = [["", *map(_tex, shown)], []]
-    for label, cells in shown.iterrows():
-        wins = [title in best[label] if table.across else label in best[title] for title in shown]
-        texts = zip(map(_number, cells), wins)
-        lines.append([_tex(label), *(rf"\textbf{{{text}}}" if one else text for text, one in texts)])
+    texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
+    texts = texts.mask(best, texts.map(lambda text: rf"\textbf{{{text}}}"))
+    lines = [["", *map(_tex, shown)], [], *([_tex(label), *cells] for label, *cells in texts.itertuples())]
     published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in shown]).dropna(how="all")
     if len(published):
         lines += [[], [rf"\multicolumn{{{len(lines[0])}}}{{l}}{{{PUBLISHED}}}"]]
-        lines += [[_tex(label), *map(_number, cells)] for label, cells in published.iterrows()]
+        lines += [[_tex(label), *cells] for label, *cells in published.map(_number).itertuples()]
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
     return "\n".join([
         r"\begin{table}[tb]", rf"\caption{{{_tex('. '.join(filter(None, (title, table.data))))}}}",
@@ -241,14 +229,12 @@ def as_latex(table: Table) -> str:
     ])  # fmt: skip
 
 
-def _best(cells: pd.Series) -> list[str]:
-    """Names of the best of cells of one metric, if there are rivals; a row that is told the true view is none."""
+def _are_best(cells: pd.Series) -> pd.Series:
+    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true view is none."""
     rivals = {name: cell for name, cell in cells.items() if cell and cell.metric and "oracle-view" not in name}
-    if len(rivals) < 2:
-        return []
-    values = {name: round(cell.value, cell.decimals) for name, cell in rivals.items()}
-    lowest = next(iter(rivals.values())).metric in _LOWEST_IS_BEST
-    return [name for name in values if values[name] == (min if lowest else max)(values.values())]
+    values = pd.Series({name: round(cell.value, cell.decimals) for name, cell in rivals.items()}, cells.index, float)
+    lowest = any(cell.metric in _LOWEST_IS_BEST for cell in rivals.values())
+    return (values == (values.min() if lowest else values.max())) & (len(rivals) > 1)
 
 
 def _number(cell: Any) -> str:
