@@ -18,10 +18,9 @@ from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, description, resolve
 from zsp_lite.benchmark.own import kind_of, write_questions
-from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_lines, read_run
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels

@@ -12,10 +12,9 @@ from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_run
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError

@@ -25,10 +25,9 @@ from zsp_lite.benchmark.evaluation import Evaluator
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, compare, read_lines, read_run
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
@@ -295,7 +294,7 @@ def frames_of(**extractors):
 
 
 def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
-    monkeypatch.setattr("zsp_lite.benchmark.store.CAPACITY", 3)
+    monkeypatch.setattr("zsp_lite.benchmark.problem.CAPACITY", 3)
     frames = frames_of(backbone=BACKBONE)
     for number in (0, 1, 2, 0, 3):
         frames.describe("backbone", ("100_a", number))

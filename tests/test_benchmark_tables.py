@@ -13,8 +13,7 @@ from benchmark_folder import CATEGORIES, made_up_run, write_run
 from zsp_lite.benchmark import figures, tables
 from zsp_lite.benchmark.methods import GROUPS, read_paper_tables, resolve
 from zsp_lite.benchmark.runs import LINES, SETTINGS, compare, read_run
-from zsp_lite.benchmark.statistics import paired_difference
-from zsp_lite.benchmark.summary import draws_of
+from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.benchmark.tables import PUBLISHED, Cell, all_rows, as_latex, as_markdown, every_table, paper_tables
 from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.cli.terminal import print_table

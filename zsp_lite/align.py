@@ -23,10 +23,9 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_texts
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.category import (
     SAME_ANGLE,
     CategoryAlignment,

@@ -13,8 +13,7 @@ from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.baselines.essential_matrix import essential_rotation
 from zsp_lite.benchmark.methods import METHODS, Method, make_extractors
 from zsp_lite.benchmark.own import describe_failure
-from zsp_lite.benchmark.problem import Answer, Problem, as_answer
-from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.errors import FatalError, InputError
@@ -31,7 +30,7 @@ class Evaluator:
     """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
 
     def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int | None = None):
-        """Make the extractors; `threads` are torch's in feature extraction."""
+        """Make the extractors; `threads` are those of feature extraction."""
         loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         self._dataset, self._methods, self._threads = Co3D(root), methods, threads
         self._extractors, self._store = make_extractors(loaded, methods), None

@@ -18,7 +18,6 @@ import cloudpickle
 import cv2
 from threadpoolctl import threadpool_limits
 
-from zsp_lite.benchmark.store import torch_threads
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer
 
@@ -91,7 +90,7 @@ def one_thread() -> Iterator[None]:
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with threadpool_limits(1), torch_threads(1):
+        with threadpool_limits(1):  # torch, BLAS, OpenMP
             yield
     finally:
         cv2.setNumThreads(cv2_threads)

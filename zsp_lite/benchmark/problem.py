@@ -1,25 +1,29 @@
-"""Argument and results of a benchmark row: `Problem` and `Answer`."""
+"""Argument and results of a benchmark row: `Problem`, whose frames a `FrameStore` keeps, and `Answer`."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.benchmark.store import FrameKey, FrameStore
 from zsp_lite.best_view import ViewMatch
-from zsp_lite.data.co3d import Pair
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import View
+from zsp_lite.views import View, crop_size, frame_view, object_crop
+
+FrameKey = tuple[str, int]  # sequence name and frame number
+CAPACITY = 128  # frames in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +73,66 @@ def as_answer(found: Any) -> Answer:
 
 def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
     return Sim3(1.0, real_array("pose of the row", pose), np.zeros(3)).R
+
+
+class FrameStore:
+    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage."""
+
+    def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
+        """Make an empty store; `threads` are those of feature extraction, None leaves them as they are."""
+        self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
+        self.timings: dict[str, list[float]] = {}
+        self._kept = lru_cache(CAPACITY)(self._read)
+        self.extent = cache(self._extent)
+
+    def full_frame(self, key: FrameKey) -> Frame:
+        """Read a frame from disk, uncropped."""
+        return self.dataset.load(self.dataset.frame(self.category, *key))
+
+    def frame(self, key: FrameKey) -> Frame:
+        """Return a frame's object crop, resized to the backbone's input."""
+        return self._kept(key)["crop"]
+
+    def describe(self, features: str, key: FrameKey) -> Any:
+        """Return what an extractor computes from a frame's crop."""
+        kept, extractor = self._kept(key), self.extractors[features]
+        if features not in kept:
+            describe, crop = getattr(extractor, "describe", None), kept["crop"]
+            # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+            with threadpool_limits(self.threads):
+                (kept[features],) = self.timed(features, describe or extractor, [crop if describe else crop.rgb])
+        return kept[features]
+
+    def view(self, features: str, key: FrameKey, foreground: str) -> View:
+        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
+        kept, name = self._kept(key), (features, foreground)
+        if name not in kept:
+            kept[name] = frame_view(self.frame(key), self.describe(features, key), foreground)
+        return kept[name]
+
+    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function, and add the time that it takes to the `timings` of a stage."""
+        start = time.perf_counter()
+        found = function(*arguments)
+        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
+        return found
+
+    def _read(self, key: FrameKey) -> dict[Any, Any]:
+        """Read a frame: its crop, to which is added by name what is computed from it."""
+        size = crop_size(self.extractors.get("backbone"))
+        return {"crop": self.timed("reading", lambda: object_crop(self.full_frame(key), size))}
+
+    def _extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
+        """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
+
+        They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        """
+        try:
+            points, _ = self.dataset.point_cloud(self.category, sequence)
+        except InputError:
+            return None
+        low, high = np.quantile(points, (0.02, 0.98), axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
 
 
 class Problem:

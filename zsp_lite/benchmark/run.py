@@ -59,7 +59,7 @@ def evaluate(
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
 
     Returns:
-        The content of OUT/summary.json (see `summary.summarise`); `write_reports` writes tables and figures.
+        The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.

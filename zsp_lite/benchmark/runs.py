@@ -14,8 +14,7 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from zsp_lite.benchmark.statistics import paired_difference
-from zsp_lite.benchmark.summary import draws_of, summarise
+from zsp_lite.benchmark.statistics import draws_of, paired_difference, summarise
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
 from zsp_lite.io.locks import writing
@@ -129,24 +128,24 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held, asked = _compared(before), _compared(now)
     for name in (name for name in asked if held.get(name, asked[name]) != asked[name]):
-        what = f"{name} {held[name]}, this is {asked[name]}"
-        raise InputError(f"{out} holds a run with {what}; choose another folder")
-    if now.library[0] not in before.library and not allow_other_version:
-        versions = (f"zsp-lite {one['version']} (commit {one['commit']})" for one in (before.library[-1], *now.library))
-        other = "choose another folder, or continue with --allow-other-version"
-        raise InputError(f"{out} was measured with {', this is '.join(versions)}; {other}")
-    library = [*before.library, *(one for one in now.library if one not in before.library)]
+        if name != "version" or not allow_other_version:
+            more = ", or continue with --allow-other-version" if name == "version" else ""
+            told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
+            raise InputError(f"{out} holds a run with {told}")
     merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins")}
+    library = [*(one for one in before.library if one != now.library[0]), *now.library]
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
 
 
 def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    command = "align" if "alignment" in settings.methods else "benchmark"
-    groups = {"methods": settings.methods, "labels": settings.labels, "origins": settings.origins}
-    parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
-    whole = {"data": settings.data, "backbone": settings.backbone, "targets": settings.targets}
-    return {"command": command} | whole | parts
+    library, groups = settings.library[-1], {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
+    return {
+        "command": "align" if "alignment" in settings.methods else "benchmark",
+        "data": settings.data, "backbone": settings.backbone, "targets": settings.targets,
+        **{f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()},
+        "version": f"{library['version']} (commit {library['commit']})",
+    }  # fmt: skip
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:

@@ -50,7 +50,6 @@ class Table:
     title: str
     cells: pd.DataFrame  # of `Cell`, or None
     note: str = ""  # how to read it
-    compact: Sequence[str] = ()  # at most three columns that a LaTeX table shows
     data: str = ""  # what was evaluated
     across: bool = False  # the columns are methods, not the rows
 
@@ -77,8 +76,7 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN)
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, difference, p]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    note = _note(summary, metrics, gain)
-    return Table("all_rows", "All rows", _frame(rows, titles), note, titles[1:4], _data(summary))
+    return _table(summary, "all_rows", "All rows", rows, titles, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -102,9 +100,9 @@ def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
         cells = [_cell(row, metric) for metric in PAPER]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
-    note = _note(summary, PAPER, _PUBLISHED_NOTE if kept else "", spec.get("note", ""))
-    frame = _frame(rows, [*titles, *(f"{PUBLISHED}: {spec['published'][k]}" for k in kept)])
-    return Table(spec["name"], spec["title"], frame, note, titles[:3], _data(summary))
+    titles += [f"{PUBLISHED}: {spec['published'][k]}" for k in kept]
+    notes = _PUBLISHED_NOTE if kept else "", spec.get("note", "")
+    return _table(summary, spec["name"], spec["title"], rows, titles, PAPER, *notes)
 
 
 def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | None = None) -> Table:
@@ -116,8 +114,7 @@ def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | N
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
     name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
-    note, names = _note(summary, [metric]), list(methods)
-    return Table(name, title, _frame(rows, names), note, names[:3], _data(summary), across=True)
+    return _table(summary, name, title, rows, list(methods), [metric], across=True)
 
 
 def comparison_table(differences: dict[str, dict[str, Any]], first: str, second: str) -> Table:
@@ -131,11 +128,9 @@ def comparison_table(differences: dict[str, dict[str, Any]], first: str, second:
         ]
         for name, one in differences.items()
     }  # fmt: skip
-    note = (
-        "On the common pairs. Intervals (95 %) and p: bootstrap over objects. Of twenty rows without a difference, one "
-        "has p < 0.05 by chance."
-    )
-    return Table("compare", f"A = {first}, B = {second}", _frame(rows, titles), note, titles[1:4])
+    note = "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
+    note += "Of twenty rows without a difference, one has p < 0.05 by chance."
+    return Table("compare", f"A = {first}, B = {second}", pd.DataFrame.from_dict(rows, "index", object, titles), note)
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -169,25 +164,21 @@ def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
     return Cell(row[metric], *row.get(f"{metric}_ci", (None, None)), decimals, metric)
 
 
-def _frame(rows: Mapping[str, Sequence[Cell | None]], titles: Sequence[str]) -> pd.DataFrame:
-    return pd.DataFrame(list(rows.values()), list(rows), titles, dtype=object)
-
-
-def _note(summary: Mapping[str, Any], metrics: Sequence[str], *more: str) -> str:
-    """How to read the figures of a run."""
-    parts = [summary.get("note", "")]
+def _table(
+    summary: Mapping[str, Any], name: str, title: str, rows: Mapping[str, Sequence[Cell | None]],
+    titles: Sequence[str], metrics: Sequence[str], *more: str, across: bool = False,
+) -> Table:  # fmt: skip
+    """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
+    data, notes = summary["data"], [summary.get("note", "")]
     if "mean_category_median" in metrics:
-        parts.append("Med. err.: mean of the categories' medians.")
+        notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
-        parts.append("Translation and scale: medians of the pairs for which a row has them.")
-    return " ".join(filter(None, [*parts, "Intervals: 95 %, bootstrap over objects.", *more]))
-
-
-def _data(summary: Mapping[str, Any]) -> str:
-    """What a run has evaluated."""
-    data, unfinished = summary["data"], " of an unfinished run" if "Not finished" in summary.get("note", "") else ""
-    name = Path(data["root"]).name
-    return f"{name}, {data['pairs']} pairs{unfinished}, {data['targets']} target views, backbone {summary['backbone']}"
+        notes.append("Translation and scale: medians of the pairs for which a row has them.")
+    notes += ["Intervals: 95 %, bootstrap over objects.", *more]
+    pairs = f"{data['pairs']} pairs" + (" of an unfinished run" if "Not finished" in notes[0] else "")
+    what = f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone {summary['backbone']}"
+    cells = pd.DataFrame.from_dict(rows, "index", object, titles)
+    return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
 
 
 def as_csv(table: Table) -> str:
@@ -208,11 +199,11 @@ def as_markdown(table: Table) -> str:
 
 
 def as_latex(table: Table) -> str:
-    """Format the compact columns as a booktabs table: no intervals, the best value of a metric in bold.
+    """Format three columns as a booktabs table: no intervals, the best value of a metric in bold.
 
     The paper's figures of these columns follow below a line.
     """
-    shown = table.cells[list(table.compact)].dropna(how="all")
+    shown = table.cells[[title for title in table.cells if title != "pairs"][:3]].dropna(how="all")
     texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
     texts = texts.mask(best, texts.map(lambda text: rf"\textbf{{{text}}}"))
     lines = [["", *map(_tex, shown)], [], *([_tex(label), *cells] for label, *cells in texts.itertuples())]
@@ -223,7 +214,7 @@ def as_latex(table: Table) -> str:
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
     return "\n".join([
         r"\begin{table}[tb]", rf"\caption{{{_tex('. '.join(filter(None, (title, table.data))))}}}",
-        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * len(table.compact)}}}", r"\toprule",
+        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * shown.shape[1]}}}", r"\toprule",
         *(rf"{' & '.join(line)} \\" if line else r"\midrule" for line in lines),
         r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     ])  # fmt: skip
