@@ -49,11 +49,11 @@ def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("thing", "told"),
     [
-        (3, "is of type int, expected"), (lambda: 0, r"a function of \(\)"), (lambda a, b, c, d: 0, "a, b, c, d"),
-        (lambda one, *, other: 0, r"a function of \(one, \*, other\)"), (ZeroShotPose, "is of type type, expected"),
-        (lambda *all: 0, r"a function of \(\*all\)"), ("benchmark_folder:FRAMES", "is of type int"),
+        (3, "is of type int, expected"), (lambda: 0, "a function of one"), (lambda a, b, c, d: 0, "a function of one"),
+        (lambda one, *, other: 0, "a function of one argument"), (ZeroShotPose, "is of type type, expected"),
+        (lambda *all: 0, "a function of one argument"), ("benchmark_folder:FRAMES", "is of type int"),
         ("benchmark_folder:nothing", "has no attribute 'nothing'"), ("nowhere:nothing", "No module named 'nowhere'"),
-        ("./here.py:x", "cannot be imported"), ("our-bv", "'our-bv' is unknown, close are ours-bv"),
+        ("./here.py:x", "cannot be imported"), ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"),
         ("no/such.csv", "no/such.csv"),
         ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"), ("", "''|no methods"),
     ],
@@ -84,7 +84,7 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
     run_rows({"mine": own_method}, tmp_path)
     run_rows({"mine": own_method, "ours": "ours"}, tmp_path)
-    with pytest.raises(InputError, match="methods of mine: .*:own_method, not .*<lambda>; choose"):
+    with pytest.raises(InputError, match="methods of mine .*:own_method, this is .*<lambda>; choose"):
         run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
@@ -143,14 +143,12 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
         assert found.loc[pairs[3].key, "error"] == 180
         assert found.loc[pairs[3].key, "failed"] == f"{rows[name]} has no pose"
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
-    with pytest.raises(InputError, match="other methods of exact"):
+    with pytest.raises(InputError, match="a run with methods of exact"):
         run_rows([f"exact={rows['exact']}"], tmp_path / "run", 4, 3)
-    with pytest.raises(InputError, match="exact.csv has no pose for any of the 6 pairs"):
-        run_rows([f"exact={rows['exact']}"], tmp_path / "other", 6, 2, "pebble")
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
-    with pytest.raises(InputError, match="two.csv: 2 target views of the pair lump/.*, expected one"):
+    with pytest.raises(InputError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
         run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
 
 

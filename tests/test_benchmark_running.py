@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,16 +99,14 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
     damaged[1] = damaged[1].replace(b'"pair":', b'"pair:')
     path.write_bytes(b"\n".join(damaged))
     for read in (read_run, again):
-        with pytest.raises(InputError, match="run.jsonl, line 2"):
+        with pytest.raises(InputError, match=", line 2: "):
             read(run)
 
 
-def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_continued(
-    undisturbed, tmp_path, monkeypatch
-):
+def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monkeypatch):
     out, summary = undisturbed
-    shutil.copy(out / SETTINGS, tmp_path)  # what was killed between the settings and the first result has no run.jsonl
-    with pytest.raises(InputError, match="run.jsonl cannot be read"):
+    shutil.copy(out / SETTINGS, tmp_path)  # of a run that was killed before its first result
+    with pytest.raises(InputError, match="no pair that all its rows have finished"):
         read_run(tmp_path)
     packed = tmp_path / f"{LINES}.gz"
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
@@ -116,14 +114,7 @@ def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_cont
     with monkeypatch.context() as context:
         context.setattr("zsp_lite.benchmark.evaluation.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
-    more = evaluate(small_folder(), QUICK, ["ours", "oracle-view"], 6, 3, tmp_path)["methods"]
-    assert more["ours"] == summary["methods"]["ours"] and more["oracle-view"]["n"] == 12
-    assert not packed.exists() and len(pairs_in(tmp_path)) == 24
-    (tmp_path / LINES).unlink()
-    assert (
-        evaluate(small_folder(), QUICK, ["oracle-view"], 6, 3, tmp_path)["methods"]["oracle-view"]
-        == more["oracle-view"]
-    )
+    assert not packed.exists() and (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
 
 
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path, monkeypatch):
@@ -136,7 +127,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
     monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
-    with pytest.raises(InputError, match="finished pairs are stored: run again to continue, with fewer workers than 2"):
+    with pytest.raises(InputError, match="finished pairs are stored: run again to continue, with fewer workers"):
         evaluate(*arguments, executor=2)
     assert seen[-1] == len(pairs_in(tmp_path)) < 12
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
@@ -177,33 +168,15 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
-class FirstFails(Executor):
-    """Evaluates chunks at once; the first one fails."""
-
-    _max_workers, submitted = 2, 0
-
-    def submit(self, function, *arguments):
-        future, self.submitted = Future(), self.submitted + 1
-        if self.submitted == 1:
-            future.set_exception(InputError("the first chunk fails"))
-        else:
-            future.set_result(function(*arguments))
-        return future
-
-
-def test_any_executor_will_do_and_what_was_evaluated_together_with_a_failure_is_saved(undisturbed, tmp_path):
+def test_any_executor_will_do(undisturbed, tmp_path):
     with ThreadPoolExecutor(2) as executor:
-        assert again(tmp_path / "a", executor)["methods"] == undisturbed[1]["methods"]
-    executor = FirstFails()
-    with pytest.raises(InputError, match="the first chunk fails"):
-        evaluate(small_folder(), QUICK, ["ours-bv"], 6, 3, tmp_path, executor)
-    assert executor.submitted == 4 and len(pairs_in(tmp_path)) >= 3
+        assert again(tmp_path, executor)["methods"] == undisturbed[1]["methods"]
 
 
 def test_unusable_executors_are_refused(monkeypatch):
     monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
     for executor, message in (
-        ("dask://127.0.0.1:1", "no scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
+        ("dask://127.0.0.1:1", "expected Dask and a scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
         (0, "workers"), (10**11, "workers"), (1.5, "workers"), (True, "workers"), (None, "workers"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message), open_workers(executor):
@@ -234,13 +207,11 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
 
 def test_chunks_hold_every_pair_once_and_pairs_beside_each_other_that_share_frames():
     work = {pair: ["ours"] for n in (3, 5) for pair in sample_pairs(Co3D(small_folder()), "lump", 12, n)}
-    for size in (1, 4, 100):
-        chunks = make_chunks(work, size)
-        assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
-        assert [len(chunk) for chunk in chunks[:-1]] == [size] * (len(chunks) - 1) and len(chunks[-1]) <= size
-        targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
-        assert targets == sorted(targets)
-    assert len(chunks) == 1
+    chunks = make_chunks(work, 5)
+    assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
+    assert [len(chunk) for chunk in chunks] == [5] * 4 + [len(work) - 20]
+    targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
+    assert targets == sorted(targets)
 
 
 def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_allowed(tmp_path, monkeypatch):
@@ -258,13 +229,6 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
 
 def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, tmp_path):
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
-    settings = json.loads((run / SETTINGS).read_text())
-    incomplete = json.dumps({name: one for name, one in settings.items() if name != "data"})
-    for text, told in (("{", "run.json: "), (incomplete, "run.json: .*missing required field `data`")):
-        (run / SETTINGS).write_text(text)
-        for read in (read_run, again):
-            with pytest.raises(InputError, match=told):
-                read(run)
     (run / SETTINGS).unlink()
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
@@ -310,7 +274,7 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     labels = read_labels(root, "lump")
     name = next(name for name, label in labels.items() if name != label.reference_seq)
     write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])))
-    with pytest.raises(InputError, match="results with other labels of lump"):
+    with pytest.raises(InputError, match="a run with labels of lump"):
         run(tmp_path / "run")
     run(tmp_path / "other")
 

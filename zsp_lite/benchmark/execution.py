@@ -7,9 +7,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from typing import Any
 from uuid import uuid4
@@ -39,7 +38,7 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, workers: int
+    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield the lines that the method `lines` of what `make` makes, such as an `evaluation.Evaluator`, finds."""
     if executor is None:
@@ -49,27 +48,21 @@ def evaluate_chunks(
                 yield from ([line] for line in evaluator.lines(chunk))
         return
     # cloudpickle: methods and backbones that are defined in a notebook travel by value.
-    pickled, waiting, running = cloudpickle.dumps((uuid4(), make)), iter(chunks), set[Future]()
+    make = cloudpickle.dumps((uuid4(), make))
+    futures = []
     try:
-        while True:
-            # Two chunks per worker keep it busy; more would fill queues with copies of the backbone.
-            for chunk in islice(waiting, 2 * workers - len(running)):
-                running.add(executor.submit(_evaluate_chunk, pickled, chunk))
-            if not running:
-                return
-            finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
-            # Failures last: all that has been evaluated is saved before an error ends the run.
-            for future in sorted(finished, key=lambda one: one.cancelled() or one.exception() is not None):
-                yield future.result()
+        futures += [executor.submit(_evaluate_chunk, make, chunk) for chunk in chunks]
+        for future in as_completed(futures):
+            yield future.result()
     except Exception as error:
         if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
             raise InputError(
                 "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-                f"with fewer workers than {workers}"
+                "with fewer workers"
             ) from error
         raise
     finally:
-        for future in running:
+        for future in futures:
             future.cancel()
 
 

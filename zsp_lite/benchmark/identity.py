@@ -37,10 +37,8 @@ def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
 
 def described(value: Any) -> str:
     """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with its public fields."""
-    if value is None or isinstance(value, bool | int | float | str):
+    if value is None or isinstance(value, bool | int | float | str | list | tuple):
         return str(value)
-    if isinstance(value, list | tuple):
-        return f"({', '.join(map(described, value))})"
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -81,6 +79,6 @@ def environment() -> dict[str, Any]:
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": [text.encode(errors="replace").decode() for text in words],
-        "versions": {one.__name__: one.__version__ for one in (torch, np, scipy, cv2)}
+        "versions": {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
         | {"python": platform.python_version(), "machine": platform.platform()},
     }

@@ -115,17 +115,14 @@ class StoredPoses:
     _poses: Mapping[tuple, Answer]
 
     def __call__(self, problem: Problem) -> Answer:
-        if not (found := self.of(problem.pair)):
+        pair = problem.pair
+        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
+        found = [view for view, frame in enumerate(pair.target_frames) if (*key, frame) in self._poses]
+        if not found:
             raise InputError(f"{self.path} has no pose")
         if len(found) > 1:
-            raise FatalError(f"{self.path} has {len(found)} poses of the pair {problem.pair.key}, expected one")
-        return found[0]
-
-    def of(self, pair: Pair) -> list[Answer]:
-        """Look up the poses of a pair."""
-        key = (pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence)
-        found = [(view, self._poses.get((*key, frame))) for view, frame in enumerate(pair.target_frames)]
-        return [replace(answer, view=view) for view, answer in found if answer is not None]
+            raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
+        return replace(self._poses[*key, pair.target_frames[found[0]]], view=found[0])
 
 
 def read_poses(path: str | Path) -> StoredPoses:
@@ -143,8 +140,7 @@ def read_poses(path: str | Path) -> StoredPoses:
             key = tuple(int(line[name]) if name.endswith("frame") else line[name] for name in _QUESTION)
             if key in poses:
                 raise ValueError("second pose of the same frames")
-            answer = Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0])
-            poses[key] = as_answer(answer)
+            poses[key] = as_answer(Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0]))
         except ValueError as error:  # an InputError is one, too
             raise InputError(f"poses {path}, line {number}: {error}") from error
     return StoredPoses(str(path), digest(data), poses)

@@ -106,11 +106,9 @@ def open_run(out: str | Path, settings: Settings, allow_other_version: bool = Fa
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
-        has_lines = packed.exists() or (out / LINES).exists()
-        if has_lines or (out / SETTINGS).exists():
+        if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings, allow_other_version)
-        # Unpacked, and without an unfinished line.
-        write_atomic(out / LINES, b"".join(text + b"\n" for text, _ in (read_texts(out) if has_lines else ())))
+        write_atomic(out / LINES, _finished_lines(out))
         packed.unlink(missing_ok=True)
         settings.calls[-1].finished = False
         _write_settings(out, settings)
@@ -127,8 +125,10 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held, asked = _compared(before), _compared(now)
-    for name in (name for name in asked if held.get(name, asked[name]) != asked[name]):
-        if name != "version" or not allow_other_version:
+    if allow_other_version:
+        held["version"] = asked["version"]
+    for name in asked:
+        if held.get(name, asked[name]) != asked[name]:
             more = ", or continue with --allow-other-version" if name == "version" else ""
             told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
             raise InputError(f"{out} holds a run with {told}")
@@ -139,13 +139,12 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
 
 def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    library, groups = settings.library[-1], {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
-    return {
-        "command": "align" if "alignment" in settings.methods else "benchmark",
-        "data": settings.data, "backbone": settings.backbone, "targets": settings.targets,
-        **{f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()},
-        "version": f"{library['version']} (commit {library['commit']})",
-    }  # fmt: skip
+    groups = {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
+    parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
+    whole = {name: getattr(settings, name) for name in ("data", "backbone", "targets")}
+    version = "{version} (commit {commit})".format(**settings.library[-1])
+    command = "align" if "alignment" in settings.methods else "benchmark"
+    return {"command": command} | whole | parts | {"version": version}
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
@@ -159,20 +158,19 @@ def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = 
         raise InputError(f"{Path(out) / LINES} cannot be written: {error}") from error
 
 
-def read_texts(out: str | Path) -> Iterator[tuple[bytes, str]]:
-    """Yield the finished lines of a run's folder, and where each stands."""
-    path, packed, what = Path(out) / LINES, Path(out) / f"{LINES}.gz", "results of a run"
+def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
+    """Read the results of the finished pairs of a run's folder, lines of a `kind`."""
+    lines = enumerate(_finished_lines(Path(out)).splitlines(), 1)
+    return [decode_json(text, kind, f"results of a run in {out}, line {number}") for number, text in lines]
+
+
+def _finished_lines(out: Path) -> bytes:
+    """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without these."""
+    path, packed, what = out / LINES, out / f"{LINES}.gz", "results of a run"
+    data = read_bytes(path, what) if path.exists() else b""
     if packed.exists():
-        path, data = packed, decompress(read_bytes(packed, what), f"{what} {packed}")
-    else:
-        data = read_bytes(path, what)
-    for number, text in enumerate(data.split(b"\n")[:-1], 1):
-        yield text, f"{what} {path}, line {number}"
-
-
-def read_lines(out: str | Path) -> list[ResultLine]:
-    """Read the results of the finished pairs of a run's folder."""
-    return [decode_json(text, ResultLine, where) for text, where in read_texts(out)]
+        data = decompress(read_bytes(packed, what), f"{what} {packed}")
+    return data[: data.rfind(b"\n") + 1]
 
 
 def read_run(out: str | Path) -> Run:
@@ -184,11 +182,11 @@ def read_run(out: str | Path) -> Run:
     if not (Path(out) / SETTINGS).is_file():
         raise InputError(f"{out} is not the folder of a benchmark run: it has no {SETTINGS}")
     settings, lines = read_json(Path(out) / SETTINGS, Settings, "settings of a run"), read_lines(out)
-    table = _finished(_table(lines, settings.calls[-1]), settings)
-    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
-    notes, last, rows = [], settings.calls[-1], table["row"].unique()
+    table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
+    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
+    notes, rows = [], table["row"].unique()
     if not last.finished:
         notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
     if hidden := [name for name in settings.methods if name not in rows]:
@@ -196,8 +194,8 @@ def read_run(out: str | Path) -> Run:
     return Run(settings, table, timings, " ".join(notes))
 
 
-def _table(lines: Sequence[ResultLine], last: Call) -> pd.DataFrame:
-    """Tabulate all results in the categories of the last call, in the order of these."""
+def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
+    """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = [
         {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
@@ -205,8 +203,10 @@ def _table(lines: Sequence[ResultLine], last: Call) -> pd.DataFrame:
     table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
-    ordered = table.astype({"category": pd.CategoricalDtype(list(last.pairs))}).dropna(subset="category")
-    return ordered.sort_values(["category", "problem", "pair"]).astype({"category": object})
+    orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
+    orders = {column: pd.CategoricalDtype(list(names)) for column, names in orders.items()}
+    table = table.astype(orders).dropna(subset=list(orders)).sort_values(["row", "category", "problem", "pair"])
+    return table.astype(dict.fromkeys(orders, object))
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
@@ -218,8 +218,7 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
         finished[number] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
-    for row in (name for name in settings.methods if name in set(table["row"])):
-        found = table[table["row"] == row]
+    for _, found in table.groupby("row", sort=False):
         number = views[found.index[0]]
         column, wanted = ("pair", finished[number]) if number in finished else ("problem", problems)
         found = found[found[column].isin(wanted)]

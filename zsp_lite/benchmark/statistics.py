@@ -115,7 +115,7 @@ def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.n
     """
     errors = np.asarray(errors, np.float64)
 
-    def mean_category_median(errors: np.ndarray, weights: Draws | None = None) -> np.ndarray:
+    def mean_category_median(errors: np.ndarray, weights: Draws | None = None) -> np.ndarray | float:
         members = [categories == category for category in np.unique(categories)]
         medians = [median(errors[one], None if weights is None else weights[:, one]) for one in members]
         return np.mean(medians, axis=0)
