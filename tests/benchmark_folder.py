@@ -60,17 +60,6 @@ class SlowBackbone(CoordinateBackbone):
         return super().__call__(images)
 
 
-@dataclass(frozen=True)
-class Sociable(CoordinateBackbone):
-    """Its features depend on how many images come together, as those of a real network do in their last bits."""
-
-    name: str = "sociable"
-
-    def __call__(self, images):
-        found = super().__call__(images)
-        return [replace(one, keys=one.keys * (1 + 0.3 * len(images))) for one in found]
-
-
 BACKBONE = CoordinateBackbone(grid=8)
 
 

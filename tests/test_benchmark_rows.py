@@ -6,12 +6,9 @@ import pytest
 import torch
 from benchmark_folder import BACKBONE, run_rows, small_folder
 
-from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.posecontrast import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import problem
-from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import category_pairs
@@ -110,19 +107,3 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
     with pytest.raises(InputError, match="posecontrast"):
         run_rows(["posecontrast"], tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_fingerprint_tells_apart_whatever_changes_the_features():
-    torch.manual_seed(0)
-    vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)
-
-    def of(**options):
-        return fingerprint(Backbone(vit, "same name", device="cpu", **options))
-
-    plain = of()
-    assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
-    changes = {"layer": 1, "facet": "query", "saliency_heads": [1], "image_size": 64, "mean": (0,) * 3, "std": (1,) * 3}
-    assert len({plain, *(of(**{name: value}) for name, value in changes.items())}) == 1 + len(changes)
-    with torch.no_grad():
-        vit.cls_token += 1
-    assert of() != plain

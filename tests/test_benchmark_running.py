@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from benchmark_folder import BACKBONE, SlowBackbone, Sociable, after_each_save, run_rows, small_folder
+from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.backbones.backbone import Backbone
@@ -95,12 +95,6 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
     assert read_run(run).table.equals(before.table)
     again(run)
     assert read_run(run).table.equals(before.table) and path.read_bytes() == whole
-    damaged = whole.split(b"\n")
-    damaged[1] = damaged[1].replace(b'"pair":', b'"pair:')
-    path.write_bytes(b"\n".join(damaged))
-    for read in (read_run, again):
-        with pytest.raises(InputError, match=", line 2: "):
-            read(run)
 
 
 def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monkeypatch):
@@ -187,22 +181,14 @@ def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
     return pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
 
 
-def errors(chunk, backbone, threads=None) -> dict:
-    evaluator = Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
-    return {line["pair"]: line["results"]["ours"]["error"] for line in evaluator.lines(chunk)}
-
-
-def test_a_frame_is_described_by_itself_so_that_no_order_matters():
-    (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 6, 3))
-    assert errors(chunk, Sociable(grid=8)) == errors(chunk[::-1], Sociable(grid=8))
-
-
 def test_a_vision_transformers_features_do_not_depend_on_threads():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
-    assert errors(chunk, backbone, 1) == errors(chunk, backbone, 2)
+    evaluators = (Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads) for threads in (1, 2))
+    one, two = ([line["results"]["ours"]["error"] for line in evaluator.lines(chunk)] for evaluator in evaluators)
+    assert one == two
 
 
 def test_chunks_hold_every_pair_once_and_pairs_beside_each_other_that_share_frames():
@@ -249,22 +235,10 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, frames_of()).keys}
-    assert sum(calls) == len(frames) and set(calls) == {1}
-
-
-def frames_of(**extractors):
-    return FrameStore(Co3D(small_folder()), "lump", extractors)
-
-
-def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
-    monkeypatch.setattr("zsp_lite.benchmark.problem.CAPACITY", 3)
-    frames = frames_of(backbone=BACKBONE)
-    for number in (0, 1, 2, 0, 3):
-        frames.describe("backbone", ("100_a", number))
-    for number, read in ((2, 4), (0, 4), (3, 4), (1, 5)):  # frame 1 was dropped: it had not been used for longest
-        frames.describe("backbone", ("100_a", number))
-        assert len(frames.timings["reading"]) == len(frames.timings["backbone"]) == read
+    store = FrameStore(Co3D(small_folder()), "lump", {})
+    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, store).keys}
+    assert sum(calls) == len(frames)
+    assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
