@@ -63,8 +63,7 @@ def import_object(path: str) -> Any:
     try:
         return pkgutil.resolve_name(path)
     except (Exception, SystemExit) as error:  # a module may raise anything
-        reason = error if isinstance(error, ImportError | AttributeError) else describe_failure(error)
-        raise InputError(f"{path!r} cannot be imported: {reason}") from error
+        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
 
 
 @dataclass(frozen=True)

@@ -76,51 +76,38 @@ def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
 
 
 class FrameStore:
-    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage."""
+    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage.
+
+    `frame`, `describe` and `view` compute once what they return, and keep it while it is among the last used.
+    """
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
         """Make an empty store; `threads` are those of feature extraction, None leaves them as they are."""
         self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
         self.timings: dict[str, list[float]] = {}
-        self._kept = lru_cache(CAPACITY)(self._read)
-        self.extent = cache(self._extent)
+        self.frame, self.extent = lru_cache(CAPACITY)(self._frame), cache(self._extent)
+        self.describe, self.view = (lru_cache(CAPACITY * len(extractors))(one) for one in (self._describe, self._view))
 
     def full_frame(self, key: FrameKey) -> Frame:
         """Read a frame from disk, uncropped."""
         return self.dataset.load(self.dataset.frame(self.category, *key))
 
-    def frame(self, key: FrameKey) -> Frame:
+    def _frame(self, key: FrameKey) -> Frame:
         """Return a frame's object crop, resized to the backbone's input."""
-        return self._kept(key)["crop"]
-
-    def describe(self, features: str, key: FrameKey) -> Any:
-        """Return what an extractor computes from a frame's crop."""
-        kept, extractor = self._kept(key), self.extractors[features]
-        if features not in kept:
-            describe, crop = getattr(extractor, "describe", None), kept["crop"]
-            # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
-            with threadpool_limits(self.threads):
-                (kept[features],) = self.timed(features, describe or extractor, [crop if describe else crop.rgb])
-        return kept[features]
-
-    def view(self, features: str, key: FrameKey, foreground: str) -> View:
-        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
-        kept, name = self._kept(key), (features, foreground)
-        if name not in kept:
-            kept[name] = frame_view(self.frame(key), self.describe(features, key), foreground)
-        return kept[name]
-
-    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function, and add the time that it takes to the `timings` of a stage."""
-        start = time.perf_counter()
-        found = function(*arguments)
-        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
-        return found
-
-    def _read(self, key: FrameKey) -> dict[Any, Any]:
-        """Read a frame: its crop, to which is added by name what is computed from it."""
         size = crop_size(self.extractors.get("backbone"))
-        return {"crop": self.timed("reading", lambda: object_crop(self.full_frame(key), size))}
+        return self.timed("reading", lambda: object_crop(self.full_frame(key), size))
+
+    def _describe(self, features: str, key: FrameKey) -> Any:
+        """Return what an extractor computes from a frame's crop."""
+        extractor, crop = self.extractors[features], self.frame(key)
+        describe = getattr(extractor, "describe", None)
+        # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+        with threadpool_limits(self.threads):
+            return self.timed(features, describe or extractor, [crop if describe else crop.rgb])[0]
+
+    def _view(self, features: str, key: FrameKey, foreground: str) -> View:
+        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
+        return frame_view(self.frame(key), self.describe(features, key), foreground)
 
     def _extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
         """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
@@ -134,6 +121,13 @@ class FrameStore:
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low))
 
+    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function, and add the time that it takes to the `timings` of a stage."""
+        start = time.perf_counter()
+        found = function(*arguments)
+        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
+        return found
+
 
 class Problem:
     """One pair as a method sees it: everything but the true pose. Results are computed once and shared by all methods.
@@ -144,7 +138,6 @@ class Problem:
     def __init__(self, pair: Pair, store: FrameStore):
         self.pair, self.seed, self.store = pair, pair.seed, store
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
-        # (sequence, frame number) of the reference and of each target
         self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
         self._estimates: dict[tuple, PoseEstimate] = {}
         self._similarity = cache(self._compare)
