@@ -21,8 +21,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
 from zsp_lite.synthetic.recording import read_poses
 
-# Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
-FAILED = 180.0
+FAILED = 180.0  # error of a failed pair: without these pairs, methods that fail often would look better
 Poses = Float[np.ndarray, "n 4 4"]
 
 

@@ -1,8 +1,4 @@
-"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own.
-
-A row is the paper's method with some settings changed, or a function (`solve`). `problem` defines the argument and the
-results of such functions.
-"""
+"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own."""
 
 import json
 import re
@@ -35,7 +31,7 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the tables."""
+    """A row of the tables: the paper's method with some settings changed, or a function of one's own."""
 
     features: str = "backbone"  # name of the feature extractor in `EXTRACTORS`
     # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
@@ -48,7 +44,6 @@ class Method:
 
 
 _MASK = {"foreground": "mask"}
-_MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
 
 METHODS: dict[str, Method] = {
     "ours": Method(),
@@ -79,7 +74,7 @@ METHODS: dict[str, Method] = {
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
-    "swav": Method("swav", settings=_MUTUAL),
+    "swav": Method("swav", settings=_MASK | {"matcher": "mutual", "kmeans": False, "binning": False}),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
@@ -93,18 +88,19 @@ def read_paper_tables() -> list[dict[str, Any]]:
     return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 
 
-_CHECKPOINTS = ("swav", "posecontrast")  # rows that are in no group: their checkpoints have to be downloaded
-# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them.
-GROUPS: dict[str, list[str]] = {"default": ["ours", "ours-bv", "rootsift"]} | {
-    table["group"]: [line["row"] for line in table["rows"] if line["row"] not in _CHECKPOINTS]
-    for table in read_paper_tables() if "group" in table
-}  # fmt: skip
-GROUPS |= {
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. The checkpoints of
+# the rows that are in no group have to be downloaded.
+GROUPS: dict[str, list[str]] = {
+    "default": ["ours", "ours-bv", "rootsift"],
+    **{
+        table["group"]: [line["row"] for line in table["rows"] if line["row"] not in ("swav", "posecontrast")]
+        for table in read_paper_tables() if "group" in table
+    },
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
     "ablations": ["ours", "table3", "matchers", "correspondences", "trials", "depth", "published"],  # at one N
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
     "all": ["paper", "verified-views", "oracle-view"],
-}
+}  # fmt: skip
 
 
 def _members(name: str) -> list[str]:

@@ -73,8 +73,7 @@ class Estimator:
     own: Any
 
     def __call__(self, problem: Problem) -> Any:
-        reference, *targets = (problem.store.full_frame(key) for key in problem.keys)
-        return self.own.estimate(reference, targets)
+        return self.own.estimate(*problem.store.dataset.load_pair(problem.pair))
 
 
 @dataclass(frozen=True)

@@ -88,14 +88,10 @@ class FrameStore:
         self.frame, self.extent = lru_cache(CAPACITY)(self._frame), cache(self._extent)
         self.describe, self.view = (lru_cache(CAPACITY * len(extractors))(one) for one in (self._describe, self._view))
 
-    def full_frame(self, key: FrameKey) -> Frame:
-        """Read a frame from disk, uncropped."""
-        return self.dataset.load(self.dataset.frame(self.category, *key))
-
     def _frame(self, key: FrameKey) -> Frame:
         """Return a frame's object crop, resized to the backbone's input."""
-        size = crop_size(self.extractors.get("backbone"))
-        return self.timed("reading", lambda: object_crop(self.full_frame(key), size))
+        size, annotation = crop_size(self.extractors.get("backbone")), self.dataset.frame(self.category, *key)
+        return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
 
     def _describe(self, features: str, key: FrameKey) -> Any:
         """Return what an extractor computes from a frame's crop."""

@@ -1,7 +1,7 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
-run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl is what `evaluate_pair`
-returned for a pair; run.jsonl.gz may take its place. One process writes to a folder; others can read it meanwhile.
+run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of run.jsonl.gz, is what
+`evaluate_pair` returned for a pair. One process writes to a folder; others can read it meanwhile.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,6 @@ from zsp_lite.metrics import accuracy, median
 SETTINGS, LINES = "run.json", "run.jsonl"
 _KEY = r"^(?P<problem>(?P<reference>(?P<category>[^/]+)/[^/]+):\d+/(?P<target>[^/]+)):\d+(?:,\d+)*$"
 _Degrees = Annotated[float, msgspec.Meta(ge=0, le=180)]
-_Key = Annotated[str, msgspec.Meta(pattern=_KEY)]
 
 
 class Call(msgspec.Struct):
@@ -67,7 +66,7 @@ class _Result(msgspec.Struct):
 
 
 class ResultLine(msgspec.Struct):
-    pair: _Key
+    pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
     results: dict[str, _Result]
     timings: dict[str, float] = {}
 
