@@ -203,9 +203,9 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
-    orders = {column: pd.CategoricalDtype(list(names)) for column, names in orders.items()}
-    table = table.astype(orders).dropna(subset=list(orders)).sort_values(["row", "category", "problem", "pair"])
-    return table.astype(dict.fromkeys(orders, object))
+    for column, names in orders.items():
+        table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
+    return table.sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(orders, object))
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
