@@ -60,7 +60,7 @@ def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_
         assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
             name: pose.sim3.matrix.tolist() for name, pose in whole.objects.items()
         }
-    with pytest.raises(InputError, match="holds a run of another command"):
+    with pytest.raises(InputError, match="holds a run with command align, this is benchmark"):
         evaluate(small_folder(), BACKBONE, ["ours"], 1, 3, tmp_path)
     with pytest.raises(InputError, match="holds a run with targets 3, this is 2"):
         align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
