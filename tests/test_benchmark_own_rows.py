@@ -143,6 +143,8 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
     with pytest.raises(InputError, match="a run with methods of exact"):
         run_rows(rows, tmp_path / "run", 4, 3)
+    with pytest.raises(InputError, match="exact.csv has no pose for any of the 6 pairs"):
+        run_rows(rows, tmp_path / "other", 6, 2, "pebble")
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))

@@ -69,6 +69,12 @@ def test_a_run_of_three_rows_has_the_tables_of_these_with_chosen_metrics_and_dif
     assert every_table(made.summary, ["acc30"])[0].cells.shape[1] == 5
 
 
+def test_a_row_that_sees_other_objects_has_a_table_of_its_own(tmp_path):
+    made = made_up_run(tmp_path, ["ours", "verified", "category"])
+    found = {table.name: list(table.cells.index) for table in every_table(made.summary)}
+    assert found["with_others"] == ["category"] and found["all_rows"] == tables.important_rows(made.summary)
+
+
 def test_figures_by_category_are_those_of_the_summary(run):
     found = {table.name: table for table in every_table(run.summary)}
     methods, rows = run.summary["methods"], tables.important_rows(run.summary)

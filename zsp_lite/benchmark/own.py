@@ -113,14 +113,18 @@ class StoredPoses:
     _poses: Mapping[tuple, Answer]
 
     def __call__(self, problem: Problem) -> Answer:
-        pair = problem.pair
-        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
-        found = [view for view, frame in enumerate(pair.target_frames) if (*key, frame) in self._poses]
+        pair, found = problem.pair, self.of(problem.pair)
         if not found:
             raise InputError(f"{self.path} has no pose")
         if len(found) > 1:
             raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
-        return replace(self._poses[*key, pair.target_frames[found[0]]], view=found[0])
+        return found[0]
+
+    def of(self, pair: Pair) -> list[Answer]:
+        """Look up the poses of a pair."""
+        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
+        found = [(view, self._poses.get((*key, frame))) for view, frame in enumerate(pair.target_frames)]
+        return [replace(answer, view=view) for view, answer in found if answer]
 
 
 def read_poses(path: str | Path) -> StoredPoses:

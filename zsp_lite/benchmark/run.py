@@ -18,13 +18,14 @@ from zsp_lite.benchmark.evaluation import Evaluator
 from zsp_lite.benchmark.figures import write_figures
 from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.own import StoredPoses
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table, write_tables
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.errors import check_choice, check_integer
+from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import write_atomic
 from zsp_lite.pipeline import ZeroShotPose
@@ -72,6 +73,8 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
+        elif isinstance(row.solve, StoredPoses) and not any(map(row.solve.of, work)):
+            raise InputError(f"{row.solve.path} has no pose for any of the {len(work)} pairs of --list-pairs")
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
