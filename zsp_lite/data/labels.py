@@ -19,9 +19,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 
-# Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
-_RIGID_TOLERANCE = 1e-3
-
+_RIGID_TOLERANCE = 1e-3  # largest deviation from a rigid transform: labels are decimal numbers of few digits
 _Row = tuple[float, float, float, float]
 
 
@@ -85,16 +83,12 @@ def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
 
 def label_bytes(label: PoseLabel) -> bytes:
     """Encode a label as JSON in the format of the published code."""
-    content = {"trans": label.trans.tolist(), "seq": label.seq, "reference_seq": label.reference_seq}
-    return json.dumps(content).encode()
+    return json.dumps(vars(label), default=np.ndarray.tolist).encode()
 
 
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """Convert a similarity between two worlds to a label with the same rotation and the same image of `centre`.
-
-    The similarity leads from the world of the reference sequence, in which `centre` is the object's centre, to that of
-    the sequence. A label has no scale: with the similarity's translation, an object off the origin would be displaced.
-    """
+    """Convert a similarity from the reference's world to a label with the same rotation and image of `centre`."""
+    # A label has no scale: with the similarity's translation, an object off the origin would be displaced.
     centre = np.asarray(centre, dtype=np.float64)
     trans = np.eye(4)
     trans[:3, :3] = sim3.R
