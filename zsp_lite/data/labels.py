@@ -48,10 +48,11 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     return read_label_folder(label_folder(root, category))
 
 
-def read_label_folder(folder: Path) -> dict[str, PoseLabel]:
-    """Read the labels of one category in a folder by sequence (see `read_labels`)."""
-    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))}
-    check_one_reference(labels, folder)
+def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict[str, PoseLabel]:
+    """Read the labels of one category in a folder by sequence, together with labels that will be added to it."""
+    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
+    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
+        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
     return labels
 
 
@@ -66,12 +67,6 @@ def read_label(path: Path) -> PoseLabel:
         found = f"seq {label.seq!r} and trans {trans.tolist()}"
         raise InputError(f"label {path} has {found}, expected a rigid transform, and seq as in its name")
     return PoseLabel(trans, label.seq, label.reference_seq)
-
-
-def check_one_reference(labels: Mapping[str, PoseLabel], folder: Path) -> None:
-    """Raise InputError if the labels of a category have several reference sequences."""
-    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
-        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:

@@ -7,15 +7,7 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import (
-    PoseLabel,
-    check_one_reference,
-    label_bytes,
-    label_folder,
-    read_label,
-    read_labels,
-    rigid_label,
-)
+from zsp_lite.data.labels import PoseLabel, label_bytes, label_folder, read_label, read_label_folder, rigid_label
 from zsp_lite.data.pairs import read_pair_file
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
@@ -35,7 +27,7 @@ def import_labels(
     sources = {}
     for category, labels in _published_labels(source, categories).items():
         folder = label_folder(root, category)
-        check_one_reference(read_labels(root, category) | {one.seq: one for one in labels.values()}, folder)
+        read_label_folder(folder, added={one.seq: one for one in labels.values()})  # checks that they fit together
         sources |= {folder / path.name: path for path in labels}
     for path in sorted(source.glob("**/determ_eval/*/*.pt")):
         if categories is None or path.stem in categories:
@@ -89,7 +81,7 @@ def transfer_labels(source: str | Path, target: str | Path, category: str, repla
     The camera centres in both are aligned by Umeyama's method with scale; the residual is their RMS distance over their
     RMS distance from their mean. Nothing is written if one is above 0.05.
     """
-    labels, old, new = read_labels(source, category), Co3D(source), Co3D(target)
+    labels, old, new = read_label_folder(label_folder(source, category)), Co3D(source), Co3D(target)
     if not labels:
         raise InputError(f"{source} has no labels of category {category}, expected class_labels/{category}/SEQ.json")
     reference = next(iter(labels.values())).reference_seq
@@ -108,7 +100,7 @@ def transfer_labels(source: str | Path, target: str | Path, category: str, repla
         moved = rigid_label(similarity, centre, name, reference)
         transferred[name] = PoseLabel(np.eye(4), name, reference) if name == reference else moved
     folder = label_folder(target, category)
-    check_one_reference(read_labels(target, category) | transferred, folder)
+    read_label_folder(folder, added=transferred)  # checks that they fit together
     write_all({folder / f"{name}.json": label_bytes(label) for name, label in transferred.items()}, replace)
     return residuals
 
