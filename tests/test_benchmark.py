@@ -16,7 +16,7 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.synthetic.recording import ObjectPose
+from zsp_lite.synthetic.ground_truth import ObjectPose
 
 ROWS = ("ours", "ours-bv", "oracle-view")
 

@@ -20,8 +20,7 @@ from zsp_lite.backbones.pretrained import WEIGHTS
 from zsp_lite.errors import InputError
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.meshes import read_mesh
-from zsp_lite.synthetic.models import list_models
+from zsp_lite.synthetic.meshes import list_models, read_mesh
 
 TOOLS = REPOSITORY / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"

@@ -80,7 +80,7 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
     ("changes", "message"),
     [
         ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
-        ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 of shape \(5, 5, 3\)"),
+        ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
         ({"depth": np.zeros((5, 5), np.float32)}, r"depth has shape \(5, 5\)"),
         ({"depth": np.full(SIZE, np.nan, np.float32)}, "depth has nan"),
         ({"depth": np.full(SIZE, -1, np.float32)}, "depth has -1"),

@@ -13,8 +13,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
 from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
-from zsp_lite.data.published import import_labels
-from zsp_lite.data.transfer import align_worlds, transfer_labels
+from zsp_lite.data.published import align_worlds, import_labels, transfer_labels
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 

@@ -11,8 +11,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.photograph import motorcycle_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.geometry_masks import mask_flags, masks_from_depth
-from zsp_lite.importers.masks import masks_from_box
+from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
 
 RADIUS = 0.3
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]

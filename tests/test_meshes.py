@@ -7,8 +7,7 @@ from model_files import painted, studio, view, wedge, write_quad, write_wedge
 
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import meshes
-from zsp_lite.synthetic.meshes import canonical_mesh, read_mesh
-from zsp_lite.synthetic.models import ModelInfo, list_models
+from zsp_lite.synthetic.meshes import ModelInfo, canonical_mesh, list_models, read_mesh
 from zsp_lite.synthetic.primitives import box, surface_spread
 from zsp_lite.synthetic.raytracing import MeshScene
 from zsp_lite.synthetic.room import RoomLight

@@ -9,8 +9,7 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look
 from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.geometry import fit_plane
+from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, motorcycle_frame, motorcycle_photograph
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import axis_deviation, object_points

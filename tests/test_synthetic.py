@@ -16,9 +16,8 @@ from zsp_lite.io.files import stable_hash
 from zsp_lite.synthetic import export
 from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.export import PRESETS, export_categories, make_object, sequence_name
+from zsp_lite.synthetic.export import PRESETS, export_categories, make_object, sequence_name, shape_turns
 from zsp_lite.synthetic.primitives import surface_spread
-from zsp_lite.synthetic.recording import shape_turns
 from zsp_lite.synthetic.sequences import HEIGHTS, handheld_sweep, record_sequence, soft_mask, stereo_depth
 
 PAPER = tuple(

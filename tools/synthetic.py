@@ -6,8 +6,6 @@ python -m tools.synthetic validation --sequences 5 --frames 16 --seed 11 --out o
 from argparse import ArgumentParser
 from pathlib import Path
 
-from tqdm import tqdm
-
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.io.locks import writing
@@ -30,7 +28,7 @@ def main(arguments: list[str] | None = None) -> None:
     with writing(given.out):
         export_categories(
             list(builders), given.out, given.sequences, given.frames, given.seed,
-            progress=tqdm, builders=builders, heights=tuple(given.heights),
+            builders=builders, heights=tuple(given.heights),
         )  # fmt: skip
 
 

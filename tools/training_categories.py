@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly
-from zsp_lite.synthetic.categories.parts import disc
+from zsp_lite.synthetic.assembly import Assembly, disc
 from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 

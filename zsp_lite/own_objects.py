@@ -24,10 +24,9 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
-from zsp_lite.importers.convert import READERS, SIGNS, scale_frame
-from zsp_lite.importers.geometry_masks import mask_flags, masks_from_depth
-from zsp_lite.importers.masks import masks_from_box
+from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame, camera_from_pose
+from zsp_lite.importers.convert import scale_frame
+from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair

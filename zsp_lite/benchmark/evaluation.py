@@ -19,7 +19,7 @@ from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
-from zsp_lite.synthetic.recording import read_poses
+from zsp_lite.synthetic.ground_truth import read_poses
 
 FAILED = 180.0  # error of a failed pair: without these pairs, methods that fail often would look better
 Poses = Float[np.ndarray, "n 4 4"]

@@ -157,7 +157,7 @@ def labels(source, root, replace) -> None:
 @replace_option
 def transfer(v1, v2, category, replace) -> None:
     """Transfer labels from a CO3D v1 folder to a v2 folder by aligning the camera centres of the same frames."""
-    from zsp_lite.data.transfer import transfer_labels
+    from zsp_lite.data.published import transfer_labels
 
     residuals = transfer_labels(v1, v2, category, replace=replace)
     for name, residual in residuals.items():

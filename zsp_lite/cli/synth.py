@@ -38,8 +38,6 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     """
     if bool(preset) + bool(categories) + bool(models_folder) != 1:
         raise click.UsageError("expected either --preset or --category or --models")
-    from tqdm import tqdm
-
     from zsp_lite.io.locks import writing
     from zsp_lite.synthetic.export import export_categories, export_models, export_preset
 
@@ -47,14 +45,14 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     with writing(out):
         if preset:
             refuse_options(given, (), "--preset")
-            export_preset(preset, out, seed, progress=tqdm)
+            export_preset(preset, out, seed)
         elif categories:
             refuse_options(given, ("sequences", "frames"), "--category")
-            export_categories(list(categories), out, sequences, frames, seed, progress=tqdm)
+            export_categories(list(categories), out, sequences, frames, seed)
         else:
             refuse_options(given, ("frames", "image_size", "front", "up"), "--models")
             size, front, up = given["image_size"] or 256, given["front"], given["up"]
-            left_out = export_models(models_folder, out, frames, seed, size, front, up, tqdm)
+            left_out = export_models(models_folder, out, frames, seed, size, front, up)
     for key, reason in left_out.items():
         print(f"Left out {key}: {reason}")
     print(f"Written: {out}")

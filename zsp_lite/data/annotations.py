@@ -92,8 +92,7 @@ class FrameIndex:
     def positions(self, sequence: str) -> dict[int, int]:
         """Return the positions of a sequence's frames by frame number; InputError if the sequence is unknown."""
         if sequence not in self.by_sequence:
-            known = f"{len(self.by_sequence)} sequences"
-            raise InputError(f"frame annotations {self.path} have {known}, and no frames of {sequence!r}")
+            raise InputError(f"frame annotations {self.path} have no frames of {sequence!r}")
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:

@@ -1,8 +1,7 @@
 """Download of the published archives of CO3D: the list of archives, disk space, unpacking.
 
 A category of CO3D v2 is published in chunks of up to 20 GB, of which the first holds the annotations; a category of v1
-is one archive. The names and SHA-256 digests stand in `co3d_archives.json`. Single sequences can be read out of an
-archive without downloading the rest of it.
+is one archive. Single sequences can be read out of an archive without downloading the rest of it.
 """
 
 import io
@@ -23,7 +22,7 @@ from zsp_lite.io.download import RemoteFile, fetch, remote_size
 from zsp_lite.io.files import path_inside, read_json, write_atomic
 from zsp_lite.io.locks import writing
 
-CATALOGUE = Path(__file__).with_name("co3d_archives.json")
+CATALOGUE = Path(__file__).with_name("co3d_archives.json")  # names and SHA-256 digests
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
 _PART = 1 << 22  # bytes of a request for a part of an archive
@@ -108,11 +107,7 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
 
 
 def download_archives(root: Path, archives: Sequence[Archive]) -> None:
-    """Download archives, verify their SHA-256 and unpack them, or sequences of them, into a data folder.
-
-    An interrupted download is continued by the next call. The annotations of a category are unpacked last, so that the
-    category is read only if it is complete. Of single sequences, each file is verified by the CRC-32 in the archive.
-    """
+    """Download archives, verify them, and unpack them, or sequences of them; continues an interrupted download."""
     with writing(root / _WORK):
         for archive in reversed(missing_archives(root, archives)):  # the first, with the annotations, comes last
             path = root / _WORK / archive.name
@@ -129,7 +124,7 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 
 
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Unpack members of a zip archive, annotations last; no path leads out of the folder, and no link is made."""
+    """Unpack members of a zip archive, annotations last, so that a category is read only if it is complete."""
     targets = {one: path_inside(root, one.filename) for one in members}  # checks all before the first is written
     members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
     for one in tqdm(members, "unpacking", disable=None):

@@ -26,7 +26,6 @@ _AXES = np.array([-1.0, -1.0, 1.0])
 # decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
 _ROTATION_TOLERANCE = 1e-3
 _FLOAT32_TOLERANCE = 1e-6
-_MIN_FOCAL_LENGTH = 1e-3  # pixels
 MOST_PIXELS = 1_000_000  # of a side
 _STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
 
@@ -52,7 +51,7 @@ class Camera:
         if deviation > _FLOAT32_TOLERANCE:
             left, _, right = np.linalg.svd(self.R)
             object.__setattr__(self, "R", left @ right)
-        check_number("camera focal_length", float(self.focal_length.min()), above=_MIN_FOCAL_LENGTH)
+        check_number("camera focal_length", float(self.focal_length.min()), above=1e-3)
         real_array("image size (height, width)", tuple(self.size), (2,))
         for side in self.size:
             check_integer("image size (height, width)", side, 1, MOST_PIXELS)
@@ -93,9 +92,7 @@ class Camera:
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """World-to-camera transform for column vectors (T^cam in the paper)."""
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.R, self.t
-        return matrix
+        return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
@@ -150,11 +147,7 @@ class Camera:
         )
 
     def turn(self, quarters: int) -> "Camera":
-        """Return the camera of the image turned by quarter turns: the camera rotates about its optical axis.
-
-        One quarter turn, counterclockwise as in `numpy.rot90`, takes pixel (x, y) of an image of width w to (y, w - x),
-        and the camera point (X, Y, Z) to (Y, -X, Z). Points, depths and pixels keep their relation exactly.
-        """
+        """Return the camera of the image turned as in `numpy.rot90`: the camera turns about its optical axis."""
         camera = self
         for _ in range(quarters % 4):
             x, y = camera.principal_point
@@ -173,11 +166,8 @@ def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.nd
 
 
 def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
-    """Return two axes of the world, to the right and up in a drawing of the scene as seen from above.
-
-    They are normal to the cameras' mean vertical, which is the image axis that they agree on better, since images may
-    be turned by 90 degrees.
-    """
+    """Return the axes of the world to the right and up in a drawing of the scene from above, normal to the vertical."""
+    # The vertical is the image axis that the cameras agree on better, since images may be turned by 90 degrees.
     axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
     down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
     right, up = np.linalg.svd(down[None])[2][1:]
@@ -185,10 +175,7 @@ def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
 
 
 def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions of cameras around a point in degrees, seen from above (see `ground_axes`).
-
-    Cameras that look along the vertical have no direction (NaN).
-    """
+    """Return the directions of cameras around a point in degrees, seen from above; NaN for those along the vertical."""
     directions = np.stack([camera.centre for camera in cameras]) - centre
     x, y = ground_axes(cameras) @ directions.T
     steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
@@ -196,16 +183,12 @@ def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float
 
 
 def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0 for one camera.
-
-    Cameras that look along the vertical do not count (see `azimuths`), unless fewer than two others are left: then the
-    span is the largest angle between any two cameras.
-    """
+    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0 for one camera."""
     angles = azimuths(cameras, centre)
     angles = np.sort(angles[~np.isnan(angles)])
     if len(angles) > 1:
         gaps = np.diff(angles, append=angles[0] + 360)
-    else:
+    else:  # others look along the vertical: the largest angle between any two cameras
         directions = np.stack([camera.centre for camera in cameras]) - centre
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))

@@ -17,8 +17,6 @@ from zsp_lite.data.pairs import pair_files, read_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 
-_MIN_FRAMES = 2  # complete frames of a sequence that can be evaluated
-
 
 @dataclass
 class CategoryCheck:
@@ -80,7 +78,7 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
             continue
         before = len(check.problems)
         frames = check.attempt(dataset.frames, category, name) or []
-        if sum(_check_frame(dataset, frame, deep, check) for frame in frames) >= _MIN_FRAMES:
+        if sum(_check_frame(dataset, frame, deep, check) for frame in frames) >= 2:
             usable.add(name)
         if any(frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC for frame in frames):
             check.layout = "v2"

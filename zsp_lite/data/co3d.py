@@ -17,7 +17,8 @@ from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
-_MIN_VIEW_QUALITY, _MIN_CLOUD_QUALITY = 1.25, 0.3  # of sequences that are worth labelling
+# Of sequences that are worth labelling: the supplement, "Choice of evaluation categories & sequences".
+_MIN_VIEW_QUALITY, _MIN_CLOUD_QUALITY = 1.25, 0.3
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,7 @@ class Co3D:
         return list(self._sequences[category])
 
     def select(self, category: str, top: int = 10) -> list[records.SequenceAnnotation]:
-        """Select at most `top` sequences for labelling, best point clouds first.
-
-        Both quality scores are above the bounds of the supplement, "Choice of evaluation categories & sequences".
-        """
+        """Select at most `top` sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
             cloud = sequence.point_cloud.quality_score if sequence.point_cloud else None
@@ -187,9 +185,7 @@ def write_co3d(root: str | Path, category: str, sequences: Iterable[SequenceData
             index = records.read_frame_index(frames_path)
             frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
         if sequences_path.is_file():
-            names = [one.sequence_name for one in records.read_sequences(sequences_path)]
-            entries = msgspec.json.decode(records.read_annotations(sequences_path), type=list[msgspec.Raw])
-            listed = list(zip(names, entries))
+            listed = [(one.sequence_name, one) for one in records.read_sequences(sequences_path)]
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality)

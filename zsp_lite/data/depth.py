@@ -1,4 +1,4 @@
-"""Depth maps: CO3D's 16-bit encoding, in-painting, and the 3D point of each pixel or patch.
+"""Depth maps: CO3D's 16-bit encoding, in-painting, the 3D point of each pixel or patch, and planes through points.
 
 A depth map is (H, W), along +z in units of the world; 0 means unknown.
 """
@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float, Real, UInt16
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
-_INPAINT_RADIUS = 3  # pixels
+_PLANE_TRIALS = 500  # samples of three points to fit a plane to
+_PLANE_POINTS = 4000  # at most that a plane is fitted to
 
 
 def decode_depth(bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> Float[np.ndarray, "h w"]:
-    """Decode CO3D's depth: the bits of each 16-bit value are those of a float16, which is times `scale_adjustment`.
-
-    Values that are not finite or not positive become 0 (unknown).
-    """
+    """Decode CO3D's depth, bits of float16 times `scale_adjustment`; 0 where that is not finite or not positive."""
     with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
         depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -40,10 +38,8 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     known = np.isfinite(depth) & (depth > 0)
     if not known.any():
         raise InputError(f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0")
-    if known.all():
-        return depth.copy()
     low, high = depth[known].min(), depth[known].max()
-    filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), _INPAINT_RADIUS, cv2.INPAINT_NS)
+    filled = cv2.inpaint(np.where(known, depth, 0), (~known).astype(np.uint8), inpaintRadius=3, flags=cv2.INPAINT_NS)
     filled = np.nan_to_num(filled, nan=low)  # OpenCV divides by weights that can be 0
     return np.where(known, depth, filled.clip(low, high))
 
@@ -61,14 +57,12 @@ def patch_points(
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
     """Compute one point per patch in camera coordinates.
 
-    The point of a patch is that of the pixel whose depth is the 25th percentile of the patch's known depths: at a
-    silhouette the nearer surface is the object, and a percentile is robust to single outliers. A patch without known
-    depth takes the in-painted depth at its central pixel. (The paper in-paints the depth and unprojects the matches;
-    it does not say which of a patch's 64 pixels it takes.)
-
-    Also returns whether each patch has a known depth. In-painting takes most of the time; without, the point of a patch
-    without known depth is the origin.
+    The point of a patch is that of the pixel whose depth is the 25th percentile of the patch's known depths. A patch
+    without known depth takes the in-painted depth at its central pixel, or the origin without `inpaint`, which takes
+    most of the time. Also returns whether each patch has a known depth.
     """
+    # The paper does not say which of a patch's pixels it takes. At a silhouette the nearer surface is the object, and
+    # a percentile is robust to single outliers.
     depth = np.asarray(depth, dtype=np.float32)
     rows, row_valid, row_middle = _split(depth.shape[0], grid[0])
     cols, col_valid, col_middle = _split(depth.shape[1], grid[1])
@@ -85,15 +79,27 @@ def patch_points(
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
     chosen = np.take_along_axis(np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1)
-    index = np.where(
-        known,
-        np.take_along_axis(pixel, chosen, axis=-1)[..., 0],
-        row_middle[:, None] * depth.shape[1] + col_middle,
-    )
+    nearer = np.take_along_axis(pixel, chosen, axis=-1)[..., 0]
+    index = np.where(known, nearer, row_middle[:, None] * depth.shape[1] + col_middle)
     filled = inpaint_depth(depth) if inpaint and not known.all() else depth
     y, x = np.divmod(index, depth.shape[1])
     depths = filled.ravel()[index] if inpaint else np.where(known, filled.ravel()[index], 0)
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), depths), known
+
+
+def fit_plane(points: Float[np.ndarray, "n 3"], threshold: float) -> tuple[Float[np.ndarray, "3"], float]:
+    """Fit a plane `normal @ x = offset` to points with outliers by RANSAC; the sign of the unit normal is arbitrary."""
+    points = points[:: -(-len(points) // _PLANE_POINTS)]
+    corners = points[np.random.default_rng(0).integers(len(points), size=(_PLANE_TRIALS, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(lengths > 0, lengths, 1)
+    distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
+    counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)  # 0 for a sample of collinear points
+    inliers = points[distances[counts.argmax()] < threshold]
+    centre = inliers.mean(axis=0)
+    normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
+    return normal, float(normal @ centre)
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -27,10 +27,7 @@ _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidde
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Image with its camera and, if known, its depth map and object mask.
-
-    InputError if shapes do not fit together, or values are out of range.
-    """
+    """Image with its camera and, if known, its depth map and object mask; InputError if they do not fit together."""
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
     depth: Float32[np.ndarray, "h w"] | None  # (H, W) along +z in units of the camera's world, 0 where unknown
@@ -41,9 +38,7 @@ class Frame:
     def __post_init__(self):
         label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.asarray(self.rgb)
         if rgb.dtype != np.uint8 or rgb.shape != (*size, 3):
-            raise InputError(
-                f"{label} rgb is {rgb.dtype} of shape {rgb.shape}, expected uint8 {(*size, 3)} as the camera"
-            )
+            raise InputError(f"{label} rgb is {rgb.dtype} {rgb.shape}, expected uint8 {(*size, 3)} as the camera")
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
             if (values := getattr(self, name)) is None:
@@ -88,6 +83,14 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
     return top, left, bottom - top, right - left
 
 
+def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Remove parts thinner than 3 pixels and return the largest connected region, empty if there is none."""
+    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
+    areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
+    return regions == 1 + areas.argmax() if len(areas) else np.zeros_like(inside)
+
+
 def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
     box = top, left, height, width = mask_to_bbox(frame.mask, threshold, padding)
@@ -104,19 +107,14 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
-    """Resize a frame without keeping its aspect ratio.
-
-    Colours are averaged (OpenCV's INTER_AREA) along a side that shrinks and interpolated along a side that grows.
-    Depth is taken from the nearest pixel, since values interpolated at an edge or hole lie on no surface. The mask is
-    interpolated.
-    """
+    """Resize a frame without keeping its aspect ratio; colours are averaged along a side that shrinks."""
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
     # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
     rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
-    if depth is not None:
+    if depth is not None:  # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
         depth = depth[np.ix_(rows, cols)]

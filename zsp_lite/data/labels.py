@@ -19,9 +19,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 
-# Largest deviation of the matrix from a rigid transform: labels are decimal numbers of few digits.
-_RIGID_TOLERANCE = 1e-3
-
+_RIGID_TOLERANCE = 1e-3  # largest deviation from a rigid transform: labels are decimal numbers of few digits
 _Row = tuple[float, float, float, float]
 
 
@@ -50,10 +48,11 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     return read_label_folder(label_folder(root, category))
 
 
-def read_label_folder(folder: Path) -> dict[str, PoseLabel]:
-    """Read the labels of one category in a folder by sequence (see `read_labels`)."""
-    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))}
-    check_one_reference(labels, folder)
+def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict[str, PoseLabel]:
+    """Read the labels of one category in a folder by sequence, together with labels that will be added to it."""
+    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
+    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
+        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
     return labels
 
 
@@ -70,12 +69,6 @@ def read_label(path: Path) -> PoseLabel:
     return PoseLabel(trans, label.seq, label.reference_seq)
 
 
-def check_one_reference(labels: Mapping[str, PoseLabel], folder: Path) -> None:
-    """Raise InputError if the labels of a category have several reference sequences."""
-    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
-        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
-
-
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
     """Write a label atomically, replacing an earlier one of the same sequence, and return the path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
@@ -85,16 +78,12 @@ def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
 
 def label_bytes(label: PoseLabel) -> bytes:
     """Encode a label as JSON in the format of the published code."""
-    content = {"trans": label.trans.tolist(), "seq": label.seq, "reference_seq": label.reference_seq}
-    return json.dumps(content).encode()
+    return json.dumps(vars(label), default=np.ndarray.tolist).encode()
 
 
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """Convert a similarity between two worlds to a label with the same rotation and the same image of `centre`.
-
-    The similarity leads from the world of the reference sequence, in which `centre` is the object's centre, to that of
-    the sequence. A label has no scale: with the similarity's translation, an object off the origin would be displaced.
-    """
+    """Convert a similarity from the reference's world to a label with the same rotation and image of `centre`."""
+    # A label has no scale: with the similarity's translation, an object off the origin would be displaced.
     centre = np.asarray(centre, dtype=np.float64)
     trans = np.eye(4)
     trans[:3, :3] = sim3.R

@@ -30,9 +30,8 @@ class _PublishedPair(msgspec.Struct):
 def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
     """Sample `n` evaluation pairs of a category, each with `n_targets` target frames.
 
-    Reference sequences cycle through the labelled sequences in sorted order; the target sequence is a random other
-    one. The reference frame is random; the target frames are evenly spaced over the sequence, from a random start.
-    The draws depend on the category and the seed only, and the pairs of a smaller `n` are the first ones of a larger.
+    Reference sequences take turns; the target sequence is a random other one. The reference frame is random; the target
+    frames are evenly spaced from a random start. The pairs of a smaller `n` are the first ones of a larger.
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
@@ -115,14 +114,11 @@ def read_pair_file(path: Path) -> list[_PublishedPair]:
 
 
 def write_published_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D) -> None:
-    """Write pairs as an evaluation set in the format of the published code."""
-    positions = {
-        category: {(key.sequence_name, key.frame_number): i for i, key in enumerate(dataset.frame_list(category))}
-        for category in dict.fromkeys(pair.category for pair in pairs)
-    }
+    """Write pairs of one category as an evaluation set in the format of the published code."""
+    keys = dataset.frame_list(pairs[0].category)
+    position = {(key.sequence_name, key.frame_number): i for i, key in enumerate(keys)}
     items = []
     for pair in pairs:
-        position = positions[pair.category]
         reference = position[pair.reference_sequence, pair.reference_frame]
         targets = [position[pair.target_sequence, number] for number in pair.target_frames]
         item = _PublishedPair(pair.category, pair.reference_sequence, reference, pair.target_sequence, targets)

@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.depth import unproject_depth
-from zsp_lite.data.frames import Frame
-from zsp_lite.data.geometry import fit_plane, largest_region
+from zsp_lite.data.depth import fit_plane, unproject_depth
+from zsp_lite.data.frames import Frame, largest_region
 
 PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
@@ -46,11 +45,7 @@ def motorcycle_photograph() -> Frame:
 
 
 def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndarray, "h w"]) -> Frame:
-    """Convert the left image and its disparities in pixels to a frame with depth in metres and an object mask.
-
-    The mask is the largest connected region of points above the floor and nearer than the background. Thin parts, such
-    as the brake cables and a mirror, are missing, and so are the lowest 2 cm of the tyres.
-    """
+    """Convert the left image and its disparities in pixels to a frame with depth in metres and an object mask."""
     known = np.isfinite(disparity)
     depth = np.zeros_like(disparity)
     depth[known] = _BASELINE * _FOCAL_LENGTH / (disparity[known] + _PRINCIPAL_DIFFERENCE)
@@ -58,5 +53,6 @@ def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndar
     points = unproject_depth(depth, camera)
     normal, offset = fit_plane(points[_FLOOR_ROWS][known[_FLOOR_ROWS]], _FLOOR_DISTANCE)
     height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
+    # Thin parts, such as the brake cables and a mirror, are missing, and so are the lowest 2 cm of the tyres.
     mask = largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))
     return Frame(rgb, depth, mask.astype(np.float32), camera, "motorcycle photograph")

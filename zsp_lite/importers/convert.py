@@ -1,6 +1,6 @@
 """Conversion of a capture to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,17 +12,12 @@ from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
-from zsp_lite.importers.geometry_masks import mask_flags
-from zsp_lite.importers.lists import read_lists
-from zsp_lite.importers.masks import masks_from_box
-from zsp_lite.importers.nerfstudio import read_nerfstudio
+from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.open3d import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, object_points
 
-READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
-SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
@@ -100,10 +95,7 @@ def import_capture(
 def fuse(
     frames: Sequence[Frame],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Fuse the depth maps inside the masks by truncated signed distances (TSDF; Curless and Levoy 1996).
-
-    Returns world points (n, 3), RGB colours (n, 3) and normals (n, 3); InputError if too few frames see a surface.
-    """
+    """Fuse the depth inside the masks by TSDF (Curless and Levoy 1996) to world points, RGB colours and normals."""
     o3d = load_open3d()
     voxel = 3 * _spread(frames) / _VOXELS
     types, shapes = (o3d.core.float32,) * 3, ((1,), (1,), (3,))

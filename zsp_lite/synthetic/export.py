@@ -1,22 +1,26 @@
 """Export of procedural categories or of a folder of models: a data folder in CO3D's layout, with labels and pairs."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from tqdm import tqdm
 
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.models import list_models
-from zsp_lite.synthetic.recording import read_poses, write_labels, write_pairs, write_sequence
-from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
+from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, read_poses
+from zsp_lite.synthetic.meshes import TexturedMesh, list_models
+from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence, record_sequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
 RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence
@@ -44,11 +48,11 @@ PRESETS = {
 }
 
 
-def export_preset(preset: str, out: str | Path, seed: int = 0, progress: Callable[[Iterable], Iterable] = iter) -> None:
+def export_preset(preset: str, out: str | Path, seed: int = 0) -> None:
     """Write a preset with its evaluation pairs to a folder; see `export_categories`."""
     check_choice("preset", preset, PRESETS)
     size = PRESETS[preset]
-    export_categories(size.categories, out, size.sequences, size.frames, seed, size.image_size, progress)
+    export_categories(size.categories, out, size.sequences, size.frames, seed, size.image_size)
     for category in size.categories:
         write_pairs(Path(out), category, size.pairs, size.targets, seed)
 
@@ -60,7 +64,6 @@ def export_categories(
     frames: int,
     seed: int,
     image_size: int = 256,
-    progress: Callable[[Iterable], Iterable] = iter,
     builders: Mapping[str, Builder] = CATEGORIES,
     heights: tuple[float, float] = HEIGHTS,
 ) -> None:
@@ -68,9 +71,8 @@ def export_categories(
 
     A sequence depends only on the seed, its category and its index. An incomplete export is completed; complete
     sequences are not rendered again. The first sequence of a category is the reference of its labels. `image_size` is
-    the shorter image side in pixels, `heights` the range of the mean elevation of a sequence's cameras in degrees;
-    `progress` wraps the loop over sequences, as tqdm does. InputError if a category is unknown, or if the folder was
-    written with other settings.
+    the shorter image side in pixels, `heights` the range of the mean elevation of a sequence's cameras in degrees.
+    InputError if a category is unknown, or if the folder was written with other settings.
     """
     for category in categories:
         check_choice("category", category, builders)
@@ -79,7 +81,7 @@ def export_categories(
         _check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
-    for category, index in progress(jobs):
+    for category, index in tqdm(jobs, "rendering", disable=None):
         name, key = sequence_name(seed, category, index), _key(seed, category, index)
         if name not in read_poses(out, category):
             mesh = make_object(category, index, seed, builders)
@@ -113,15 +115,12 @@ def export_models(
     image_size: int = 256,
     front: str | None = None,
     up: str | None = None,
-    progress: Callable[[Iterable], Iterable] = iter,
 ) -> dict[str, str]:
     """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
 
-    A sequence has the name of its model, and depends only on the seed, the model and its orientation. An incomplete
-    export is completed; complete sequences are not rendered again, unless the model or its orientation changed. The
-    first model of a category is the reference of its labels. `image_size` is the shorter image side in pixels, `front`
-    and `up` are as of `list_models`; `progress` wraps the loop over models, as tqdm does. Returns the models that were
-    left out ("CATEGORY/NAME"), with the reason. InputError if no model is usable, or if `out` holds other data.
+    An incomplete export is completed; complete sequences are not rendered again, unless the model or its orientation
+    changed. The other arguments are as of `export_categories` and `list_models`. Returns the models that were left out
+    ("CATEGORY/NAME"), with the reason. InputError if no model is usable, or if `out` holds other data.
     """
     models, out = list_models(folder, front, up), Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
@@ -131,7 +130,7 @@ def export_models(
         _check_same_settings(out, rendered.settings, settings)
     elif out.is_dir() and Co3D(out).categories():
         raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
-    for model in progress(models):
+    for model in tqdm(models, "rendering", disable=None):
         record = {
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
@@ -170,3 +169,43 @@ def _check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
     """Raise InputError if a folder was written with other settings."""
     if found != settings:
         raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
+
+
+def write_sequence(
+    out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, RenderedSequence]
+) -> None:
+    """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with one is complete."""
+    data, exact = recorded
+    write_co3d(out, category, [data], quality=88)
+    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
+    poses = read_poses(out, category)
+    poses[data.name] = ObjectPose(exact.object_pose.tolist(), exact.scale, low, high, shape_turns(mesh.vertices))
+    write_atomic(out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode())
+
+
+def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
+    """Return the quarter turns about the up axis, in degrees, after which the vertices are the same within 3 %."""
+    points = vertices - (vertices.min(0) + vertices.max(0)) / 2
+    x, y, z = points.T
+    turned = {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}
+    distance = {turn: KDTree(points).query(np.stack(one, 1))[0].max() for turn, one in turned.items()}
+    return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
+
+
+def write_labels(out: Path, category: str, names: Iterable[str]) -> None:
+    """Write the pose labels of sequences from their object poses; the first name is the reference."""
+    poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
+    reference, *others = names
+    write_label(out, category, PoseLabel(np.eye(4), reference, reference))
+    for name in others:
+        # Rounded, to be equal on all processors, and without negative zeros.
+        trans = np.round(poses[name] @ np.linalg.inv(poses[reference]), 12) + 0.0
+        write_label(out, category, PoseLabel(trans, name, reference))
+
+
+def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], seed: int) -> None:
+    """Sample evaluation pairs, a file per number of target views, in the format of the published evaluation."""
+    dataset = Co3D(out)
+    for n_targets in targets:
+        sampled = sample_pairs(dataset, category, pairs, n_targets, seed)
+        write_published_pairs(pairs_path(out, category, pairs, n_targets), sampled, dataset)

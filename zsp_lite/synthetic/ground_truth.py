@@ -1,11 +1,13 @@
-"""Ground-truth correspondences between views of synthetic objects, for evaluation only.
+"""Object poses of synthetic data, and ground-truth correspondences between views, for evaluation only.
 
 Instances of a category have different proportions. Their points are therefore compared in box coordinates, from 0
 (rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.neighbors import NearestNeighbors
@@ -14,11 +16,40 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.synthetic.recording import POSES_FILE, ObjectPose, read_poses
+from zsp_lite.io.files import read_json
 from zsp_lite.views import object_crop, patch_mask
 
+POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
+_Vector = tuple[float, float, float]
+_Row = tuple[float, float, float, float]
+
+
+class ObjectPose(msgspec.Struct):
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in object coordinates."""
+
+    trans: tuple[_Row, _Row, _Row, _Row]  # the matrix [R t]
+    scale: float
+    low: _Vector  # corners of the box
+    high: _Vector
+    turns: tuple[int, ...] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+
+    @property
+    def R(self) -> Float[np.ndarray, "3 3"]:
+        return np.array(self.trans)[:3, :3]
+
+    @property
+    def t(self) -> Float[np.ndarray, "3"]:
+        return np.array(self.trans)[:3, 3]
+
+    def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
+        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
+
+    def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to box coordinates, 0 to 1 along each object axis."""
+        return (self.to_object(world) - self.low) / np.subtract(self.high, self.low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +61,12 @@ class GroundTruthPair:
     target: Frame
     cells: Int[np.ndarray, "rows cols 2"]  # matching target patch (row, col) of each reference patch
     valid: Bool[np.ndarray, "rows cols"]  # reference patches that have a match
+
+
+def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
+    """Return the object pose of every sequence of a category; none without the file."""
+    path = out / category / POSES_FILE
+    return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:

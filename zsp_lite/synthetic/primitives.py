@@ -71,10 +71,7 @@ def box(size, centre=(0, 0, 0)) -> Mesh:
 
 
 def lathe(profile, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
-    """Return the surface of revolution about z of a profile of (radius, height) points (n, 2).
-
-    Normals point outwards if the profile goes up. With `start` and `stop`, it is the sector between two angles.
-    """
+    """Revolve a profile (n, 2) of radii and heights about z; normals point outwards if the profile goes up."""
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
     angle = np.linspace(start, stop, sides, endpoint=not closed)

@@ -46,19 +46,15 @@ class _Hits(NamedTuple):
 
 
 class MeshScene:
-    """A mesh on the floor of a room, for rendering from cameras in the coordinates of the mesh.
-
-    The lowest vertex stands on the floor. `coordinates` are the object coordinates of each vertex, for a deformed copy
-    of an object; by default its positions. `samples` is the number of samples per pixel along each axis.
-    """
+    """A mesh on the floor of a room, for rendering from cameras in the coordinates of the mesh."""
 
     def __init__(
         self,
         mesh: TexturedMesh,
         lighting: RoomLight,
         seed: int | np.random.Generator,
-        coordinates: Float[np.ndarray, "v 3"] | None = None,
-        samples: int = 2,
+        coordinates: Float[np.ndarray, "v 3"] | None = None,  # of the object that the mesh is a deformed copy of
+        samples: int = 2,  # per pixel, along each axis
     ):
         o3d = load_open3d()
         self.mesh, self.lighting, self.room = mesh, lighting, lighting.room
@@ -103,8 +99,6 @@ class MeshScene:
         rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
         return Rendering(rgb, depth, mask, canonical, normals, camera)
 
-    # Geometry
-
     def _cast(self, origin: Float[np.ndarray, "#*n 3"], rays: Float[np.ndarray, "*n 3"]) -> _Hits:
         """Return the first point that each ray meets; a ray passes through the holes of textures."""
         origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
@@ -141,8 +135,6 @@ class MeshScene:
         n, count = directions.shape[:2]
         blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
         return 1 - blocked.astype(np.float32) / np.float32(count)
-
-    # Shading
 
     def _shade(self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits) -> Float[np.ndarray, "h w 4"]:
         """Return the radiance of the object along rays, multiplied by its opacity, and the opacity."""
@@ -210,8 +202,6 @@ class MeshScene:
         """Return directions to random points of the key light, `count` for each of n points."""
         offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, n, count)
         return _unit(self.room.light.astype(np.float32) + offset)
-
-    # Background
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the visible shares of the key light and of the room on a grid below the object, and its width."""

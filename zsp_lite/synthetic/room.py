@@ -161,8 +161,7 @@ class RoomLight:
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
         """Return the radiance of walls and ceiling and the albedo of the floor along rays, and the reach of the floor.
 
-        Rays start at `eye`, which is moved into the room; `blur` is the angle that a ray covers, in radians. The reach
-        is the ray parameter where a ray meets the floor, 0 where it does not.
+        Each ray covers the angle `blur`, in radians; the reach is its parameter on the floor, 0 where it misses it.
         """
         low, high = (corner[:, None].astype(np.float32) for corner in (self.room.low, self.room.high))
         eye = np.clip(eye[:, None], low + 0.05, high - 0.05).astype(np.float32)

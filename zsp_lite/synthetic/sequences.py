@@ -6,7 +6,6 @@ grazing angles. Its masks come from a segmentation network (PointRend), accurate
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -44,10 +43,7 @@ class RenderedSequence:
 
 
 def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation (3, 3) and translation (3,), world to camera, of a camera that looks at `target` (3,).
-
-    Angles are in radians: azimuth about z, 0 at +x; elevation above the horizontal plane; roll about the optical axis.
-    """
+    """Return rotation and translation, world to camera, of a camera that looks at `target` (3,); angles in radians."""
     away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     forward = -away
     right = np.cross(forward, [0, 0, 1.0])
@@ -64,11 +60,7 @@ def handheld_sweep(
     size: tuple[int, int],
     heights: tuple[float, float] = HEIGHTS,
 ) -> list[Camera]:
-    """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object.
-
-    All share one focal length: the object fills 55 to 75 % of the shorter image side in the median view and is inside
-    the image in all views.
-    """
+    """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the object."""
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
 
@@ -89,6 +81,7 @@ def handheld_sweep(
     sides = np.array(size[::-1], float)
     principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
     room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
+    # The object fills 55 to 75 % of the shorter side in the median view, and is inside the image in all views.
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
     allowed = (room / np.maximum(-low, high).max(0)).min()
     focal_length = np.full(2, round(min(wanted, allowed), 6))
@@ -98,41 +91,34 @@ def handheld_sweep(
 def render_sequence(
     mesh: TexturedMesh, rng: np.random.Generator, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
 ) -> RenderedSequence:
-    """Render views around an object in a random room; `image_size` is the shorter image side.
-
-    The world is the frame of the first camera, so that the pose of the object in it does not depend on the category.
-    """
+    """Render views around an object in a random room; `image_size` is the shorter image side."""
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
     cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
     scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
-    first = cameras[0].matrix
+    first = cameras[0].matrix  # its frame is the world, so that the object's pose does not depend on the category
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
-    rounded = partial(np.round, decimals=9)
     views = []
     for camera in cameras:
         view = scene.render(camera)
-        pose = rounded(view.camera.matrix @ to_object) + 0.0  # no negative zeros
+        pose = np.round(view.camera.matrix @ to_object, 9) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
-    return RenderedSequence(tuple(views), tuple(seconds.tolist()), rounded(first), 1.0)
+    return RenderedSequence(tuple(views), tuple(seconds.tolist()), np.round(first, 9), 1.0)
 
 
 def stereo_depth(
     view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Simulate the depth map of multi-view stereo, 0 where there is no measurement.
-
-    The holes are fractions of the pixels of the object and of the floor. The noise, mostly correlated between pixels,
-    is 0.5 % of the depth at the object and grows with the square of the depth.
-    """
+    """Simulate the depth map of multi-view stereo; the holes are fractions of the object's and the floor's pixels."""
     confidence = _stereo_confidence(view, rng)
     known = np.zeros(view.mask.shape, bool)
     for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
     near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf  # a flat object may be seen edge-on
+    # The noise, mostly correlated between pixels, grows with the square of the depth.
     noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(view.mask.shape)
     noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
@@ -183,10 +169,7 @@ def fused_cloud(
 def record_sequence(
     mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
 ) -> tuple[SequenceData, RenderedSequence]:
-    """Return a sequence with the errors of CO3D's data, and the exact one; the point cloud has CO3D's unit spread.
-
-    `key` seeds room, cameras and noise.
-    """
+    """Return a sequence with the errors of CO3D's data, and the exact one; the point cloud has CO3D's unit spread."""
     sequence = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, heights)
     rng = np.random.default_rng([key, 2])
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)

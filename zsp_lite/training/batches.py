@@ -28,15 +28,13 @@ class Batch:
 def crop_grids(
     rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
 ) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
-    """Draw slightly rotated crops as grids for `grid_sample`; each group of `per_object` is mirrored as a whole or not.
-
-    The second result maps directions in the image to directions in the crop.
-    """
+    """Draw slightly rotated crops as grids for `grid_sample`, and the map of directions in the image to the crop's."""
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
     width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
     angle = rng.normal(0, 0.12, n)
     x, y = (rng.uniform(-1, 1, n) * (1 - extent) * 0.9 for extent in (width, height))
+    # Each group is mirrored as a whole or not.
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
     c, s = np.cos(angle), np.sin(angle)
     affine = np.stack([

@@ -48,10 +48,7 @@ class DistillationConfig:
 
 
 class Head(nn.Module):
-    """Projection head: an MLP, then cosine similarities to K learned directions.
-
-    This is DINO's weight-normalised last layer with a fixed gain of 1, so that all logits are in [-1, 1].
-    """
+    """Projection head: an MLP, then cosine similarities to K learned directions."""
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
@@ -63,6 +60,7 @@ class Head(nn.Module):
             nn.init.zeros_(module.bias)
 
     def forward(self, cls: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch outputs"]:
+        # DINO's weight-normalised last layer with a fixed gain of 1: all logits are in [-1, 1].
         return F.linear(F.normalize(self.mlp(cls), dim=-1), F.normalize(self.directions, dim=-1))
 
 

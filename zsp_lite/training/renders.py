@@ -23,7 +23,9 @@ from zsp_lite.synthetic.sequences import orbit_pose
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels
 GRID = 48  # points along each side of a view at which geometry is known
-PAIR_ANGLES = np.radians((5, 45))  # smallest and largest difference in azimuth of the two views of a pair
+# Smallest and largest difference in azimuth of the two views of a pair, about that of a reference and the nearest of a
+# few target views, and never more than that of two views of different pairs.
+PAIR_ANGLES = np.radians((5, 45))
 ROOMS, SHARING = 8, 100  # so many rooms for so many consecutive objects: a room takes five times as long as a view
 
 
@@ -44,11 +46,7 @@ def render_set(numbers: Iterable[int]) -> RenderSet:
 
 
 def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one object; returns its rows of `RenderSet.rgb`, `.surface` and `.geometry`.
-
-    The views are four pairs, a quarter turn apart. The two views of a pair differ by 5 to 45 degrees of azimuth, about
-    as much as a reference and the nearest of a few target views, and never more than two views of different pairs.
-    """
+    """Render one object as four pairs of views, a quarter turn apart; returns its rows of a `RenderSet`."""
     rng = np.random.default_rng([number, 0])  # [number, 1] draws the object itself
     shape = make_shape(build_random_object, [number, 1])
     start, step, views = rng.uniform(0, TAU), SIZE // GRID, []
@@ -79,15 +77,11 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def framed_camera(
     vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarray, size: int, margin: float = 1.1, shift=(0, 0)
 ) -> Camera:
-    """Return a camera at pose R, t with a square image of `size` pixels that contains all vertices.
-
-    The bounding square of the object is enlarged by the factor `margin` and shifted by `shift` (2,), fractions of its
-    width.
-    """
+    """Return a camera at pose R, t with a square image of `size` pixels that contains all vertices."""
     in_camera = vertices @ R.T + t
     plane = in_camera[:, :2] / in_camera[:, 2:]
     low, high = plane.min(0), plane.max(0)
-    width = (high - low).max() * margin
+    width = (high - low).max() * margin  # of the image; the shift is a fraction of it
     centre, focal_length = (low + high) / 2 + np.multiply(shift, width), size / width
     return Camera(R, t, np.full(2, focal_length), size / 2 - centre * focal_length, (size, size))
 
@@ -95,10 +89,7 @@ def framed_camera(
 def render_instance(
     number: int, mesh: TexturedMesh, coordinates: Float[np.ndarray, "v 3"], camera: Camera, rng: np.random.Generator
 ) -> Rendering:
-    """Render an instance of object `number` in a random room, which is turned at random.
-
-    `coordinates` are the object coordinates of the vertices, the same for all instances of an object.
-    """
+    """Render an instance of object `number`, with the coordinates of that object, in a random room turned at random."""
     angle = rng.uniform(0, TAU)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=(mesh.normals @ turn.T).astype(np.float32))

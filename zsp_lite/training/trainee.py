@@ -16,8 +16,7 @@ from zsp_lite.training.renders import VIEWS, RenderSet
 class Trainee(nn.Module):
     """A transformer whose keys of block `layer` (from 0) are trained, and the running mean of these keys.
 
-    Two linear heads, which only training uses, predict geometry (see `geometry_loss`) from the output tokens and from
-    the input of the keys' projection.
+    Two linear heads, which only training uses, predict geometry from the output tokens and from the keys' input.
     """
 
     def __init__(self, backbone: VisionTransformer, layer: int):

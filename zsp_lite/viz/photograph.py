@@ -23,8 +23,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_points
-from zsp_lite.synthetic.ground_truth import object_poses
-from zsp_lite.synthetic.recording import POSES_FILE
+from zsp_lite.synthetic.ground_truth import POSES_FILE, object_poses
 from zsp_lite.viz import plots
 
 PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")

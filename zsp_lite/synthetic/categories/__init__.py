@@ -9,8 +9,8 @@ from zsp_lite.synthetic.categories.household import chair, hairdryer, toaster, t
 from zsp_lite.synthetic.categories.street import bicycle, car, hydrant, motorcycle
 from zsp_lite.synthetic.categories.toys import teddybear, toybus, toyplane, toytrain, toytruck
 
-_LARGE = (bicycle, car, chair, hydrant, motorcycle, toilet)
-_SMALL = (backpack, book, hairdryer, handbag, keyboard, laptop, mouse, remote, toaster)
-_TOYS = (teddybear, toybus, toyplane, toytrain, toytruck)
-_BUILDERS = {build.__name__: build for build in (*_LARGE, *_SMALL, *_TOYS)}
-CATEGORIES: dict[str, Builder] = dict(sorted(_BUILDERS.items()))
+_BUILDERS = (
+    backpack, bicycle, book, car, chair, hairdryer, handbag, hydrant, keyboard, laptop, motorcycle, mouse, remote,
+    teddybear, toaster, toilet, toybus, toyplane, toytrain, toytruck,
+)  # fmt: skip
+CATEGORIES: dict[str, Builder] = {build.__name__: build for build in _BUILDERS}

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly
-from zsp_lite.synthetic.categories.parts import Y, rounded_box, tapered
+from zsp_lite.synthetic.assembly import Assembly, Y, rounded_box, tapered
 from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, torus
 
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly
-from zsp_lite.synthetic.categories.parts import rounded_box
+from zsp_lite.synthetic.assembly import Assembly, rounded_box
 from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 

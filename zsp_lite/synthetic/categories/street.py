@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly
-from zsp_lite.synthetic.categories.parts import Y, add_wheels, disc, pane, rounded_box, tapered
+from zsp_lite.synthetic.assembly import Assembly, Y, add_wheels, disc, pane, rounded_box, tapered
 from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 
