@@ -151,13 +151,12 @@ def outline_patch(
 ) -> list[Artist]:
     """Outline a patch of the image of an axis, or the block of patches up to `reach` around it, with a label beside it.
 
-    A cell outside the image is moved to its border, and the block is cut there.
+    The block is cut at the border of the image.
     """
-    centre = np.clip(cell, 0, np.subtract(grid, 1))
-    corners = np.clip([centre - reach, centre + reach + 1], 0, grid)
+    corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    at, side = (right, "left") if centre[1] < 0.8 * grid[1] else (left, "right")
+    at, side = (right, "left") if cell[1] < 0.8 * grid[1] else (left, "right")
     name = axis.text(at, (top + bottom) / 2, f" {label} ", ha=side, va="center", weight="bold", path_effects=_OUTLINE)
     return [axis.add_patch(box), name]
 

@@ -6,18 +6,16 @@ The browser draws the points and sends clicks (`cloud_view.js`). Python finds th
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Real, UInt8
+from scipy.spatial import KDTree
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.common import load_package
-
-if TYPE_CHECKING:
-    from anywidget import AnyWidget
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
 _DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
@@ -41,17 +39,11 @@ def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points, neighbours after each other.
-
-    The slider of the labelling widget goes through them in this order, along the Morton (Z-order) curve.
-    """
+    """Return the indices of at most `most` points, neighbours after each other, as the slider goes through them."""
     kept = np.arange(len(points))
     if len(points) > most:
         kept = np.random.default_rng(0).choice(len(points), most, replace=False)
-    low, high = points[kept].min(axis=0), points[kept].max(axis=0)
-    cell = ((points[kept] - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
-    code = sum(((cell[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
-    return kept[np.lexsort((kept, code))]
+    return kept[KDTree(points[kept]).indices]  # leaf by leaf
 
 
 def point_under(
@@ -134,7 +126,7 @@ class CloudView:
 
 
 @cache
-def _cloud_widget() -> "type[AnyWidget]":
+def _cloud_widget() -> type:
     anywidget = load_package("anywidget")
     from traitlets import Bytes, Float, Int, List, Unicode
 

@@ -39,6 +39,7 @@ _STYLE = """<style>
 .zsp-label th, .zsp-label td { padding: 1px 8px; text-align: left; line-height: 1.4; }
 .zsp-label th { border-bottom: 1px solid; }
 .zsp-label td:nth-child(n+4) { text-align: right; }
+.zsp-progress tr:has(td:first-child:not(:empty)) td { font-weight: bold; }
 .zsp-label .widget-html-content { line-height: 1.4; }
 .zsp-message p { margin: 2px 0; min-height: 1.4em; line-height: 1.4; }
 .zsp-message .problem { border-left: 5px solid #D55E00; padding-left: 6px; }
@@ -130,7 +131,7 @@ class _LabellingWidget:
         return f"{len(self.labelling.picks(self.current))} keypoints on {self.current}."
 
     def redo(self) -> str:
-        self.labelling.clear(self.current)
+        self.labelling.put(self.current, [])
         return f"All keypoints of {self.current} removed."
 
     def accept(self) -> str:
