@@ -12,7 +12,7 @@ from scipy.stats import binomtest, mannwhitneyu
 class Reliability:
     """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table."""
 
-    auroc: float  # area under the ROC curve (see `auroc`)
+    auroc: float  # probability that a correct estimate has a higher confidence than a wrong one, ties counting half
     calibration_error: float  # expected calibration error, in [0, 1]
     top_half_accuracy: float  # fraction of correct estimates among the more confident half
     count: np.ndarray  # number of estimates in each bin
@@ -40,12 +40,7 @@ def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, "
     interval = np.transpose([test.proportion_ci(method="wilson") for test in tests])
     error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
     upper = float(correct[order[len(order) // 2 :]].mean())
-    return Reliability(auroc(confidence, correct), error, upper, count, mean, accuracy, interval)
-
-
-def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
-    """Estimate the probability that a correct estimate has a higher confidence than a wrong one, ties counting half."""
-    positive, negative = confidence[correct], confidence[~correct]
-    if not len(positive) or not len(negative):
-        return float("nan")
-    return float(mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative)))
+    right, wrong = confidence[correct], confidence[~correct]
+    pairs = len(right) * len(wrong)
+    auroc = float(mannwhitneyu(right, wrong).statistic / pairs) if pairs else float("nan")
+    return Reliability(auroc, error, upper, count, mean, accuracy, interval)

@@ -50,10 +50,10 @@ def write_pair_report(path: Path, result: PairResult) -> Path:
 
 def write_category_report(path: Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
     """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
-    names, style = list(alignment.objects), {"format": "jpg", "dpi": 150, "pil_kwargs": {"quality": 90}}
+    names = list(alignment.objects)
     parts = [names[start : start + category_sheet.MOST] for start in range(0, len(names), category_sheet.MOST)]
     figures = [category_sheet.contact_sheet(dataset, category, alignment, part) for part in parts]
-    sheets = [_encode(figure, **style) for figure in figures]
+    sheets = [_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures]
     text = _template("category.html").render(
         category=category, columns=category_sheet.COLUMNS, rows=category_sheet.object_rows(alignment),
         images=[f"data:image/jpeg;base64,{base64.b64encode(sheet).decode()}" for sheet in sheets],
@@ -92,9 +92,9 @@ def write_report(
         picture = _data_uri(photograph_figure(photograph)) if photograph else ""
     page = _template("report.html").render(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
-        own=own, labelled=any(result.errors for result in results) or not own, photograph=photograph,
-        photograph_columns=PHOTOGRAPH_COLUMNS, photograph_rows=photograph_rows(photograph),
-        photograph_picture=picture, link=lambda name: _notebook_link(name, path.parent),
+        own=own, photograph=photograph, photograph_columns=PHOTOGRAPH_COLUMNS,
+        photograph_rows=photograph_rows(photograph), photograph_picture=picture,
+        link=lambda name: _notebook_link(name, path.parent),
     )  # fmt: skip
     write_atomic(path, page.encode(errors="replace"))
     return path
@@ -195,8 +195,8 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     # The clouds fill the scene. The eye is above the target camera, to its right.
     camera = {"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
     ground = {"paper_bgcolor": "rgba(0,0,0,0)", "font_color": _GREY, "legend_bgcolor": "rgba(0,0,0,0)"}
-    scene.update_layout(height=400, scene_camera=camera, **ground)
-    scene.update_layout({f"scene_{axis}axis": {"visible": False} for axis in "xyz"})
+    hidden = {f"scene_{axis}axis_visible": False for axis in "xyz"}
+    scene.update_layout(height=400, scene_camera=camera, **ground, **hidden)
     config = {"displaylogo": False, "responsive": True, "scrollZoom": False, "displayModeBar": False}
     content = {"points": cloud.round(4).tolist(), "poses": [move.matrix[:3].round(6).tolist() for move in moves]}
     plot = scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config)
