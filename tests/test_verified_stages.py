@@ -34,7 +34,7 @@ from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms, viewpoint_term
 from zsp_lite.views import View, extract_views, object_crop
-from zsp_lite.viz.reliability import auroc, reliability
+from zsp_lite.viz.reliability import reliability
 
 seeds = st.integers(0, 2**31)
 
@@ -376,8 +376,8 @@ def test_surface_weights_do_not_depend_on_the_sampling_density():
 
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():
     confidence, right = np.array([0.9, 0.6, 0.6, 0.2]), np.array([True, True, False, False])
-    assert auroc(confidence, right) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
-    assert np.isnan(auroc(confidence, np.ones(4, dtype=bool)))
+    assert reliability(confidence, right, bins=2).auroc == pytest.approx((1 + 1 + 0.5 + 1) / 4)
+    assert np.isnan(reliability(confidence, np.ones(4, dtype=bool), bins=2).auroc)
 
 
 def test_reliability_by_hand():

@@ -39,7 +39,7 @@ def demo(data, solver, backbone, out) -> None:
         dataset, model = Co3D(folder), load_backbone(backbone)
         photograph = list(run_photograph(dataset, model))
         results = list(run_demo(dataset, model, SOLVERS[solver]))
-        path = write_report(out / "report.html", results, str(folder), note, model.name, photograph)
+        path = write_report(out / "report.html", results, model.name, str(folder), note, photograph)
         write_overview(out / "overview.jpg", results)
     if photograph:
         title = f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"

@@ -7,8 +7,7 @@ candidates: contact sheet of the sequences to label
 The widget for notebooks is in `zsp_lite.widgets.labelling`.
 """
 
-from zsp_lite.data.labels import rigid_label
-from zsp_lite.labelling.keypoints import Alignment, align_picks
+from zsp_lite.labelling.keypoints import align_picks
 from zsp_lite.labelling.session import Labelling
 
-__all__ = ["Alignment", "Labelling", "align_picks", "rigid_label"]
+__all__ = ["Labelling", "align_picks"]

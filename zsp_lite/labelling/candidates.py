@@ -8,23 +8,21 @@ from matplotlib.figure import Figure
 
 from zsp_lite.data.annotations import SequenceAnnotation
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import crop_to_object, resize_frame
+from zsp_lite.views import object_crop
 
+_VIEWS = 4  # of a sequence
 _SIDE = 128  # pixels of a thumbnail
 
 
-def contact_sheet(dataset: Co3D, category: str, sequences: Sequence[SequenceAnnotation], views: int = 4) -> Figure:
+def contact_sheet(dataset: Co3D, category: str, sequences: Sequence[SequenceAnnotation]) -> Figure:
     """Draw one row of evenly spaced frames per sequence, with its quality scores."""
-    figure, axes = plt.subplots(
-        len(sequences), views, figsize=(1.5 * views + 2.4, 1.5 * len(sequences)), squeeze=False, layout="constrained"
-    )
+    size = 1.5 * _VIEWS + 2.4, 1.5 * len(sequences)
+    figure, axes = plt.subplots(len(sequences), _VIEWS, figsize=size, squeeze=False, layout="constrained")
     for row, sequence in zip(axes, sequences):
         frames = dataset.frames(category, sequence.sequence_name)
-        chosen = np.linspace(0, len(frames), views, endpoint=False).astype(int)
+        chosen = np.linspace(0, len(frames), _VIEWS, endpoint=False).astype(int)
         for axis, index in zip(row, chosen):
-            frame = dataset.load(frames[index])
-            crop = crop_to_object(frame) if frame.mask is not None and frame.mask.any() else frame
-            axis.imshow(resize_frame(crop, (_SIDE, _SIDE)).rgb)
+            axis.imshow(object_crop(dataset.load(frames[index]), _SIDE).rgb)
             axis.set(xticks=[], yticks=[])
         row[0].set_ylabel(_scores(sequence), rotation=0, ha="right", va="center", fontsize=8)
     return figure

@@ -18,15 +18,11 @@ MIN_KEYPOINTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Alignment of the reference sequence with another sequence.
+    """Alignment of the reference sequence with another sequence."""
 
-    Attributes:
-        sim3: Similarity from the world of the reference sequence to that of the sequence.
-        residuals: (n,) distance of each transformed keypoint from its pick, relative to the spread of the picks (their
-            standard deviation, averaged over the axes), so that objects of any size can be compared.
-    """
-
-    sim3: Sim3
+    sim3: Sim3  # from the world of the reference sequence to that of the sequence
+    # Distance of each transformed keypoint from its pick, relative to the spread of the picks (their standard
+    # deviation, averaged over the axes), so that objects of any size can be compared.
     residuals: Float[np.ndarray, " n"]
 
     @property
@@ -47,10 +43,8 @@ def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
     """
     reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
-        raise InputError(
-            f"{len(picks)} keypoints picked and {len(reference)} on the reference, expected equally many, "
-            f"at least {MIN_KEYPOINTS}"
-        )
+        found = f"{len(picks)} keypoints picked and {len(reference)} on the reference"
+        raise InputError(f"{found}, expected equally many, at least {MIN_KEYPOINTS}")
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))

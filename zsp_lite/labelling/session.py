@@ -16,14 +16,7 @@ from jaxtyping import Float, Real
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import (
-    PoseLabel,
-    label_folder,
-    read_label_folder,
-    read_labels,
-    rigid_label,
-    write_label,
-)
+from zsp_lite.data.labels import PoseLabel, label_folder, read_label_folder, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
@@ -44,21 +37,13 @@ class _Picks(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a sequence.
-
-    Attributes:
-        sequence: Name of the sequence.
-        state: "reference", "open", "accepted" or "skipped".
-        picks: Number of picked keypoints.
-        rms: RMS residual of the alignment relative to the spread of the picks, or None before all keypoints are picked.
-        problem: Why the picks give no alignment, such as all on one line; "" if there is no problem.
-    """
+    """Progress of a sequence."""
 
     sequence: str
-    state: str
+    state: str  # "reference", "open", "accepted" or "skipped"
     picks: int
-    rms: float | None
-    problem: str = ""
+    rms: float | None  # of the residuals relative to the spread of the picks; None before all keypoints are picked
+    problem: str = ""  # why the picks give no alignment, such as all on one line
 
 
 class Labelling:
@@ -95,17 +80,13 @@ class Labelling:
         references = {label.reference_seq for label in read_labels(root, category).values()}
         references |= ({stored.reference_seq} if stored else set()) | ({reference} if reference else set())
         if len(references) > 1:
-            raise InputError(
-                f"category {category}: reference, stored picks and labels name {', '.join(sorted(references))}, "
-                "expected one reference sequence"
-            )
+            found = f"reference, stored picks and labels name {', '.join(sorted(references))}"
+            raise InputError(f"category {category}: {found}, expected one reference sequence")
         chosen = sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud
         chosen = list(dict.fromkeys([*references, *chosen]))
         if missing := [name for name in chosen if name not in with_cloud]:
-            raise InputError(
-                f"sequence {category}/{missing[0]} has no point cloud, expected some of "
-                f"{', '.join(with_cloud) or 'none'}"
-            )
+            allowed = ", ".join(with_cloud) or "none"
+            raise InputError(f"sequence {category}/{missing[0]} has no point cloud, expected some of {allowed}")
         if len(chosen) < 2:
             raise InputError(f"category {category} has {len(chosen)} sequence with a point cloud, expected two")
         best = max(chosen, key=lambda name: known[name].point_cloud.quality_score or -np.inf)
@@ -136,17 +117,14 @@ class Labelling:
 
     def first_view(self, sequence: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation (3, 3) from world to first camera of a sequence; the identity without cameras."""
-        for frame in self.dataset.frames(self.category, self._known(sequence)):
-            if frame.viewpoint is not None:
-                return self.dataset.camera(frame).R
-        return np.eye(3)
+        frames = self.dataset.frames(self.category, self._known(sequence))
+        return next((self.dataset.camera(frame).R for frame in frames if frame.viewpoint is not None), np.eye(3))
 
     def pick(self, sequence: str, point: Point, name: str = "") -> None:
         """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a new one of that name.
 
         Raises:
-            InputError: All keypoints are picked, the point is not finite, or the reference's keypoints are in use on
-                other sequences.
+            InputError: All keypoints are picked, or the reference's keypoints are in use on other sequences.
         """
         picks = self.picks(sequence)
         if sequence != self.reference and len(picks) >= len(self.names):
@@ -158,10 +136,6 @@ class Labelling:
         if len(picks := self.picks(sequence)):
             self.put(sequence, picks[:-1], self.names[:-1])
 
-    def clear(self, sequence: str) -> None:
-        """Remove all picks of a sequence. An accepted label is kept until another one is accepted."""
-        self.put(sequence, [])
-
     def proposal(self, sequence: str) -> Sim3 | None:
         """Return the proposed similarity from the world of the reference to that of a sequence; None without one."""
         if not {self.reference, self._known(sequence)} <= self._proposals.keys():
@@ -172,16 +146,14 @@ class Labelling:
     def put(self, sequence: str, points: Sequence[Point] | Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
         """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints.
 
-        A sequence that was skipped is open again.
+        A sequence that was skipped is open again. An accepted label is kept until another one is accepted.
         """
         points = real_array(f"picks on {sequence}", points if len(points) else np.zeros((0, 3)), (None, 3))
         check_magnitude(f"picks on {sequence}", points)
         if self._known(sequence) == self.reference:
-            others = [name for name, picks in self._stored.picks.items() if name != sequence and picks]
-            if others:
-                raise InputError(
-                    f"keypoints of the reference {sequence} are in use on {', '.join(others)}; clear those first"
-                )
+            if others := [name for name, picks in self._stored.picks.items() if name != sequence and picks]:
+                in_use = f"in use on {', '.join(others)}"
+                raise InputError(f"keypoints of the reference {sequence} are {in_use}; clear those first")
             self._stored.names[:] = names
         self._stored.picks[sequence] = points.tolist()
         self._save(sequence)
@@ -193,21 +165,15 @@ class Labelling:
             return None
         return align_picks(self.picks(self.reference), picks)
 
-    def relative_residuals(self, sequence: str) -> Float[np.ndarray, " n"] | None:
-        """Return the residual of each keypoint relative to the object's size; None before all keypoints are picked.
-
-        The residuals of an `Alignment` are relative to the spread of the picks, which is several times smaller.
-        """
-        if (alignment := self.alignment(sequence)) is None:
-            return None
-        low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
-        distance = alignment.residuals * np.sqrt(self.picks(sequence).var(axis=0).mean())
-        return distance / max(float((high - low).max()), 1e-12)
-
     def doubt(self, sequence: str) -> str:
         """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; "" otherwise."""
-        residuals = self.relative_residuals(sequence)
-        if residuals is None or (rms := float(np.sqrt(np.square(residuals).mean()))) <= MAX_RESIDUAL:
+        if (alignment := self.alignment(sequence)) is None:
+            return ""
+        # From fractions of the spread of the picks to fractions of the object's size.
+        low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
+        scale = np.sqrt(self.picks(sequence).var(axis=0).mean()) / max((high - low).max(), 1e-12)
+        residuals, rms = scale * alignment.residuals, scale * alignment.rms
+        if rms <= MAX_RESIDUAL:
             return ""
         worst = int(residuals.argmax())
         return (

@@ -27,13 +27,13 @@ def contact_sheet(
     their next best turn, too. At most ten objects are shown.
     """
     names = list(names or alignment.objects)[:MOST]
-    objects = {name: alignment.objects[name] for name in names}
-    surest, first = max(alignment.objects.items(), key=lambda item: item[1].probability)
+    objects, look = alignment.objects, doubtful(alignment)
+    surest, first = max(objects.items(), key=lambda item: item[1].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ first.sim3.R.T
     rows = {"as scanned": dict.fromkeys(names, camera)}
-    rows["aligned"] = {name: common @ one.sim3.R for name, one in objects.items()}
-    others = {name: objects[name].alternative for name in doubtful(alignment) if name in names}
+    rows["aligned"] = {name: common @ objects[name].sim3.R for name in names}
+    others = {name: objects[name].alternative for name in names if name in look}
     if turned := {name: common @ other.R for name, other in others.items() if other}:
         rows["or turned"] = turned
     size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
@@ -44,9 +44,9 @@ def contact_sheet(
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in cameras:
                 axis.imshow(_nearest(dataset, category, name, cameras[name]))
-    for axis, (name, one) in zip(axes[1], objects.items()):
-        colour = VERMILLION if name in others else "black"
-        axis.set_xlabel(f"{name[:16]}\n{100 * one.probability:.0f} %", fontsize=8, color=colour, parse_math=False)
+    for axis, name in zip(axes[1], names):
+        text, colour = f"{name[:16]}\n{100 * objects[name].probability:.0f} %", VERMILLION if name in look else "black"
+        axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
     return figure
 
 

@@ -35,12 +35,9 @@ _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard 
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """Pose of the motorcycle of `motorcycle_photograph`, estimated from views of a synthetic one.
+    """Pose of the motorcycle of `motorcycle_photograph` in its camera, estimated from views of a synthetic one."""
 
-    All points and directions are in the frame of the photograph's camera.
-    """
-
-    photograph: Frame  # the photograph
+    photograph: Frame
     sequence: str  # sequence of the synthetic motorcycle
     foreground: str  # setting of `ZeroShotPose`
     solver: str  # setting of `ZeroShotPose`
@@ -91,14 +88,17 @@ def photograph_rows(results: Sequence[PhotographResult]) -> list[tuple[str, str,
 def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     """Draw the aligned cloud and the estimated front, left and up on the photograph, one panel per result.
 
-    The left column shows a view of the synthetic motorcycle, and the directions judged by eye. The colour of a point is
-    its position from the rear (dark) to the front (bright) of the synthetic motorcycle.
+    The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
     photograph, estimate = results[0].photograph, results[0].estimate
     view, (height, width) = estimate.target_views[estimate.view].frame.rgb, photograph.camera.size
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)  # to the aspect of the photograph
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
-    titles = [_title(result) for result in results]
+    titles = [
+        f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n"
+        f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
+        for result in results
+    ]
     titles.insert(len(_SOLVERS), "directions judged by eye\n")
     titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
     images = [view, *[photograph.rgb] * (len(titles) - 1)]
@@ -118,11 +118,6 @@ def _draw_directions(axis: Axes, frame: Frame, origin: np.ndarray, directions: n
     plots.draw_axes(axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up"))
 
 
-def _title(result: PhotographResult) -> str:
-    errors = f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
-    return f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n{errors}"
-
-
-def _angle(first: np.ndarray, second: np.ndarray | tuple[float, ...]) -> float:
+def _angle(first: np.ndarray, second: tuple[float, ...]) -> float:
     """Return the angle between two vectors in degrees."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))

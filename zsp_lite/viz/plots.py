@@ -2,8 +2,7 @@
 
 `show_...` makes a figure: images in a grid, maps over images, matches between two, curves, points, intervals, dots by
 category, histograms. `draw_...`, `overlay_map` and the marks add to axes, so that a figure is a few calls. A patch is a
-cell (row, col) of a grid (rows, columns). Colours are distinguishable with colour-vision deficiencies. Titles and names
-are no TeX.
+cell (row, col) of a grid (rows, columns). Titles and names are no TeX.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -97,13 +96,9 @@ def overlay_map(
 
     `limits` are the values at the ends of the colour map, `label` is that of a colour bar. `set_data` fills it anew.
     """
-    left, right = axis.get_xlim()
-    bottom, top = axis.get_ylim()
-    values = np.asarray(values, dtype=np.float64)
     low, high = limits or (None, None)
-    drawn = axis.imshow(
-        values, cmap=cmap, alpha=alpha, extent=(left, right, bottom, top), interpolation="nearest", vmin=low, vmax=high
-    )
+    style = {"cmap": cmap, "alpha": alpha, "interpolation": "nearest", "vmin": low, "vmax": high}
+    drawn = axis.imshow(np.asarray(values, np.float64), extent=(*axis.get_xlim(), *axis.get_ylim()), **style)
     if label is not None:
         bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
         bar.set_label(label, fontsize=_FONT - 1)
@@ -151,13 +146,12 @@ def outline_patch(
 ) -> list[Artist]:
     """Outline a patch of the image of an axis, or the block of patches up to `reach` around it, with a label beside it.
 
-    A cell outside the image is moved to its border, and the block is cut there.
+    The block is cut at the border of the image.
     """
-    centre = np.clip(cell, 0, np.subtract(grid, 1))
-    corners = np.clip([centre - reach, centre + reach + 1], 0, grid)
+    corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    at, side = (right, "left") if centre[1] < 0.8 * grid[1] else (left, "right")
+    at, side = (right, "left") if cell[1] < 0.8 * grid[1] else (left, "right")
     name = axis.text(at, (top + bottom) / 2, f" {label} ", ha=side, va="center", weight="bold", path_effects=_OUTLINE)
     return [axis.add_patch(box), name]
 
@@ -470,10 +464,7 @@ def _rounded(pose: Sim3) -> Sim3:
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Colour points by their position along the first principal axis of the cloud.
-
-    Drawn over the image of another object, the gradient shows the orientation of the cloud.
-    """
+    """Colour points by their position along the first principal axis of the cloud, which shows its orientation."""
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)
     along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]

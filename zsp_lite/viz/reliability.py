@@ -10,17 +10,14 @@ from scipy.stats import binomtest, mannwhitneyu
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table.
+    """How well confidences are calibrated and how well they rank estimates. `print` shows it as a table."""
 
-    Bins hold equal numbers of estimates, in order of confidence.
-    """
-
-    auroc: float  # area under the ROC curve (see `auroc`)
+    auroc: float  # probability that a correct estimate has a higher confidence than a wrong one, ties counting half
     calibration_error: float  # expected calibration error, in [0, 1]
     top_half_accuracy: float  # fraction of correct estimates among the more confident half
-    count: np.ndarray  # (bins,) number of estimates
-    confidence: Float[np.ndarray, " bins"]  # (bins,) mean confidence
-    accuracy: Float[np.ndarray, " bins"]  # (bins,) fraction of correct estimates
+    count: np.ndarray  # number of estimates in each bin
+    confidence: Float[np.ndarray, " bins"]  # mean
+    accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates
     interval: Float[np.ndarray, "2 bins"]  # lower and upper ends of its 95 % interval (Wilson)
 
     def __str__(self) -> str:
@@ -33,31 +30,17 @@ class Reliability:
 
 
 def reliability(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10) -> Reliability:
-    """Measure the reliability of confidences.
-
-    Args:
-        confidence: Confidences of n estimates, in [0, 1].
-        correct: Which of the estimates were correct.
-        bins: Number of bins of equal count.
-    """
-    confidence, correct = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
+    """Measure the reliability of confidences, in [0, 1], in bins of equal count in order of confidence."""
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, bins)
     mean = np.array([confidence[part].mean() for part in parts])
     accuracy = np.array([correct[part].mean() for part in parts])
     count = np.array([len(part) for part in parts])
-    upper_half = order[len(order) // 2 :]
-    ends = [binomtest(int(correct[part].sum()), len(part)).proportion_ci(method="wilson") for part in parts]
-    interval = np.array([[end.low for end in ends], [end.high for end in ends]])
+    tests = [binomtest(int(correct[part].sum()), len(part)) for part in parts]
+    interval = np.transpose([test.proportion_ci(method="wilson") for test in tests])
     error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
-    upper = float(correct[upper_half].mean())
-    return Reliability(auroc(confidence, correct), error, upper, count, mean, accuracy, interval)
-
-
-def auroc(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
-    """Estimate the probability that a correct estimate has a higher confidence than a wrong one, ties counting half."""
-    correct = np.asarray(correct, dtype=bool)
-    positive, negative = np.asarray(confidence)[correct], np.asarray(confidence)[~correct]
-    if not len(positive) or not len(negative):
-        return float("nan")
-    return float(mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative)))
+    upper = float(correct[order[len(order) // 2 :]].mean())
+    right, wrong = confidence[correct], confidence[~correct]
+    pairs = len(right) * len(wrong)
+    auroc = float(mannwhitneyu(right, wrong).statistic / pairs) if pairs else float("nan")
+    return Reliability(auroc, error, upper, count, mean, accuracy, interval)

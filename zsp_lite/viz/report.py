@@ -41,57 +41,39 @@ _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark gr
 _COLOURED = "text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"
 
 
-def write_report(
-    path: str | Path,
-    results: Sequence[PairResult],
-    data: str,
-    data_note: str,
-    backbone: str,
-    photograph: Sequence[PhotographResult] = (),
-) -> Path:
-    """Write the page of the demo."""
-    path = Path(path)
-    page = render_page(results, backbone, path.parent, data, data_note, photograph=photograph)
-    write_atomic(path, page.encode(errors="replace"))
-    return path
-
-
-def write_pair_report(path: str | Path, result: PairResult) -> Path:
+def write_pair_report(path: Path, result: PairResult) -> Path:
     """Write the page of one pair of the user's own."""
-    path = Path(path)
     names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found by depth and colours"}
     note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
-    page = render_page([result], result.backbone, path.parent, data_note=note, own=True)
-    write_atomic(path, page.encode(errors="replace"))
-    return path
+    return write_report(path, [result], result.backbone, data_note=note, own=True)
 
 
-def write_category_report(path: str | Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
+def write_category_report(path: Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
     """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
-    names, style = list(alignment.objects), {"format": "jpg", "dpi": 150, "pil_kwargs": {"quality": 90}}
+    names = list(alignment.objects)
     parts = [names[start : start + category_sheet.MOST] for start in range(0, len(names), category_sheet.MOST)]
     figures = [category_sheet.contact_sheet(dataset, category, alignment, part) for part in parts]
-    sheets = [_encode(figure, **style) for figure in figures]
+    sheets = [_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures]
     text = _template("category.html").render(
         category=category, columns=category_sheet.COLUMNS, rows=category_sheet.object_rows(alignment),
         images=[f"data:image/jpeg;base64,{base64.b64encode(sheet).decode()}" for sheet in sheets],
         doubtful=category_sheet.doubtful(alignment),
     )  # fmt: skip
-    write_atomic(Path(path).with_name("objects.jpg"), sheets[0])
+    write_atomic(path.with_name("objects.jpg"), sheets[0])
     write_atomic(path, text.encode())
-    return Path(path)
+    return path
 
 
-def render_page(
+def write_report(
+    path: Path,
     results: Sequence[PairResult],
     backbone: str,
-    folder: Path = Path(),
     data: str = "",
     data_note: str = "",
-    own: bool = False,
     photograph: Sequence[PhotographResult] = (),
-) -> str:
-    """Return the page as text: of the demo, or of a pair of the user's `own`. Links are relative to `folder`."""
+    own: bool = False,
+) -> Path:
+    """Write the page of the demo, or of a pair of the user's `own`."""
     with plt.rc_context(dict.fromkeys(_COLOURED, _GREY)):
         pairs = [
             {
@@ -108,12 +90,14 @@ def render_page(
             for index, result in enumerate(results, 1)
         ]
         picture = _data_uri(photograph_figure(photograph)) if photograph else ""
-    return _template("report.html").render(
+    page = _template("report.html").render(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
-        own=own, labelled=any(result.errors for result in results) or not own, photograph=photograph,
-        photograph_columns=PHOTOGRAPH_COLUMNS, photograph_rows=photograph_rows(photograph),
-        photograph_picture=picture, link=lambda name: _notebook_link(name, folder),
+        own=own, photograph=photograph, photograph_columns=PHOTOGRAPH_COLUMNS,
+        photograph_rows=photograph_rows(photograph), photograph_picture=picture,
+        link=lambda name: _notebook_link(name, path.parent),
     )  # fmt: skip
+    write_atomic(path, page.encode(errors="replace"))
+    return path
 
 
 def _template(name: str) -> Template:
@@ -149,10 +133,9 @@ def legend(columns: Sequence[str] = COLUMNS) -> str:
     return "; ".join(f"{name}: {_MEANINGS[name]}" for name in columns if name in _MEANINGS) + "."
 
 
-def write_overview(path: str | Path, results: Sequence[PairResult]) -> Path:
+def write_overview(path: Path, results: Sequence[PairResult]) -> None:
     """Write the picture of `overview` as a JPEG."""
     write_atomic(path, _encode(overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}))
-    return Path(path)
 
 
 def overview(results: Sequence[PairResult]) -> Figure:
@@ -212,13 +195,10 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     # The clouds fill the scene. The eye is above the target camera, to its right.
     camera = {"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
     ground = {"paper_bgcolor": "rgba(0,0,0,0)", "font_color": _GREY, "legend_bgcolor": "rgba(0,0,0,0)"}
-    scene.update_layout(height=400, scene_camera=camera, **ground)
-    scene.update_layout({f"scene_{axis}axis": {"visible": False} for axis in "xyz"})
+    hidden = {f"scene_{axis}axis_visible": False for axis in "xyz"}
+    scene.update_layout(height=400, scene_camera=camera, **ground, **hidden)
     config = {"displaylogo": False, "responsive": True, "scrollZoom": False, "displayModeBar": False}
-    content = {
-        "points": np.round(cloud, 4).tolist(),
-        "poses": [move.matrix[:3].round(6).tolist() for move in moves],
-    }
+    content = {"points": cloud.round(4).tolist(), "poses": [move.matrix[:3].round(6).tolist() for move in moves]}
     plot = scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config)
     return Markup(_template("scene.html").render(names=list(poses), plot=Markup(plot), content=content))
 

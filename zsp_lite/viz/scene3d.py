@@ -6,8 +6,6 @@ from jaxtyping import Real
 
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-_AXIS_LABELS = "x (right)", "y (down)", "z (forward)"
-
 
 def aligned_clouds(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, "m 3"]) -> go.Figure:
     """Draw two point clouds in the target camera's frame, seen from near that camera: +x right, +y down, +z forward.
@@ -26,7 +24,7 @@ def aligned_clouds(reference: Real[np.ndarray, "n 3"], target: Real[np.ndarray, 
     middle, half = (low + high) / 2, 0.6 * float((high - low).max())
     axes = {
         f"{label[0]}axis": {"title": {"text": label}, "range": [float(x - half), float(x + half)], "nticks": 5}
-        for label, x in zip(_AXIS_LABELS, middle)
+        for label, x in zip(("x (right)", "y (down)", "z (forward)"), middle)
     }
     camera = {
         "up": {"x": 0, "y": -1, "z": 0},

@@ -177,7 +177,7 @@ function render({ model, el }) {
     held = null;
     if (!still) return sendView();
     const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
-    model.send({ kind: "click", at, view, reach: 9 / unit });
+    model.send({ at, view, reach: 9 / unit });
   });
   canvas.addEventListener("pointercancel", () => (held = null));
   canvas.addEventListener("dblclick", (event) => event.preventDefault());

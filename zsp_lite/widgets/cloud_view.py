@@ -4,19 +4,18 @@ The browser draws the points and sends clicks (`cloud_view.js`). Python finds th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Real, UInt8
+from scipy.spatial import KDTree
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.errors import InputError
+from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.common import load_package
-
-if TYPE_CHECKING:
-    from anywidget import AnyWidget
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
 _DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
@@ -27,39 +26,24 @@ _STYLE = """
 """
 
 
-@dataclass(frozen=True, eq=False)
-class ViewBox:
-    """Map from world to view units: the ball of `radius` around `centre` becomes the unit ball."""
+def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
+    """Return the similarity from the world to view units: the ball around a cloud becomes the unit ball.
 
-    centre: Float[np.ndarray, "3"]
-    radius: float
-
-    @classmethod
-    def around(cls, points: Real[np.ndarray, "n 3"]) -> "ViewBox":
-        """Return the ball of a cloud, from the 1st to the 99th percentile along each axis, robust to outliers."""
-        low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
-        radius = float(np.linalg.norm(high - low)) / 2
-        if not radius >= 1e-12:  # not, because of NaN
-            raise InputError(f"point cloud of {len(points)} points has no extent, expected an object of finite points")
-        return cls((low + high) / 2, radius)
-
-    def to_view(self, points: Real[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Map world points to view units."""
-        return (np.asarray(points, dtype=np.float64) - self.centre) / self.radius
+    The ball is from the 1st to the 99th percentile along each axis, robust to outliers.
+    """
+    low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
+    radius = float(np.linalg.norm(high - low)) / 2
+    if not radius >= 1e-12:  # not, because of NaN
+        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object of finite points")
+    return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points, neighbours after each other.
-
-    The slider of the labelling widget goes through them in this order, along the Morton (Z-order) curve.
-    """
+    """Return the indices of at most `most` points, neighbours after each other, as the slider goes through them."""
     kept = np.arange(len(points))
     if len(points) > most:
         kept = np.random.default_rng(0).choice(len(points), most, replace=False)
-    low, high = points[kept].min(axis=0), points[kept].max(axis=0)
-    cell = ((points[kept] - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
-    code = sum(((cell[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
-    return kept[np.lexsort((kept, code))]
+    return kept[KDTree(points[kept]).indices]  # leaf by leaf
 
 
 def point_under(
@@ -82,36 +66,38 @@ def point_under(
 class CloudView:
     """A canvas with one point cloud; `widget` is its Jupyter widget."""
 
-    def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any], side: int = 400):
-        """Create an empty canvas with the CSS class `name`; a click calls `on_pick` with the world point, or None."""
-        self.widget = _cloud_widget()(side=side)
-        self.widget.add_class(name)
-        self.widget.on_msg(self._receive)
+    def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any]):
+        """Create an empty canvas, of class zsp-cloud-NAME; a click calls `on_pick` with the world point, or None."""
+        self.widget = _cloud_widget()()
+        self.widget.add_class(f"zsp-cloud-{name}")
+        self.widget.on_msg(self._clicked)
         self.on_pick = on_pick
-        self._cloud = self._in_view = np.zeros((0, 3))
-        self._box: ViewBox | None = None
+        self._cloud = np.zeros((0, 3))
+        self._to_view: Sim3 | None = None  # None while the canvas is empty
 
     def show(
-        self, points: Real[np.ndarray, "n 3"], colours: UInt8[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"] | None,
-        alt: str, overlay: tuple[Real[np.ndarray, "m 3"], tuple[int, int, int], tuple[int, int, int]] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        points: Real[np.ndarray, "n 3"],
+        colours: UInt8[np.ndarray, "n 3"],
+        view: Real[np.ndarray, "3 3"] | None,
+        alt: str,
+        overlay: Real[np.ndarray, "m 3"] | None = None,
+    ) -> None:
         """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps the present one).
 
-        An `overlay` has the points of a second cloud (crosses), its colour, and that of the first one (discs).
+        With an `overlay`, the points of a second cloud, the first is orange discs, the second blue crosses.
         """
-        self._box = box = ViewBox.around(points)
-        self._cloud, self._in_view = np.asarray(points, dtype=np.float64), box.to_view(points)
+        self._cloud, self._to_view = np.asarray(points, dtype=np.float64), view_units(points)
         kept = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
-        drawn, drawn_colours = self._in_view[kept], colours[kept]
-        crosses = np.zeros(len(kept), np.uint8)
+        drawn, colours, crosses = points[kept], colours[kept], np.zeros(len(kept), np.uint8)
         if overlay is not None:
-            other = box.to_view(overlay[0])[subsample(overlay[0], MAX_POINTS // 2)]
-            drawn_colours = np.repeat(np.array([overlay[2], overlay[1]], np.uint8), [len(kept), len(other)], axis=0)
-            drawn, crosses = np.concatenate([drawn, other]), np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
+            other = overlay[subsample(overlay, MAX_POINTS // 2)]
+            crosses = np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
+            two = np.array([list(bytes.fromhex(colour[1:])) for colour in (ORANGE, BLUE)], np.uint8)
+            drawn, colours = np.concatenate([drawn, other]), two[crosses]
         with self.widget.hold_sync():
-            self.widget.points = drawn.astype(np.float32).tobytes()
-            self.widget.colours = np.ascontiguousarray(drawn_colours, dtype=np.uint8).tobytes()
-            self.widget.crosses = crosses.tobytes()
+            self.widget.points = self._to_view.apply(drawn).astype(np.float32).tobytes()
+            self.widget.colours, self.widget.crosses = colours.tobytes(), crosses.tobytes()
             self.widget.alt = alt
             if view is not None:
                 self.widget.view = np.asarray(view, dtype=np.float64).ravel().tolist()
@@ -119,29 +105,28 @@ class CloudView:
 
     def clear(self, alt: str) -> None:
         """Show an empty canvas; `alt` gives the reason."""
-        self._box, self._cloud, self._in_view = None, np.zeros((0, 3)), np.zeros((0, 3))
+        self._to_view = None
         with self.widget.hold_sync():
             self.widget.points = self.widget.colours = self.widget.crosses = b""
             self.widget.marks, self.widget.cursor, self.widget.alt = [], [], alt
 
     def mark(self, points: Real[np.ndarray, "k 3"]) -> None:
         """Draw the numbers 1, 2, ... beside world points."""
-        if self._box is not None:
-            self.widget.marks = self._box.to_view(points).tolist()
+        self.widget.marks = self._to_view.apply(points).tolist()
 
     def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
         """Draw a cross-hair at a world point; None removes it."""
-        self.widget.cursor = [] if point is None or self._box is None else self._box.to_view(point).tolist()
+        self.widget.cursor = [] if point is None or self._to_view is None else self._to_view.apply(point).tolist()
 
-    def _receive(self, _, content: dict, buffers: list) -> None:
-        if content.get("kind") == "click" and self._box is not None:
+    def _clicked(self, _, content: dict, buffers: list) -> None:
+        if self._to_view is not None:
             view, at = np.array(content["view"]).reshape(3, 3), np.array(content["at"])
-            found = point_under(self._in_view, view, at, content["reach"])
+            found = point_under(self._to_view.apply(self._cloud), view, at, content["reach"])
             self.on_pick(None if found is None else self._cloud[found])
 
 
 @cache
-def _cloud_widget() -> "type[AnyWidget]":
+def _cloud_widget() -> type:
     anywidget = load_package("anywidget")
     from traitlets import Bytes, Float, Int, List, Unicode
 

@@ -17,7 +17,7 @@ How to write a widget:
 import importlib
 from collections.abc import Callable, Mapping
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import matplotlib.pyplot as plt
@@ -28,11 +28,7 @@ from matplotlib.figure import Figure
 
 from zsp_lite.errors import InputError
 
-if TYPE_CHECKING:
-    from ipywidgets import ValueWidget
-
-Widget = Any  # an ipywidgets.VBox; the package is imported when a widget is made
-MAX_HEIGHT = "420px"  # of a picture
+Widget = Any  # of ipywidgets, which is imported when a widget is made
 _LABEL = {"description_width": "initial"}
 
 
@@ -44,7 +40,7 @@ def load_package(name: str = "ipywidgets") -> Any:
         raise InputError(f"this widget needs {name}, which is not installed; pip install {name}") from error
 
 
-def slider(label: str, low: float, high: float, value: float, step: float = 1) -> "ValueWidget":
+def slider(label: str, low: float, high: float, value: float, step: float = 1) -> Widget:
     """Return a slider from `low` to `high`, with integer values if all four numbers are integers."""
     widgets = load_package()
     integer = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
@@ -53,22 +49,14 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     return kind(value, min=low, max=high, step=step, description=label, style=_LABEL, layout={"width": "22em"}, **form)
 
 
-def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, "ValueWidget"]:
+def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:
     """Return sliders over the rows and columns of a patch grid, counted from 0, that begin at a patch."""
     names = (("row", f"row{of}"), ("col", f"column{of}"))
     return {name: slider(label, 0, cells - 1, at) for (name, label), cells, at in zip(names, grid, start)}
 
 
-def choice(label: str, options: list[str], value: str | None = None) -> "ValueWidget":
-    """Return a menu; the initial value is the first option by default."""
-    widgets = load_package()
-    return widgets.Dropdown(options=options, value=value or options[0], description=label, style=_LABEL)
-
-
-def interactive_figure(
-    figure: Figure, controls: Mapping[str, "ValueWidget"], update: Callable[..., str], alt: str
-) -> Widget:
-    """Return a widget of controls above a figure above a caption, which are its attributes, as is `redraw()`.
+def interactive_figure(figure: Figure, controls: Mapping[str, Widget], update: Callable[..., str], alt: str) -> Widget:
+    """Return a widget of controls above a picture of a figure above a caption, which are its attributes.
 
     `update` is called with the values of the `controls`, which have the names of its arguments; it changes the figure
     and returns the caption. `alt` describes the figure for screen readers, whatever the controls are.
@@ -77,28 +65,28 @@ def interactive_figure(
     plt.close(figure)  # otherwise the notebook shows it a second time
     canvas = FigureCanvasAgg(figure)
     # Not stretched in wide windows, and low enough for the controls to stay in sight on a screen of 800 pixels.
-    size = {"max_width": "100%", "max_height": MAX_HEIGHT, "align_self": "flex-start", "object_fit": "contain"}
+    size = {"max_width": "100%", "max_height": "420px", "align_self": "flex-start", "object_fit": "contain"}
     picture = widgets.Image(format="png", layout=size)
     # Image widgets have no alternative text, and JupyterLab fails on images with a tooltip.
     described = widgets.HTML(f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>')
     caption = widgets.HTML()
-    # The layout is computed once and then fixed, so that the figure does not move between updates.
-    update(**{name: control.value for name, control in controls.items()})
-    for _ in range(2):  # the layout of images with colour bars is exact only after the second pass
-        canvas.draw()
-    figure.set_layout_engine("none")
 
     def redraw(change=None) -> None:
-        text = update(**{name: control.value for name, control in controls.items()})
-        picture.value = png(figure)
-        caption.value = text
+        caption.value = update(**{name: control.value for name, control in controls.items()})
+        canvas.draw()
+        pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
+        picture.value = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
     for control in controls.values():
         control.observe(redraw, names="value")
+    # The layout is computed once and then fixed, so that the figure does not move between updates. That of images with
+    # colour bars is exact only after the second pass.
     redraw()
+    redraw()
+    figure.set_layout_engine("none")
     row = widgets.HBox(list(controls.values()), layout={"flex_flow": "row wrap"})
     box = widgets.VBox([row, described, picture, caption])
-    box.redraw, box.controls, box.figure, box.picture, box.caption = redraw, dict(controls), figure, picture, caption
+    box.controls, box.picture, box.caption = controls, picture, caption
     return box
 
 
@@ -112,14 +100,6 @@ def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
         drawn.extend(draw(*values, **named))
 
     return redraw
-
-
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG with the fastest compression."""
-    canvas = figure.canvas
-    canvas.draw()
-    pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
-    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 def show(figure: Figure, alt: str) -> None:

@@ -17,7 +17,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import Widget, choice, interactive_figure, patch_sliders, redrawing, slider
+from zsp_lite.widgets.common import Widget, interactive_figure, load_package, patch_sliders, redrawing, slider
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -47,9 +47,8 @@ def attention(
     layers, _, dim = queries.shape
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
     outline = redrawing(plots.outline_patch)
-    weights = plots.overlay_map(
-        axes[1], np.zeros(grid), alpha=0.8, limits=(0, 1), label="weight relative to the largest"
-    )
+    label = "weight relative to the largest"
+    weights = plots.overlay_map(axes[1], np.zeros(grid), alpha=0.8, limits=(0, 1), label=label)
     figure.set_figheight(4)  # space for the colour bar
     axes[0].set_anchor("N")
 
@@ -70,9 +69,8 @@ def attention(
         **patch_sliders(grid, (grid[0] // 2, grid[1] // 2)),
         "layer": slider("layer", 0, layers - 1, layers * 3 // 4), "head": slider("head", 0, heads - 1, 0),
     }  # fmt: skip
-    return interactive_figure(
-        figure, controls, update, "An image with one patch outlined, and the attention weights of that patch."
-    )
+    alt = "An image with one patch outlined, and the attention weights of that patch."
+    return interactive_figure(figure, controls, update, alt)
 
 
 def similarities(
@@ -122,7 +120,8 @@ def similarities(
 
     known = np.argwhere(valid)
     middle = tuple(known[np.abs(known - np.median(known, axis=0)).sum(axis=1).argmin()].tolist())
-    controls = {**patch_sliders(grid, middle), "kind": choice("similarity", list(sims), start)}
+    kinds = load_package().Dropdown(options=list(sims), value=start or next(iter(sims)), description="similarity")
+    controls = {**patch_sliders(grid, middle), "kind": kinds}
     alt = "A patch of the reference; its similarities, nearest neighbour and true match in the target."
     return interactive_figure(figure, controls, update, alt)
 
@@ -133,9 +132,8 @@ def saliency(view: View) -> Widget:
     truth = patch_mask(view.frame, grid)
     thresholds = np.linspace(0, 1, 101)
     overlaps = [mask_iou(torch.from_numpy(values > threshold), truth) for threshold in thresholds]
-    figure, axes = plots.show_images(
-        [view.frame.rgb, view.frame.rgb], ["foreground", "overlap with the mask"], size=3.2
-    )
+    titles = ["foreground", "overlap with the mask"]
+    figure, axes = plots.show_images([view.frame.rgb, view.frame.rgb], titles, size=3.2)
     shown = plots.overlay_map(axes[0], np.zeros(grid), limits=(0, 1), label="saliency")
     figure.set_figheight(4)  # space for the colour bar
     axes[1].clear()
@@ -157,6 +155,5 @@ def saliency(view: View) -> Widget:
         )
 
     controls = {"threshold": slider("threshold", 0.0, 1.0, 0.05, 0.01)}
-    return interactive_figure(
-        figure, controls, update, "Patches above the threshold, and a curve of IoU against the threshold."
-    )
+    alt = "Patches above the threshold, and a curve of IoU against the threshold."
+    return interactive_figure(figure, controls, update, alt)

@@ -1,21 +1,16 @@
 """Widget on masks: a bounding box and the mask that GrabCut segments in it."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from zsp_lite.data.frames import ON_OBJECT
+from zsp_lite.data.cameras import Box
+from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
 from zsp_lite.widgets.common import Widget, interactive_figure, slider
 
-if TYPE_CHECKING:
-    from zsp_lite.data.cameras import Box
-    from zsp_lite.data.frames import Frame
 
-
-def box_to_mask(frame: "Frame", box: "Box") -> Widget:
+def box_to_mask(frame: Frame, box: Box) -> Widget:
     """Show the mask that GrabCut segments in a box (top, left, height, width), and its overlap with the frame's."""
     height, width = frame.camera.size
     top, left, box_height, box_width = box

@@ -19,9 +19,7 @@ _COLOURS = {
     "--jq-incorrect-color": "#C24E00",
     "--jq-numeric-input-label": "currentColor",
 }
-_FIELDS = """<style>
-input.Input-text, input.Input-text:focus { border: 1px solid #555555; background: white; color: #222222; }
-</style>"""
+_FIELDS = "input.Input-text, input.Input-text:focus { border: 1px solid #555; background: white; color: #222; }"
 
 
 def read_questions(notebook: str) -> list[list[dict]]:
@@ -41,8 +39,8 @@ def self_check(notebook: str, number: int) -> None:
         raise InputError("self_check was called outside IPython, expected a notebook, which can show the questions")
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
-    form, script = (output.data for output in captured.outputs)
-    ipython.display.display(ipython.display.HTML(form["text/html"] + _FIELDS + "</div>"))  # jupyterquiz leaves it open
+    form, script = (output.data for output in captured.outputs)  # the form is a <div> that jupyterquiz leaves open
+    ipython.display.display(ipython.display.HTML(form["text/html"] + f"<style>{_FIELDS}</style></div>"))
     # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from the script.
     hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
     ipython.display.display(ipython.display.Javascript(hidden))
