@@ -27,12 +27,10 @@ class PretrainedWeights:
 
     @property
     def url(self) -> str:
-        """Address of the file."""
         return os.environ.get("ZSP_LITE_DINO_URL", DINO_URL).rstrip("/") + "/" + self.file
 
     @property
     def path(self) -> Path:
-        """Path of the downloaded file."""
         return cache_folder() / Path(self.file).name
 
 
@@ -56,31 +54,29 @@ def obtained_by(name: str) -> str:
 
 
 def download(name: str) -> Path:
-    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is not there yet."""
+    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is not there yet.
+
+    InputError if the file is not the embedded or released one.
+    """
     if name.startswith(PREFIX):
         return model_folder(name)
     if name == DEFAULT:
+        check_shipped(TINY)
         return TINY
     check_choice("backbone", name, available_backbones())
     weights = PRETRAINED[name]
     try:
-        return fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=MOST_BYTES)
+        path = fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=MOST_BYTES)
     except InputError as error:
         raise InputError(
             f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use {DEFAULT}"
         ) from error
-
-
-def check_authentic(name: str, path: Path) -> None:
-    """Raise InputError if the file of a backbone of this name is not the embedded or released one."""
-    if name == DEFAULT:
-        return check_shipped(path)
-    weights = PRETRAINED[name]
     if not has_size_and_hash(path, weights.size, weights.md5_prefix):
         raise InputError(
             f"{name}: {path} is not the released file, expected {weights.size or 'any number of'} bytes with MD5 "
             f"{weights.md5_prefix}...; remove it, then run zsp-lite weights fetch {name}"
         )
+    return path
 
 
 def check_shipped(path: Path) -> None:

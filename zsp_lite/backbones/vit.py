@@ -5,7 +5,7 @@ the last block's CLS token as saliency, and the CLS output token as global featu
 """
 
 import math
-from collections.abc import Iterator
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import torch
@@ -29,9 +29,7 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 class Tokens:
     """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    keys: Float[
-        Tensor, "batch n dim"
-    ]  # patch descriptors: the keys of one block (or another facet), heads concatenated
+    keys: Float[Tensor, "batch n dim"]  # descriptors: the keys (or another facet) of one block, heads concatenated
     attention: Float[Tensor, "batch heads n"]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
@@ -86,18 +84,6 @@ class Attention(nn.Module):
         return ((q * self.scale) @ k.transpose(-1, -2))[:, :, 0]
 
 
-class Mlp(nn.Module):
-    """Two linear layers with a GELU between them."""
-
-    def __init__(self, dim: int, hidden: int):
-        super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
-
-    def forward(self, x: Float[Tensor, "batch n dim"]) -> Float[Tensor, "batch n dim"]:
-        return self.fc2(F.gelu(self.fc1(x)))
-
-
 class Block(nn.Module):
     """Pre-norm transformer block."""
 
@@ -106,7 +92,8 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(dim, eps=1e-6)
         self.attn = Attention(dim, heads)
         self.norm2 = nn.LayerNorm(dim, eps=1e-6)
-        self.mlp = Mlp(dim, 4 * dim)
+        layers = {"fc1": nn.Linear(dim, 4 * dim), "gelu": nn.GELU(), "fc2": nn.Linear(4 * dim, dim)}
+        self.mlp = nn.Sequential(OrderedDict(layers))
 
     def finish(
         self, x: Float[Tensor, "batch n dim"], attended: Float[Tensor, "batch n dim"]
@@ -195,16 +182,9 @@ class VisionTransformer(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch tokens dim"]:
         """Return the normalised output tokens, CLS first."""
         x, _ = self.embed(images)
-        for activations in self.run_blocks(x):
-            pass
-        return self.norm(activations.token)
-
-    def run_blocks(self, x: Float[Tensor, "batch tokens dim"], count: int | None = None) -> Iterator[BlockActivations]:
-        """Run the first `count` blocks (default: all) one after the other and yield the activations of each."""
-        for block in self.blocks[:count]:
-            activations = block(x)
-            x = activations.token
-            yield activations
+        for block in self.blocks:
+            x = block(x).token
+        return self.norm(x)
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
         """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS output token.
@@ -212,11 +192,12 @@ class VisionTransformer(nn.Module):
         The images are normalised; their height and width are multiples of the patch size.
         """
         x, grid = self.embed(images)
-        for index, activations in enumerate(self.run_blocks(x, self.depth - 1)):
+        *others, block = self.blocks
+        for index, other in enumerate(others):
+            activations = other(x)
             x = activations.token
             if index == layer:
                 descriptors = getattr(activations, facet)
-        block = self.blocks[-1]
         if facet == "key":  # no other activation of the patches is needed in the last block
             cls, last_descriptors, logits = block.forward_cls(x)
         else:
@@ -230,7 +211,10 @@ class VisionTransformer(nn.Module):
     def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
         x, _ = self.embed(images)
-        activations = list(self.run_blocks(x))
+        activations = []
+        for block in self.blocks:
+            activations.append(block(x))
+            x = activations[-1].token
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
         return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits)
