@@ -96,8 +96,7 @@ def nearest_rotation(
 ) -> tuple[Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
     """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
 
-    Returns the rotations, the singular values of the covariances (sums of target @ source^T over corresponding centred
-    points), and signs: -1 where a reflection would fit better.
+    Returns the rotations, the covariances' singular values, and signs: -1 where a reflection would fit better.
     """
     left, singular, right = np.linalg.svd(covariance)
     rotation = left @ right
@@ -167,8 +166,6 @@ def ransac(
     check_number("ransac: threshold", threshold, above=0)
     if not isinstance(seed, np.random.Generator):
         check_integer("ransac: seed", seed, 0)
-    if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
-        raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])

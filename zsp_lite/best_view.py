@@ -21,8 +21,7 @@ class ViewMatch:
 
     reference: View
     target: View
-    # cosines between the descriptors of the reference's patches and the target's
-    similarity: Float[torch.Tensor, "reference target"]
+    similarity: Float[torch.Tensor, "reference target"]  # cosines between the descriptors of their patches
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 

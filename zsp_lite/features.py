@@ -41,10 +41,7 @@ class FeatureMap:
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape
-        return (
-            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, keys of {channels} "
-            f"channels, global feature of {len(self.global_feature)}, {self.keys.device})"
-        )
+        return f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, {channels} channels)"
 
     @property
     def grid(self) -> Grid:

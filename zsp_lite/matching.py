@@ -65,8 +65,7 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     for keys2 in map(_keys, targets):
         products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
         summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
-        cosine = summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
-        results.append(cosine)
+        results.append(summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2)))
     return results
 
 

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.backbones.pretrained import DEFAULT
+from zsp_lite.backbones.load import DEFAULT, BackboneConfig, load_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span

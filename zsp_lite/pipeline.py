@@ -21,7 +21,7 @@ from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match
 from zsp_lite.matching import similarities as cosine_similarities
 from zsp_lite.points import standard_deviation
-from zsp_lite.views import View, crop_size, extract_views, object_crop, usable_targets
+from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVER_CLASSES = {"verified": "zsp_lite.verified:VerifiedSolver"}
@@ -115,14 +115,11 @@ class ZeroShotPose:
 
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
-        size = crop_size(self.backbone)
+        size = getattr(self.backbone, "image_size", IMAGE_SIZE)
         return extract_views(self.backbone, [object_crop(frame, size) for frame in frames], self.foreground)
 
     def match_views(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
+        self, reference: View, targets: Sequence[View], similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 

@@ -29,12 +29,9 @@ class View:
     # probability of each pixel of being on the object, in [0, 1]
     soft_mask: Float[np.ndarray, "height width"] = field(repr=False)
 
-    @cached_property
+    @cached_property  # of N target views the paper's solver needs only those of the chosen one
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`).
-
-        Computed on first use: of N target views the paper's solver needs only those of the chosen one.
-        """
+        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`)."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
 
     @cached_property
@@ -46,11 +43,6 @@ class View:
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
         """Foreground patches with measured depth."""
         return np.asarray(self.foreground.cpu()) & self.measured_points[1]
-
-
-def crop_size(backbone: FeatureExtractor | None) -> int:
-    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one."""
-    return getattr(backbone, "image_size", IMAGE_SIZE)
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:

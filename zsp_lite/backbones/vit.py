@@ -50,10 +50,10 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    query: Float[Tensor, "batch tokens dim"]  # like key and value a linear function of `normed`, heads concatenated
+    query: Float[Tensor, "batch outputs dim"]  # like key and value a linear function of `normed`, heads concatenated
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
-    token: Float[Tensor, "batch tokens dim"]  # output of the block, not normalised
+    token: Float[Tensor, "batch outputs dim"]  # output of the block, not normalised
 
 
 class Attention(nn.Module):
@@ -95,26 +95,17 @@ class Block(nn.Module):
         layers = {"fc1": nn.Linear(dim, 4 * dim), "gelu": nn.GELU(), "fc2": nn.Linear(4 * dim, dim)}
         self.mlp = nn.Sequential(OrderedDict(layers))
 
-    def finish(
-        self, x: Float[Tensor, "batch n dim"], attended: Float[Tensor, "batch n dim"]
-    ) -> Float[Tensor, "batch n dim"]:
-        """Add the attention output to the residual stream, then the MLP's output."""
-        x = x + attended
-        return x + self.mlp(self.norm2(x))
-
-    def forward(self, x: Float[Tensor, "batch n dim"]) -> BlockActivations:
+    def forward(self, x: Float[Tensor, "batch n dim"], outputs: int | None = None) -> BlockActivations:
+        """Compute the activations; queries and output, which take most of the time, of the first `outputs` tokens."""
         normed = self.norm1(x)
-        q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
-        return BlockActivations(normed, q, k, v, self.finish(x, self.attn(q, k, v)))
-
-    def forward_cls(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the output for the CLS token only, all keys (batch, n, dim) and the CLS token's attention logits."""
-        dim = x.shape[-1]
-        weight, bias = self.attn.qkv.weight, self.attn.qkv.bias
-        normed = self.norm1(x)
-        q = F.linear(normed[:, :1], weight[:dim], bias[:dim])
-        k, v = F.linear(normed, weight[dim:], bias[dim:]).chunk(2, dim=-1)
-        return self.finish(x[:, :1], self.attn(q, k, v)), k, self.attn.cls_logits(q, k)
+        if outputs is None:
+            q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
+        else:
+            dim, weight, bias = x.shape[-1], self.attn.qkv.weight, self.attn.qkv.bias
+            q = F.linear(normed[:, :outputs], weight[:dim], bias[:dim])
+            k, v = F.linear(normed, weight[dim:], bias[dim:]).chunk(2, dim=-1)
+        attended = x[:, :outputs] + self.attn(q, k, v)
+        return BlockActivations(normed, q, k, v, attended + self.mlp(self.norm2(attended)))
 
 
 class PatchEmbed(nn.Module):
@@ -187,26 +178,16 @@ class VisionTransformer(nn.Module):
         return self.norm(x)
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
-        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS output token.
-
-        The images are normalised; their height and width are multiples of the patch size.
-        """
+        """Compute the descriptors of one block (counted from 0), CLS attention and CLS output of normalised images."""
         x, grid = self.embed(images)
-        *others, block = self.blocks
-        for index, other in enumerate(others):
-            activations = other(x)
+        for index, block in enumerate(self.blocks):
+            # In the last block the method needs the keys of all tokens, but the query and the output of CLS only.
+            activations = block(x, 1 if index == self.depth - 1 and facet == "key" else None)
             x = activations.token
             if index == layer:
                 descriptors = getattr(activations, facet)
-        if facet == "key":  # no other activation of the patches is needed in the last block
-            cls, last_descriptors, logits = block.forward_cls(x)
-        else:
-            activations = block(x)
-            cls, last_descriptors = activations.token[:, :1], getattr(activations, facet)
-            logits = block.attn.cls_logits(activations.query, activations.key)
-        if layer == self.depth - 1:
-            descriptors = last_descriptors
-        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
+        logits = block.attn.cls_logits(activations.query, activations.key)
+        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(x[:, :1])[:, 0], grid)
 
     def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""

@@ -18,7 +18,7 @@ from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
-from zsp_lite.io.open3d import load_open3d
+from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, object_points
 
 READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
