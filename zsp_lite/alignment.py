@@ -166,6 +166,8 @@ def ransac(
     check_number("ransac: threshold", threshold, above=0)
     if not isinstance(seed, np.random.Generator):
         check_integer("ransac: seed", seed, 0)
+    if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
+        raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
