@@ -16,7 +16,7 @@ from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_ca
 from tools.same_shape import CATALOGUE, copy_same_shape
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
-from zsp_lite.backbones.pretrained import WEIGHTS
+from zsp_lite.backbones.load import WEIGHTS
 from zsp_lite.errors import InputError
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.synthetic.categories import CATEGORIES

@@ -30,7 +30,7 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
 def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
-    monkeypatch.setattr("zsp_lite.backbones.pretrained.available_backbones", lambda: {"zsp-tiny": None})
+    monkeypatch.setattr("zsp_lite.backbones.load.available_backbones", lambda: {"zsp-tiny": None})
     assert main(["doctor"]) == 1
     python, torch, tiny, reinstall, cache, choose, last = capsys.readouterr().out.splitlines()
     assert python.startswith("ok    Python ") and torch.startswith("ok    torch ")
@@ -46,6 +46,6 @@ def test_the_doctor_passes_here(capsys):
 def test_open3d_prints_nothing_in_a_notebook():
     """Open3D detects IPython's shell by the name of its class, and would start a web server."""
     notebook = "import builtins; builtins.get_ipython = type('ZMQInteractiveShell', (), {})\n"
-    code = notebook + "from zsp_lite.io.open3d import load_open3d; load_open3d()"
+    code = notebook + "from zsp_lite.io.ply import load_open3d; load_open3d()"
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert finished.stdout == ""

@@ -15,8 +15,7 @@ from transformers import AutoModel
 
 from zsp_lite import load_backbone
 from zsp_lite.backbones.backbone import prepare_images
-from zsp_lite.backbones.load import verify
-from zsp_lite.backbones.pretrained import download
+from zsp_lite.backbones.load import download, verify
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
 from zsp_lite.errors import InputError

@@ -134,7 +134,7 @@ def test_paths_that_are_no_source_are_refused(tmp_path, ellipsoids, frames):
     for path, message in (
         (tmp_path / "nowhere", "nowhere does not exist, expected a JPEG or PNG file, CATEGORY/SEQUENCE"),
         (tmp_path / "notes.txt", "notes.txt has another format, expected"),
-        (ellipsoids.root / "ellipsoid", "is a category, expected .* CATEGORY/SEQUENCE"),
+        (ellipsoids.root / "ellipsoid", "has another format, expected .* CATEGORY/SEQUENCE"),
         (ellipsoids.root / "ellipsoid/c", "does not exist"),
         (tmp_path, r"transforms.json \(nerfstudio\) or poses.txt \(lists\)"),
     ):

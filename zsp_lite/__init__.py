@@ -20,13 +20,8 @@ Read the files in this order:
     own_objects  one pair of your own, from files to files
     category     all objects of a category in one frame, by the verified solver
 
-    data         CO3D folders, frames, cameras, depth, labels, pairs
-    backbones    vision transformers and how to load them
-    viz          plots, 3D scenes, the HTML report
-    io           files, downloads, PLY, Open3D
+    data, backbones, viz, io, benchmark, baselines, labelling, importers, synthetic, training, widgets, cli
     verified     a solver beyond the paper that tests many poses in all target views
-    benchmark    the paper's tables
-    baselines, labelling, importers, synthetic, training, widgets, cli
 """
 
 import ast

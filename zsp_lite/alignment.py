@@ -23,17 +23,11 @@ MOST_TRIALS = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class Sim3:
-    """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera points.
+    """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera points."""
 
-    Attributes:
-        scale: Positive, unitless.
-        R: (3, 3) rotation matrix.
-        t: (3,) translation, in units of the target's scene.
-    """
-
-    scale: float
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, "3"]
+    scale: float  # positive, unitless
+    R: Float[np.ndarray, "3 3"]  # rotation
+    t: Float[np.ndarray, "3"]  # translation, in units of the target's scene
 
     def __post_init__(self):
         rotation, translation = real_array("Sim3: R", self.R, (3, 3)), real_array("Sim3: t", self.t, (3,))
@@ -102,8 +96,7 @@ def nearest_rotation(
 ) -> tuple[Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
     """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
 
-    Returns the rotations, the singular values of the covariances (sums of target @ source^T over corresponding centred
-    points), and signs: -1 where a reflection would fit better.
+    Returns the rotations, the covariances' singular values, and signs: -1 where a reflection would fit better.
     """
     left, singular, right = np.linalg.svd(covariance)
     rotation = left @ right

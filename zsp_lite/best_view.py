@@ -1,8 +1,4 @@
-"""Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3).
-
-Each score is a function of features or matches. The entries of `VIEW_SELECTORS` have one argument, a `ViewMatch`. The
-view of highest score is selected.
-"""
+"""Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -18,18 +14,14 @@ from zsp_lite.views import View
 
 Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
-# Distance of a missing match: that of orthogonal descriptors.
-_ORTHOGONAL = 2**0.5
-
 
 @dataclass(frozen=True, eq=False)
 class ViewMatch:
     """The reference and one target view, with their matches: the input of a view selector."""
 
-    reference: View  # the reference
-    target: View  # the target view
-    # cosines between the descriptors of the reference's patches and the target's
-    similarity: Float[torch.Tensor, "reference target"]
+    reference: View
+    target: View
+    similarity: Float[torch.Tensor, "reference target"]  # cosines between the descriptors of their patches
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 
@@ -63,7 +55,7 @@ def correspondence_score(matches: Matches, k: int) -> float:
 def score_from_cosines(cosines: Float[torch.Tensor, " n"], k: int) -> float:
     """Compute `correspondence_score` from the cosines of at most k matches."""
     distances = (2 - 2 * cosines).clamp_min(0).sqrt()
-    return -float(distances.sum()) - max(k - len(cosines), 0) * _ORTHOGONAL
+    return -float(distances.sum()) - max(k - len(cosines), 0) * 2**0.5
 
 
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:

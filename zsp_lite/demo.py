@@ -1,11 +1,10 @@
 """The pairs of `zsp-lite demo`: one of each category, with its pose error."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult, label_errors
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
@@ -43,16 +42,13 @@ def run_demo(dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] =
 
 
 def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None) -> PairResult:
-    """Estimate the pose of a pair by each solver, by default the method's own, and its error by the pose labels."""
+    """Estimate the pose of a pair by each solver, by default the method's own, and its error if it has labels."""
     reference, targets = dataset.load_pair(pair)
     estimates = solve_pair(method, reference, targets, solvers)
-    labels, sequences = read_labels(dataset.root, pair.category), (pair.reference_sequence, pair.target_sequence)
-    if missing := [name for name in sequences if name not in labels]:
-        raise InputError(f"{pair.category}/{missing[0]}: no pose label, expected one to compare the estimate with")
-    errors = label_errors(estimates, [labels[name] for name in sequences], reference, targets)
     sources = (
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
     )
-    name = getattr(method.backbone, "name", "")
-    return PairResult(pair.category, sources, reference, tuple(targets), estimates, errors, pair, backbone=name)
+    name, sequences = getattr(method.backbone, "name", ""), (pair.reference_sequence, pair.target_sequence)
+    found = PairResult(pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name)
+    return replace(found, errors=label_errors(found, dataset.root / pair.category, sequences))

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-MAX_LENGTH = 1e9  # largest coordinate, in any unit of length or in pixels
+# Largest coordinate, in any unit of length or in pixels. Beyond 1e150 squares overflow, and LAPACK may never return.
+MAX_LENGTH = 1e9
 _LONGEST = 1000  # characters of a message
 
 
@@ -26,10 +27,7 @@ class InputError(ValueError):
 
 
 class FatalError(InputError):
-    """An InputError that ends a benchmark run, because it concerns the backbone or the code of a row.
-
-    Any other InputError of a row counts the pair as failed.
-    """
+    """An InputError of the backbone or a row's code, which ends a benchmark run; others count the pair as failed."""
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:
@@ -46,10 +44,7 @@ def check_number(name: str, value: object, above: float) -> None:
 
 
 def check_magnitude(name: str, values: object) -> None:
-    """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in magnitude.
-
-    Beyond about 1e150, squares overflow and LAPACK's SVD may never return.
-    """
+    """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in magnitude."""
     import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
 
     sizes = np.abs(values)

@@ -1,13 +1,15 @@
 """Pose estimates, of one solver and of a pair, and the protocol of the solvers that compute them from matched views."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
@@ -15,10 +17,11 @@ from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.labels import PoseLabel, relative_pose
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
-from zsp_lite.views import View, turn_view
+from zsp_lite.views import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +188,14 @@ class PairResult:
         }
 
 
-def label_errors(
-    estimates: Mapping[str, PoseEstimate], labels: Sequence[PoseLabel], reference: Frame, targets: Sequence[Frame]
-) -> dict[str, float]:
-    """Compute the rotation errors of estimates in degrees, by the labels of the reference's and target's sequences."""
-    errors = {}
-    for name, estimate in estimates.items():
-        truth = relative_pose(labels[0], reference.camera, labels[1], targets[estimate.view].camera)
+def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
+    """Compute rotation errors in degrees; {} unless both sequences of the folder of a category have labels."""
+    labels, errors = read_labels(category.parent, category.name), {}
+    if not set(sequences) <= set(labels):
+        return errors
+    first, second = (labels[name] for name in sequences)
+    for name, estimate in found.estimates.items():
+        truth = relative_pose(first, found.reference.camera, second, found.targets[estimate.view].camera)
         errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     return errors
 
@@ -244,11 +248,16 @@ def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) 
     rows, columns = reference.features.grid
     patches = np.rot90(np.arange(rows * columns).reshape(rows, columns), quarters)
     matched = np.stack(np.unravel_index(patches[tuple(estimate.matches.reference.T)], (rows, columns)), axis=-1)
+    view = estimate.reference_view
+    maps = view.features.keys, view.features.saliency, view.foreground
+    keys, saliency, foreground = (torch.rot90(one, -quarters, (0, 1)) for one in maps)
+    features = FeatureMap(keys, saliency, view.features.global_feature)
+    mask = np.ascontiguousarray(np.rot90(view.soft_mask, -quarters))
     return replace(
         estimate,
         sim3=estimate.sim3 @ turn,
         matches=replace(estimate.matches, reference=matched),
-        reference_view=replace(turn_view(estimate.reference_view, -quarters), frame=reference.frame),
+        reference_view=View(reference.frame, features, foreground, mask),
         hypotheses=tuple(replace(one, sim3=one.sim3 @ turn) for one in estimate.hypotheses),
         reference_turn=90 * (quarters % 4),
     )

@@ -24,23 +24,13 @@ SALIENCY_THRESHOLD = 0.05
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Features of one image.
+    """Features of one image. InputError if shapes do not fit together, FatalError if values are not finite."""
 
-    Attributes:
-        keys: (H, W, D) key of each patch.
-        saliency: (H, W) saliency of each patch, in [0, 1].
-        global_feature: (E,) feature of the whole image.
+    keys: Float[Tensor, "h w d"]  # key of each patch
+    saliency: Float[Tensor, "h w"]  # saliency of each patch, in [0, 1]
+    global_feature: Float[Tensor, " e"]  # feature of the whole image
 
-    Raises:
-        InputError: Shapes do not fit together.
-        FatalError: Values are not finite. (Both come from a backbone that a user plugs in.)
-    """
-
-    keys: Float[Tensor, "h w d"]
-    saliency: Float[Tensor, "h w"]
-    global_feature: Float[Tensor, " e"]
-
-    def __post_init__(self):
+    def __post_init__(self):  # because a user may plug in any backbone
         keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
         if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
@@ -51,10 +41,7 @@ class FeatureMap:
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape
-        return (
-            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, keys of {channels} "
-            f"channels, global feature of {len(self.global_feature)}, {self.keys.device})"
-        )
+        return f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, {channels} channels)"
 
     @property
     def grid(self) -> Grid:

@@ -43,15 +43,6 @@ class Matches:
     def __len__(self) -> int:
         return len(self.reference)
 
-    def __repr__(self) -> str:
-        if not len(self):
-            return "Matches(none)"
-        low, high = self.similarity.min(), self.similarity.max()
-        return (
-            f"Matches({len(self)}, similarity {low:.3f} to {high:.3f}, distance {self.distance.min():.3g} to "
-            f"{self.distance.max():.3g})"
-        )
-
 
 def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     """Compute the cosine similarity of the log-binned descriptors of all pairs of patches.
@@ -74,8 +65,7 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     for keys2 in map(_keys, targets):
         products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
         summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
-        cosine = summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
-        results.append(cosine)
+        results.append(summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2)))
     return results
 
 
@@ -174,7 +164,9 @@ def match(
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
-        order = order[_most_salient(clusters, start.saliency.flatten().cpu().numpy()[order])]
+        by_cluster = np.lexsort((-start.saliency.flatten().cpu().numpy()[order], clusters))  # the most salient first
+        first = np.unique(clusters[by_cluster], return_index=True)[1]
+        order = order[np.sort(by_cluster[first])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
     v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
     reference, matched = (u, v) if cycle_from == "reference" else (v, u)
@@ -269,10 +261,3 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
-
-
-def _most_salient(labels: Int[np.ndarray, " m"], salience: Float[np.ndarray, " m"]) -> Int[np.ndarray, " clusters"]:
-    """Find the index of each cluster's most salient point (ties: the first), in ascending order."""
-    order = np.lexsort((-salience, labels))
-    _, first = np.unique(labels[order], return_index=True)
-    return np.sort(order[first])

@@ -1,7 +1,4 @@
-"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation metrics").
-
-`benchmark.statistics` has their intervals and tests. A bootstrap replicate is a row of weights, one per pair.
-"""
+"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation metrics")."""
 
 import numpy as np
 from jaxtyping import Float

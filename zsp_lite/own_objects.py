@@ -13,14 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.backbones.pretrained import DEFAULT
+from zsp_lite.backbones.load import DEFAULT, BackboneConfig, load_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
-from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
 from zsp_lite.features import FeatureExtractor
@@ -31,7 +29,6 @@ from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
 from zsp_lite.points import axis_deviation, object_pixels, world_cloud
-from zsp_lite.views import has_saliency
 
 _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
@@ -149,7 +146,8 @@ def estimate_pose(
         positions = second.spread(targets)
         frames = second.load(positions)
         model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-        method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
+        foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
+        method = ZeroShotPose(model, foreground=foreground, upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
         unscaled = [one.format == "sequence" or not len(cloud) for one, cloud in zip(sources, clouds)]
@@ -276,8 +274,6 @@ def _format(path: Path) -> str:
         if (path / sign).is_file():
             return name
     found = "has another format" if path.exists() else "does not exist"
-    if (whole / FRAMES_FILE).is_file():
-        found = "is a category"
     signs = " or ".join(f"{sign} ({name})" for name, sign in SIGNS.items())
     raise InputError(
         f"{path} {found}, expected a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or a folder with {signs}; "
@@ -311,10 +307,7 @@ def known_errors(
     one, other = (source.path.resolve() for source in (first, second))
     if {first.format, second.format} != {"sequence"} or one.parent != other.parent:
         return {}
-    labels = read_labels(one.parent.parent, one.parent.name)
-    if not {one.name, other.name} <= set(labels):
-        return {}
-    return label_errors(estimates, [labels[one.name], labels[other.name]], result.reference, result.targets)
+    return label_errors(replace(result, estimates=estimates), one.parent, (one.name, other.name))
 
 
 def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:

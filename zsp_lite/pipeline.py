@@ -21,7 +21,7 @@ from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match
 from zsp_lite.matching import similarities as cosine_similarities
 from zsp_lite.points import standard_deviation
-from zsp_lite.views import View, crop_size, extract_views, has_saliency, object_crop, usable_targets
+from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVER_CLASSES = {"verified": "zsp_lite.verified:VerifiedSolver"}
@@ -87,15 +87,10 @@ class ZeroShotPose:
             check_integer(name, getattr(self, name), *limits)
         if not callable(self.backbone):
             raise InputError(f"backbone is {self.backbone!r}, expected what `load_backbone` returns")
-        if self.foreground == "saliency" and not has_saliency(self.backbone):
+        if self.foreground == "saliency" and not getattr(self.backbone, "has_saliency", True):
             name = getattr(self.backbone, "name", type(self.backbone).__name__)
             raise InputError(f"foreground is 'saliency', which {name} does not have; expected 'mask'")
         check_number("threshold", self.threshold, above=0)
-
-    @property
-    def clusters(self) -> bool:
-        """Whether k-means selects the matches (see `kmeans`)."""
-        return getattr(self._solver(), "kmeans", True) if self.kmeans is None else self.kmeans
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
@@ -120,14 +115,11 @@ class ZeroShotPose:
 
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
-        size = crop_size(self.backbone)
+        size = getattr(self.backbone, "image_size", IMAGE_SIZE)
         return extract_views(self.backbone, [object_crop(frame, size) for frame in frames], self.foreground)
 
     def match_views(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
+        self, reference: View, targets: Sequence[View], similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
@@ -136,10 +128,11 @@ class ZeroShotPose:
         if similarities is None:
             compare = cosine_similarities if self.binning else key_similarities
             similarities = compare(reference.features, [target.features for target in targets])
+        kmeans = getattr(self._solver(), "kmeans", True) if self.kmeans is None else self.kmeans
         matched = []
         for target, similarity in zip(targets, similarities, strict=True):
             matches = match(
-                reference.features, target.features, self.k, self.clusters, self.seed, self.cycle_from,
+                reference.features, target.features, self.k, kmeans, self.seed, self.cycle_from,
                 ref_foreground=reference.foreground, target_foreground=target.foreground, sim=similarity,
                 matcher=self.matcher, binning=self.binning,
             )  # fmt: skip

@@ -1,7 +1,4 @@
-"""Points of the object: the pixels on it, their 3D points, outliers and standard deviation.
-
-Patches on the object are `View.foreground`; the functions here work on pixels and points.
-"""
+"""Points of the object: the pixels on it, their 3D points, outliers and standard deviation."""
 
 from collections.abc import Sequence
 
@@ -40,10 +37,7 @@ def standard_deviation(points: Float[np.ndarray, "n 3"]) -> float:
 
 
 def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
-    """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D (supplement).
-
-    It is at most `standard_deviation`, and equal to it for points that vary equally along all axes.
-    """
+    """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D (supplement)."""
     return float(points.std(axis=0).mean())
 
 

@@ -1,7 +1,7 @@
 """Views: the object crop of a frame with its features, foreground patches and 3D points (fig. 2, left)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import patch_points
-from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame, turn_frame
+from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
@@ -25,22 +25,13 @@ class View:
 
     frame: Frame  # the crop
     features: FeatureMap  # features of the crop's image
-    foreground: Bool[torch.Tensor, "rows cols"]  # patches on the object
-    soft_mask: Float[np.ndarray, "height width"]  # probability of each pixel of being on the object, in [0, 1]
+    foreground: Bool[torch.Tensor, "rows cols"] = field(repr=False)  # patches on the object
+    # probability of each pixel of being on the object, in [0, 1]
+    soft_mask: Float[np.ndarray, "height width"] = field(repr=False)
 
-    def __repr__(self) -> str:
-        (height, width), (rows, columns) = self.frame.camera.size, self.features.grid
-        return (
-            f"View({self.frame.name!r}, {height} x {width} pixels, {int(self.foreground.sum())} of {rows} x {columns} "
-            f"patches foreground)"
-        )
-
-    @cached_property
+    @cached_property  # of N target views the paper's solver needs only those of the chosen one
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`).
-
-        Computed on first use: of N target views the paper's solver needs only those of the chosen one.
-        """
+        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`)."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
 
     @cached_property
@@ -52,16 +43,6 @@ class View:
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
         """Foreground patches with measured depth."""
         return np.asarray(self.foreground.cpu()) & self.measured_points[1]
-
-
-def crop_size(backbone: FeatureExtractor | None) -> int:
-    """Get the size of object crops for a backbone, in pixels: its `image_size`, or 224 without one."""
-    return getattr(backbone, "image_size", IMAGE_SIZE)
-
-
-def has_saliency(backbone: FeatureExtractor | None) -> bool:
-    """Tell whether a backbone separates the object from the background: its `has_saliency`, or True without one."""
-    return getattr(backbone, "has_saliency", True)
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
@@ -86,18 +67,10 @@ def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") 
     """
     if foreground == "mask" or (crop.mask is not None and not crop.mask.any()):
         return View(crop, features, patch_mask(crop, features.grid).to(features.keys.device), crop.mask)
-    return View(crop, features, features.foreground(), soft_saliency(features, crop.camera.size))
-
-
-def turn_view(view: View, quarters: int) -> View:
-    """Turn a view with its feature maps and masks by quarter turns, counterclockwise as in `numpy.rot90`."""
-    features = view.features
-    keys, saliency, foreground = (
-        torch.rot90(values, quarters, (0, 1)) for values in (features.keys, features.saliency, view.foreground)
-    )
-    features = FeatureMap(keys, saliency, features.global_feature)
-    mask = np.ascontiguousarray(np.rot90(view.soft_mask, quarters))
-    return View(turn_frame(view.frame, quarters), features, foreground, mask)
+    # As a soft mask: 0 for no saliency, 0.5 at the threshold of the foreground, 1 from twice that on.
+    ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
+    soft_mask = cv2.resize(ramp, crop.camera.size[::-1], interpolation=cv2.INTER_LINEAR)
+    return View(crop, features, features.foreground(), soft_mask)
 
 
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
@@ -115,12 +88,6 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
     if not usable:
         raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
     return usable, tuple(flags)
-
-
-def soft_saliency(features: FeatureMap, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on."""
-    ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
-    return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:

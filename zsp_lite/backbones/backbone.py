@@ -27,15 +27,12 @@ class Backbone:
     Args:
         model: Network.
         name: Name used in tables and reports.
-        layer: Block that describes the patches (see `block_index`). Default: block 9 counted from 0, or the last block
-            of a shallower network. The paper writes "the 9th ViT layer"; its published code counts from 0.
+        layer: Block that describes the patches (see `load_backbone`). Default: block 9 counted from 0, or the last of
+            a shallower network.
         saliency_heads: Heads of the last block whose CLS attention is averaged into the saliency. Default: heads 0, 2,
             4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads for other sizes.
-        device: Default: the GPU if there is one, else the CPU.
         batch_size: Number of images in one forward pass.
-        facet: Activation of the block used as descriptor; the paper's is "key".
-        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default:
-            the model's.
+        device, facet, image_size: As of `load_backbone`; the default size is the model's.
         mean, std: Normalisation of RGB values in [0, 1].
 
     Raises:

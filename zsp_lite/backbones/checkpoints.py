@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import file_size
-from zsp_lite.io.tensors import MAX_WEIGHTS, load_torch
+from zsp_lite.io.files import MAX_WEIGHTS, file_size, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -1,4 +1,7 @@
-"""Loading of backbones: by name, from a checkpoint file, or from a model in Hugging Face's format."""
+"""Loading of backbones, from a checkpoint file, a model in Hugging Face's format, or by name.
+
+The names are those of the embedded one, and of the DINO models released by Caron et al. (2021).
+"""
 
 import os
 from dataclasses import dataclass
@@ -9,10 +12,41 @@ import torch
 
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone
 from zsp_lite.backbones.checkpoints import build_vit, metadata_integers, read_checkpoint
-from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
-from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, check_authentic, download, obtained_by
+from zsp_lite.backbones.huggingface import PREFIX, load_huggingface, model_folder
 from zsp_lite.choices import Facet
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_choice
+from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
+
+DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
+MOST_BYTES = 400_000_000  # of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
+WEIGHTS = Path(__file__).parents[1] / "weights"
+DEFAULT = "zsp-tiny"
+TINY = WEIGHTS / "zsp-tiny.safetensors"
+
+
+@dataclass(frozen=True)
+class PretrainedWeights:
+    """A released checkpoint."""
+
+    file: str  # path below the DINO URL
+    md5_prefix: str  # no more digits of a digest were published
+    size: int | None = None  # bytes
+
+    @property
+    def url(self) -> str:
+        return os.environ.get("ZSP_LITE_DINO_URL", DINO_URL).rstrip("/") + "/" + self.file
+
+    @property
+    def path(self) -> Path:
+        return cache_folder() / Path(self.file).name
+
+
+PRETRAINED = {
+    "dino_vits8": PretrainedWeights("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
+    "dino_vits16": PretrainedWeights("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
+    "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
+    "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
+}
 
 
 @dataclass(frozen=True)
@@ -78,6 +112,42 @@ def load_backbone(
     return backbone
 
 
+def available_backbones() -> dict[str, Path | None]:
+    """Return the names of all backbones with their file, or None if it is not downloaded."""
+    paths = {DEFAULT: TINY} | {name: weights.path for name, weights in PRETRAINED.items()}
+    return {name: path if path.is_file() else None for name, path in paths.items()}
+
+
+def obtained_by(name: str) -> str:
+    """Return what is to be done for a backbone whose file `available_backbones` does not have."""
+    return "missing: reinstall zsp-lite" if name == DEFAULT else f"not downloaded: zsp-lite weights fetch {name}"
+
+
+def download(name: str) -> Path:
+    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is not there yet.
+
+    InputError if the file is not the released one.
+    """
+    if name.startswith(PREFIX):
+        return model_folder(name)
+    if name == DEFAULT:
+        return TINY
+    check_choice("backbone", name, available_backbones())
+    weights = PRETRAINED[name]
+    try:
+        path = fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=MOST_BYTES)
+    except InputError as error:
+        raise InputError(
+            f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use {DEFAULT}"
+        ) from error
+    if not has_size_and_hash(path, weights.size, weights.md5_prefix):
+        raise InputError(
+            f"{name}: {path} is not the released file, expected {weights.size or 'any number of'} bytes with MD5 "
+            f"{weights.md5_prefix}...; remove it, then run zsp-lite weights fetch {name}"
+        )
+    return path
+
+
 def verify(name_or_path: str | Path) -> None:
     """Raise InputError unless a backbone is there, loads, and has finite features of an image."""
     name = str(name_or_path)
@@ -104,7 +174,6 @@ def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) 
     name, path = config.name, Path(config.name).expanduser()
     if name in available_backbones():
         path, label = download(name), name
-        check_authentic(name, path)
     elif os.path.isfile(path):  # False for a name that is too long, where Path.is_file raises
         label = path.stem
     else:

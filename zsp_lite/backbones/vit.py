@@ -5,7 +5,7 @@ the last block's CLS token as saliency, and the CLS output token as global featu
 """
 
 import math
-from collections.abc import Iterator
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import torch
@@ -29,9 +29,7 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 class Tokens:
     """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    keys: Float[
-        Tensor, "batch n dim"
-    ]  # patch descriptors: the keys of one block (or another facet), heads concatenated
+    keys: Float[Tensor, "batch n dim"]  # descriptors: the keys (or another facet) of one block, heads concatenated
     attention: Float[Tensor, "batch heads n"]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
@@ -52,10 +50,10 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    query: Float[Tensor, "batch tokens dim"]  # like key and value a linear function of `normed`, heads concatenated
+    query: Float[Tensor, "batch outputs dim"]  # like key and value a linear function of `normed`, heads concatenated
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
-    token: Float[Tensor, "batch tokens dim"]  # output of the block, not normalised
+    token: Float[Tensor, "batch outputs dim"]  # output of the block, not normalised
 
 
 class Attention(nn.Module):
@@ -86,18 +84,6 @@ class Attention(nn.Module):
         return ((q * self.scale) @ k.transpose(-1, -2))[:, :, 0]
 
 
-class Mlp(nn.Module):
-    """Two linear layers with a GELU between them."""
-
-    def __init__(self, dim: int, hidden: int):
-        super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
-
-    def forward(self, x: Float[Tensor, "batch n dim"]) -> Float[Tensor, "batch n dim"]:
-        return self.fc2(F.gelu(self.fc1(x)))
-
-
 class Block(nn.Module):
     """Pre-norm transformer block."""
 
@@ -106,28 +92,20 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(dim, eps=1e-6)
         self.attn = Attention(dim, heads)
         self.norm2 = nn.LayerNorm(dim, eps=1e-6)
-        self.mlp = Mlp(dim, 4 * dim)
+        layers = {"fc1": nn.Linear(dim, 4 * dim), "gelu": nn.GELU(), "fc2": nn.Linear(4 * dim, dim)}
+        self.mlp = nn.Sequential(OrderedDict(layers))
 
-    def finish(
-        self, x: Float[Tensor, "batch n dim"], attended: Float[Tensor, "batch n dim"]
-    ) -> Float[Tensor, "batch n dim"]:
-        """Add the attention output to the residual stream, then the MLP's output."""
-        x = x + attended
-        return x + self.mlp(self.norm2(x))
-
-    def forward(self, x: Float[Tensor, "batch n dim"]) -> BlockActivations:
+    def forward(self, x: Float[Tensor, "batch n dim"], outputs: int | None = None) -> BlockActivations:
+        """Compute the activations; queries and output, which take most of the time, of the first `outputs` tokens."""
         normed = self.norm1(x)
-        q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
-        return BlockActivations(normed, q, k, v, self.finish(x, self.attn(q, k, v)))
-
-    def forward_cls(self, x: Float[Tensor, "batch n dim"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the output for the CLS token only, all keys (batch, n, dim) and the CLS token's attention logits."""
-        dim = x.shape[-1]
-        weight, bias = self.attn.qkv.weight, self.attn.qkv.bias
-        normed = self.norm1(x)
-        q = F.linear(normed[:, :1], weight[:dim], bias[:dim])
-        k, v = F.linear(normed, weight[dim:], bias[dim:]).chunk(2, dim=-1)
-        return self.finish(x[:, :1], self.attn(q, k, v)), k, self.attn.cls_logits(q, k)
+        if outputs is None:
+            q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
+        else:
+            dim, weight, bias = x.shape[-1], self.attn.qkv.weight, self.attn.qkv.bias
+            q = F.linear(normed[:, :outputs], weight[:dim], bias[:dim])
+            k, v = F.linear(normed, weight[dim:], bias[dim:]).chunk(2, dim=-1)
+        attended = x[:, :outputs] + self.attn(q, k, v)
+        return BlockActivations(normed, q, k, v, attended + self.mlp(self.norm2(attended)))
 
 
 class PatchEmbed(nn.Module):
@@ -195,42 +173,29 @@ class VisionTransformer(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch tokens dim"]:
         """Return the normalised output tokens, CLS first."""
         x, _ = self.embed(images)
-        for activations in self.run_blocks(x):
-            pass
-        return self.norm(activations.token)
-
-    def run_blocks(self, x: Float[Tensor, "batch tokens dim"], count: int | None = None) -> Iterator[BlockActivations]:
-        """Run the first `count` blocks (default: all) one after the other and yield the activations of each."""
-        for block in self.blocks[:count]:
-            activations = block(x)
-            x = activations.token
-            yield activations
+        for block in self.blocks:
+            x = block(x).token
+        return self.norm(x)
 
     def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
-        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS output token.
-
-        The images are normalised; their height and width are multiples of the patch size.
-        """
+        """Compute the descriptors of one block (counted from 0), CLS attention and CLS output of normalised images."""
         x, grid = self.embed(images)
-        for index, activations in enumerate(self.run_blocks(x, self.depth - 1)):
+        for index, block in enumerate(self.blocks):
+            # In the last block the method needs the keys of all tokens, but the query and the output of CLS only.
+            activations = block(x, 1 if index == self.depth - 1 and facet == "key" else None)
             x = activations.token
             if index == layer:
                 descriptors = getattr(activations, facet)
-        block = self.blocks[-1]
-        if facet == "key":  # no other activation of the patches is needed in the last block
-            cls, last_descriptors, logits = block.forward_cls(x)
-        else:
-            activations = block(x)
-            cls, last_descriptors = activations.token[:, :1], getattr(activations, facet)
-            logits = block.attn.cls_logits(activations.query, activations.key)
-        if layer == self.depth - 1:
-            descriptors = last_descriptors
-        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(cls)[:, 0], grid)
+        logits = block.attn.cls_logits(activations.query, activations.key)
+        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(x[:, :1])[:, 0], grid)
 
     def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
         """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
         x, _ = self.embed(images)
-        activations = list(self.run_blocks(x))
+        activations = []
+        for block in self.blocks:
+            activations.append(block(x))
+            x = activations[-1].token
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
         return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits)

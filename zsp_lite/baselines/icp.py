@@ -9,7 +9,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.open3d import load_open3d
+from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import object_points
 
 POINTS = 5000  # largest number of points per cloud

@@ -22,7 +22,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.io.download import cache_folder
-from zsp_lite.io.tensors import load_torch
+from zsp_lite.io.files import load_torch
 
 SWAV_URL = "https://dl.fbaipublicfiles.com/deepcluster/swav_800ep_pretrain.pth.tar"
 POSECONTRAST_URL = "https://github.com/YoungXIAO13/PoseContrast"  # the authors' repository links the checkpoint

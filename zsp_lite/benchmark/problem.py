@@ -20,7 +20,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import View, crop_size, frame_view, object_crop
+from zsp_lite.views import IMAGE_SIZE, View, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
@@ -90,7 +90,8 @@ class FrameStore:
 
     def _frame(self, key: FrameKey) -> Frame:
         """Return a frame's object crop, resized to the backbone's input."""
-        size, annotation = crop_size(self.extractors.get("backbone")), self.dataset.frame(self.category, *key)
+        size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
+        annotation = self.dataset.frame(self.category, *key)
         return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
 
     def _describe(self, features: str, key: FrameKey) -> Any:

@@ -30,7 +30,7 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     try:
         import torch
 
-        from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, obtained_by
+        from zsp_lite.backbones.load import DEFAULT, available_backbones, obtained_by
         from zsp_lite.io.download import cache_folder
     except (ImportError, OSError) as error:
         yield "packages", "bad", f"cannot be imported: {error}", f"{sys.executable} -m pip install path/to/zsp-lite"

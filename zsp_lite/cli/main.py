@@ -78,7 +78,7 @@ def weights() -> None:
 @weights.command("list", epilog=examples("weights list"))
 def list_weights() -> None:
     """List every backbone with its file, or where to get it."""
-    from zsp_lite.backbones.pretrained import available_backbones, obtained_by
+    from zsp_lite.backbones.load import available_backbones, obtained_by
 
     for name, path in available_backbones().items():
         print(f"{name:19} {path or obtained_by(name)}")
@@ -88,7 +88,7 @@ def list_weights() -> None:
 @click.argument("name")
 def fetch(name) -> None:
     """Download a backbone: NAME as `weights list` prints it, or hf:NAME."""
-    from zsp_lite.backbones.pretrained import download
+    from zsp_lite.backbones.load import download
 
     print(f"Available: {download(name)}")
 

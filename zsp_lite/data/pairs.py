@@ -15,8 +15,7 @@ import torch
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import plain_name, stable_hash, write_atomic
-from zsp_lite.io.tensors import load_torch
+from zsp_lite.io.files import load_torch, plain_name, stable_hash, write_atomic
 
 
 class _PublishedPair(msgspec.Struct):

@@ -15,7 +15,7 @@ from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, 
 from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
-from zsp_lite.io.open3d import load_open3d
+from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, object_points
 
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras

@@ -1,1 +1,1 @@
-"""Files, downloads, PLY point clouds, and the import of Open3D."""
+"""Files, downloads, and point clouds."""

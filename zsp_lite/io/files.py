@@ -16,6 +16,7 @@ import msgspec
 from zsp_lite.errors import InputError
 
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
+MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
 GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME = 255  # bytes, on most file systems
@@ -67,6 +68,17 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
     except (OSError, ValueError) as error:
         problem = str(getattr(error, "strerror", error)).lower()
     raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
+
+
+def load_torch(path: str | Path, what: str) -> Any:
+    """Read a torch file without executing code in it; InputError if it is damaged, or has more than plain data."""
+    import torch  # takes seconds, and most callers of this module do not need it
+
+    file_size(path, what, MAX_WEIGHTS)
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file can raise almost any; torch's message recommends unsafe loading
+        raise InputError(f"{what} {path}: damaged, or contains more than tensors ({type(error).__name__})") from error
 
 
 def sha256(path: str | Path, what: str) -> str:

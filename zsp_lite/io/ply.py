@@ -1,6 +1,10 @@
-"""Reading and writing of point clouds in PLY files."""
+"""Point clouds: PLY files, and the import of Open3D, for which all other modules call `load_open3d`."""
 
+import ctypes
+import functools
 import io
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +35,7 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-    """Read the positions and 8-bit colours (None if there are none) of a binary or ASCII PLY file.
-
-    InputError if the file is damaged, or positions are not finite or above 1e9.
-    """
+    """Read the positions and 8-bit colours (None if there are none) of a PLY file; InputError if it is damaged."""
     from trimesh.exchange.ply import load_ply  # takes 0.5 s to import
     from trimesh.visual.color import to_rgba
 
@@ -48,3 +49,17 @@ def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.nda
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
     check_magnitude(f"point cloud {path}", points)
     return points, colours
+
+
+@functools.cache
+def load_open3d():
+    """Import and return the `open3d` module."""
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # it would start a server in a notebook
+    # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from a package.
+    if sys.platform.startswith("linux"):
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    import open3d
+
+    return open3d

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.io.open3d import load_open3d
+from zsp_lite.io.ply import load_open3d
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.room import FLOOR_REACH, RoomLight
 from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear

@@ -31,7 +31,9 @@ def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, s
     found = {}
     with torch.no_grad():
         x, _ = model.embed(batch.to(backbone.device))
-        for layer, activations in enumerate(model.run_blocks(x)):
+        for layer, block in enumerate(model.blocks):
+            activations = block(x)
+            x = activations.token
             found |= {(layer, facet): getattr(activations, facet).cpu() for facet in FACETS}
     return found
 
