@@ -12,9 +12,8 @@ from synthetic_views import look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import normalize
-from zsp_lite.baselines import icp as icp_module
-from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.baselines.icp import align, icp
+from zsp_lite.baselines import geometry
+from zsp_lite.baselines.geometry import align, essential_rotation, icp
 from zsp_lite.baselines.networks import (
     PoseContrast,
     ResNet50,
@@ -134,7 +133,7 @@ def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
 def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     """Two sequences of the same object, whose first cameras differ by a few degrees."""
     clouds = []
-    monkeypatch.setattr(icp_module, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
+    monkeypatch.setattr(geometry, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
     cameras = [look_at(side) for side in [(1.0, 0.1, 0.3), (0.95, 0.2, 0.35), (-0.2, 1.0, 0.3)]]
     # As in CO3D, the first camera has the same rotation in the world of every sequence.
     turn = cameras[0].R.T @ cameras[1].R
@@ -146,7 +145,7 @@ def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     found = align(first, targets, 0, firsts, seed=0)
     assert rotation_error(found.R, np.eye(3)) < 1e-6
     source, target = clouds
-    assert len(source) <= icp_module.POINTS and len(target) == icp_module.POINTS
+    assert len(source) <= geometry.POINTS and len(target) == geometry.POINTS
     distance, _ = cKDTree(target).query(source)
     truth = true_pose(first.camera, placements[0], cameras[0], placements[1])
     assert np.median(distance) < 0.15 and 2 < rotation_error(found.R, truth.R) < 10

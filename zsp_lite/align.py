@@ -55,7 +55,8 @@ class PairSolver:
     """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
 
     def __init__(self, root: str, category: str, backbone: FeatureExtractor | str | BackboneConfig, threads: int):
-        self._store = FrameStore(Co3D(root), category, {"backbone": _loaded(backbone)}, threads)
+        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+        self._store = FrameStore(Co3D(root), category, {"backbone": loaded}, threads)
 
     def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Find the hypotheses of the pairs of a chunk."""
@@ -66,10 +67,6 @@ class PairSolver:
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
                 line |= {"probabilities": found.probabilities.tolist()}
             yield line
-
-
-def _loaded(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
-    return load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
 
 
 def align_category(
@@ -103,7 +100,7 @@ def align_category(
             of them, or OUT holds another run.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
-    loaded = _loaded(backbone)
+    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
         open_workers(executor) as (pool, workers),
@@ -134,11 +131,9 @@ def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> t
     """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    alone = [((one.reference, one.target), one.sim3s[0]) for one in found.pairs]
-    together = [(pair, found.between(*pair)) for pair in true]
-    return tuple(
-        [float(rotation_error(sim3.R, true[pair])) for pair, sim3 in some if pair in true] for some in (together, alone)
-    )
+    together = [float(rotation_error(found.between(*pair).R, true[pair])) for pair in true]
+    alone = [((one.reference, one.target), one.sim3s[0].R) for one in found.pairs]
+    return together, [float(rotation_error(rotation, true[pair])) for pair, rotation in alone if pair in true]
 
 
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:

@@ -76,11 +76,7 @@ def _layer(inputs: int, outputs: int, blocks: int, stride: int = 2) -> nn.Sequen
 
 
 class Swav:
-    """SwAV (Caron et al. 2020), trained by self-supervision, as a feature extractor.
-
-    The keys are the output of the third layer, (28, 28, 1024), which the paper does not state; the global feature is
-    the mean of the last layer's output, and the saliency is 1 everywhere.
-    """
+    """SwAV (Caron et al. 2020), trained by self-supervision, as a feature extractor without saliency."""
 
     name = "swav"
     has_saliency = False
@@ -94,7 +90,7 @@ class Swav:
         maps = []
         for image in normalize(prepare_images(images, self.image_size)):
             third, last = self.model(image[None])
-            keys = third[0].permute(1, 2, 0)
+            keys = third[0].permute(1, 2, 0)  # (28, 28, 1024); the paper does not state the layer
             maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), last.mean((2, 3))[0]))
         return maps
 
@@ -157,20 +153,16 @@ def load_posecontrast() -> PoseContrast:
 
 
 def euler_to_rotation(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Convert azimuth, elevation and in-plane rotation to the rotation from the canonical frame to the camera.
-
-    In degrees. The rotation to an OpenGL camera is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
-    """
+    """Convert azimuth, elevation and in-plane angle in degrees to the rotation from canonical frame to camera."""
+    # To an OpenGL camera, it is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
     zxz = (np.asarray(angles, np.float64) - (0, 180, 180))[::-1]
     return _AXES @ Rotation.from_euler("ZXZ", zxz, degrees=True).as_matrix()
 
 
 def square_crop(frame: Frame) -> UInt8[np.ndarray, "s s 3"]:
-    """Restore the aspect ratio of an object crop, and pad it with black to a square.
-
-    The aspect ratio follows from the camera of the crop, because the pixels of the photograph are square.
-    """
-    extent = frame.camera.size[::-1] / frame.camera.focal_length  # width and height at depth 1
+    """Restore the aspect ratio of an object crop, and pad it with black to a square."""
+    # Width and height at depth 1, which are those of the photograph, because its pixels are square.
+    extent = frame.camera.size[::-1] / frame.camera.focal_length
     width, height = np.maximum(1, np.round(_SIDE * extent / extent.max())).astype(int).tolist()
     resized = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     top, left = (_SIDE - height) // 2, (_SIDE - width) // 2

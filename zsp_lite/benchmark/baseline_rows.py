@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.baselines.icp import align
+from zsp_lite.baselines.geometry import align
 from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints

@@ -62,8 +62,7 @@ def build_maps(
     columns: Sequence[Int[np.ndarray, " patches"]],
 ) -> ViewMaps:
     """Build the maps of views that share a world frame."""
-    cameras = [_map_camera(view.frame.camera) for view in views]
-    tables = [_table(*one, world_to_working.scale) for one in zip(views, cameras, columns, strict=True)]
+    cameras, tables = zip(*(_table(*one, world_to_working.scale) for one in zip(views, columns, strict=True)))
     sizes = np.array([camera.size[::-1] for camera in cameras])
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
@@ -80,11 +79,7 @@ def build_maps(
 def project_points(
     maps: ViewMaps, linear: Float[Tensor, "m 3 3"], translation: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"]
 ) -> Projection:
-    """Transform points by `linear @ x + translation`, project them into every view and read the maps.
-
-    A point beyond the border reads the nearest border pixel, and its silhouette distance is larger by the distance to
-    it; but where the silhouette reaches the border, the object is cut off, its extent unknown, and the distance 0.
-    """
+    """Transform points by `linear @ x + translation`, project them into every view and read the maps."""
     m, v = len(linear), len(maps.size)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
     camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
@@ -93,6 +88,8 @@ def project_points(
     pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
     pixels = in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
     last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
+    # A point beyond the border reads the nearest border pixel, and its silhouette distance is larger by the distance to
+    # it; but where the silhouette reaches the border, the object is cut off, its extent unknown, and the distance 0.
     nearest = torch.minimum(pixels.clamp_min(0), last)
     column, row = nearest.int().unbind(2)
     index = (row * maps.size[:, :1].int()).add_(column).add_(maps.first_row[:, None].int())
@@ -104,24 +101,19 @@ def project_points(
     return Projection(depth, surface_depth, weight, distance, patch.int(), pixels.transpose(2, 3))
 
 
-def _map_camera(camera: Camera) -> Camera:
-    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes."""
-    height, width = camera.size
-    aspect = (height / camera.focal_length[1]) / (width / camera.focal_length[0])
-    rows = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
-    return camera.resize((rows, max(round(_MAP_PIXELS / rows), 1)))
-
-
 def _table(
-    view: View, camera: Camera, columns: Int[np.ndarray, " patches"], scale: float
-) -> Float[np.ndarray, "4 pixels"]:
-    height, width = camera.size
-    frame, grid = view.frame, view.features.grid
-    rows, cols = ((2 * np.arange(n) + 1) * old // (2 * n) for n, old in zip(camera.size, frame.camera.size))
+    view: View, columns: Int[np.ndarray, " patches"], scale: float
+) -> tuple[Camera, Float[np.ndarray, "4 pixels"]]:
+    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes, and fill its table."""
+    frame, camera, grid = view.frame, view.frame.camera, view.features.grid
+    aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
+    height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
+    width = max(round(_MAP_PIXELS / height), 1)
+    rows, cols = ((2 * np.arange(n) + 1) * old // (2 * n) for n, old in zip((height, width), camera.size))
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth[np.ix_(rows, cols)]
     outside = [(mask < threshold).astype(np.uint8) for threshold in _MASK_THRESHOLDS]
     distance = [cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside]
     patch = (np.arange(height) * grid[0] // height)[:, None] * grid[1] + np.arange(width) * grid[1] // width
     table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), columns[patch]
-    return np.stack([values.astype(np.float32) for values in table]).reshape(4, -1)
+    return camera.resize((height, width)), np.stack([values.astype(np.float32) for values in table]).reshape(4, -1)

@@ -56,12 +56,11 @@ def refine(
 ) -> tuple[Poses, Float[Tensor, " m"]]:
     """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores.
 
-    Each round keeps the best step if it raises the score. The weighted mean of the six best steps is a candidate of
-    the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
-    Rotations are about the centroid of the reference's points, which is the origin in working units.
+    Each round keeps the best step if it raises the score. A candidate of the next round is the mean of the six best.
     """
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
+    # The logarithmic recombination weights of CMA-ES (Hansen 2016).
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None
@@ -78,12 +77,8 @@ def refine(
         mean = (steps[rows[:, None], top] * weights).sum(dim=1)
         # Relative to the pose from which the next round starts.
         recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
-        poses = Poses(
-            torch.where(improved, candidates.scale[index], poses.scale),
-            torch.where(improved[:, None, None], candidates.rotation[index], poses.rotation),
-            torch.where(improved[:, None], candidates.translation[index], poses.translation),
-        )
-        best_score = torch.where(improved, top_score[:, 0], best_score)
+        poses = concatenate([poses, candidates])[torch.where(improved, m + index, rows)]
+        best_score = torch.maximum(best_score, top_score[:, 0])
     return poses, best_score
 
 

@@ -47,12 +47,8 @@ class Scene:
     target_cameras: tuple[Camera, ...]  # cameras of the targets
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]  # points of reference and target, per target
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
+    view_similarity_std: float  # standard deviation of that similarity over the target views
     view_span: float  # angle in degrees that the target views span around the target
-
-    @property
-    def view_similarity_std(self) -> float:
-        """Standard deviation of the target views' similarity to the reference."""
-        return float(self.view_similarity.std(correction=0))
 
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
         """Convert a pose from working units to a similarity from the reference camera to a target view's camera."""
@@ -86,7 +82,7 @@ def build_scene(
     ]
     # Of each view: each foreground patch's highest similarity in the other view, averaged in both directions.
     best = [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
-    view_similarity = torch.stack(best)
+    view_similarity = torch.stack(best) - torch.stack(best).mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     matched = []
@@ -96,21 +92,21 @@ def build_scene(
         both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
         matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
     cameras = tuple(target.frame.camera for target in targets)
+    still = [(np.eye(3), np.zeros(3))]  # the reference's points are in its camera's frame
     return Scene(
         reference_points=float_tensor(source[source_valid]),
         target_points=float_tensor(cloud[valid]),
         target_column=torch.from_numpy(column[valid]),
         target_weight=surface_weights(float_tensor(cloud[valid])),
         similarity=torch.cat([double_centre(one[valid_rows]) for one in between_foregrounds], dim=1).contiguous(),
-        reference_maps=build_maps(
-            [reference], [(np.eye(3), np.zeros(3))], reference_to_working, [_number(source_valid)]
-        ),
+        reference_maps=build_maps([reference], still, reference_to_working, [_number(source_valid)]),
         target_maps=build_maps(targets, to_camera, target_to_working, np.split(column, starts)),
         reference_to_working=reference_to_working,
         target_to_working=target_to_working,
         target_cameras=cameras,
         matches=tuple(matched),
-        view_similarity=view_similarity - view_similarity.mean(),
+        view_similarity=view_similarity,
+        view_similarity_std=float(view_similarity.std(correction=0)),
         view_span=view_span(cameras, first.to_world(target_to_working.inverse().t)),
     )
 

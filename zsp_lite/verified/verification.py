@@ -127,17 +127,14 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         some = poses[first : first + size]
         forward, reverse = forward_terms(scene, some, stride[0]), reverse_terms(scene, some, stride[1])
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
-    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses)], dim=1)
-
-
-def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the viewpoint term; its angle includes rotation about the line of sight, with which features change."""
+    # The angle includes rotation about the line of sight, with which features change.
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
-    return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
+    viewpoint = torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
+    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint], dim=1)
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
-    """Compute the point terms of a projection."""
+    """Read the similarity of point i to patch j at index `offset[i] + patch_stride * j`."""
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
     free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)
