@@ -17,9 +17,9 @@ from zsp_lite.baselines import geometry
 from zsp_lite.baselines.geometry import align, essential_rotation, icp
 from zsp_lite.baselines.networks import (
     PoseContrast,
+    Swav,
     euler_to_rotation,
     load_posecontrast,
-    load_swav,
     square_crop,
 )
 from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches, unproject_pixels
@@ -83,19 +83,19 @@ def test_the_swav_checkpoint_describes_patches_by_the_third_layer_on_the_papers_
     path = tmp_path / "swav_800ep_pretrain.pth.tar"
     torch.save(state, path)
     image = np.random.default_rng(0).integers(0, 256, (448, 448, 3), dtype=np.uint8)
-    (found,) = load_swav()([image])
+    (found,) = Swav()([image])
     *_, third, last = resnet_by_hand(weights, normalize(torch.from_numpy(image).permute(2, 0, 1)[None] / 255))
     assert found.keys.shape == (28, 28, 1024) and found.saliency.min() == 1
     torch.testing.assert_close(found.keys.permute(2, 0, 1), third[0], rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(found.global_feature, last.mean((2, 3))[0], rtol=1e-3, atol=1e-3)
     torch.save(state | {"module.conv1.weight": torch.zeros(64, 3, 5, 5)}, path)
     with pytest.raises(InputError, match="swav.* the weights do not fit: .*size mismatch"):
-        load_swav()
+        Swav()
 
 
 @pytest.mark.parametrize(
     ("load", "url", "variable"),
-    [(load_swav, "https://dl.fbaipublicfiles.com/.*swav", "ZSP_LITE_SWAV"),
+    [(Swav, "https://dl.fbaipublicfiles.com/.*swav", "ZSP_LITE_SWAV"),
      (load_posecontrast, "https://github.com/.*PoseContrast", "ZSP_LITE_POSECONTRAST")],
 )  # fmt: skip
 def test_without_a_checkpoint_one_line_says_where_to_get_it(tmp_path, monkeypatch, load, url, variable):
@@ -122,10 +122,10 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head}, path)
     monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))
     frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
-    (found,) = load_posecontrast().describe([frame])
+    ((rotation, feature),) = load_posecontrast().describe([frame])
     batch = normalize(torch.from_numpy(square_crop(frame)).permute(2, 0, 1)[None] / 255)
     x = resnet_by_hand(weights, batch)[-1].mean((2, 3))
-    torch.testing.assert_close(found.feature, x[0], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(feature, x[0], rtol=1e-3, atol=1e-3)
     x, angles = network.net_vp["compress"](x)[0], []
     for name, bins in (("azi", 24), ("ele", 12), ("inp", 24)):
         score, offset = (
@@ -133,7 +133,7 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
         )
         assert len(score) == bins
         angles.append(15 * (int(score.argmax()) + float(offset[score.argmax()])))
-    assert rotation_error(found.rotation, euler_to_rotation(np.clip(angles, 0, 360))) < 0.1
+    assert rotation_error(rotation, euler_to_rotation(np.clip(angles, 0, 360))) < 0.1
     assert {"compress.0.weight", "compress.1.running_mean", "compress.7.bias"} <= head.keys()
     for content in ([1], {"net_feat": features}, {"net_feat": {}, "net_vp": {}}):
         torch.save(content, path)

@@ -19,7 +19,6 @@ from zsp_lite.estimates import Hypothesis
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
-from zsp_lite.verified.maps import build_maps, project_points
 from zsp_lite.verified.poses import (
     SCALE_RANGE,
     Poses,
@@ -30,7 +29,7 @@ from zsp_lite.verified.poses import (
 )
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import SearchSchedule, refine
-from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
+from zsp_lite.verified.scene import build_maps, build_scene, double_centre, project_points, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms
 from zsp_lite.views import View, extract_views, object_crop

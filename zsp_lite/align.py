@@ -1,7 +1,4 @@
-"""A whole category in one frame, and one's own pair with the help of others.
-
-The pairs of a category go through the executors of the benchmark and are stored in the folder of a run.
-"""
+"""A whole category in one frame, as a run of the benchmark's kind, and one's own pair with the help of others."""
 
 import json
 import logging
@@ -155,15 +152,14 @@ def estimate_with_helpers(
 ) -> PairResult:  # fmt: skip
     """Estimate the pose between the first two of one's own objects; the others settle what these two cannot.
 
-    Others are unlabelled objects of the category. Of the hypotheses for the first two, the one that agrees with the
-    alignment of all objects comes first. An image alone is the reference of pairs only.
+    Of the hypotheses for these two, the one that agrees with the alignment of all objects comes first.
     """
     if len({one.path.resolve() for one in sources}) < len(sources):
         raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
     solve = partial(estimate_pose, solver="verified", targets=targets, backbone=_Remembering(backbone), upright=upright)
     found = {(0, 1): solve(*sources[:2], reference_frame=reference_frame)}
     for a, b in permutations(range(len(sources)), 2):
-        if (a, b) != (0, 1) and sources[b].format != "image":
+        if (a, b) != (0, 1) and sources[b].format != "image":  # an image alone is the reference of pairs only
             with suppress(InputError):  # a pair that has no pose says nothing
                 found[a, b] = solve(sources[a], sources[b], reference_frame=None if a else reference_frame)
     names = [f"{k} {one.name}" for k, one in enumerate(sources)]

@@ -15,8 +15,6 @@ from zsp_lite.matching import Matches
 from zsp_lite.points import object_points
 
 POINTS = 5000  # largest number of points per cloud
-_ITERATIONS = 100
-_TOLERANCE = 1e-6  # relative change of fitness and RMSE at convergence
 _MIN_POINTS = 10
 # Every point has a correspondence at any distance, as in PyTorch3D's ICP, which the paper uses.
 _MAX_DISTANCE = 1e6
@@ -30,7 +28,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
     registration = open3d.pipelines.registration
     result = registration.registration_icp(
         *clouds, _MAX_DISTANCE, np.eye(4), registration.TransformationEstimationPointToPoint(with_scaling=True),
-        registration.ICPConvergenceCriteria(_TOLERANCE, _TOLERANCE, _ITERATIONS),
+        registration.ICPConvergenceCriteria(relative_fitness=1e-6, relative_rmse=1e-6, max_iteration=100),
     )  # fmt: skip
     matrix = np.asarray(result.transformation)
     determinant = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0

@@ -6,7 +6,6 @@ Both are a ResNet-50 (He et al. 2016): that of transformers, as no CPU build of 
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -62,8 +61,12 @@ class Swav:
     has_saliency = False
     image_size = 448
 
-    def __init__(self, model: nn.Module):
-        self.model, self.state_dict = model, model.state_dict  # the weights identify the extractor in the benchmark
+    def __init__(self):
+        """Load the published network from $ZSP_LITE_SWAV, or from the cache folder."""
+        path, self.model = _checkpoint(SWAV_URL, "ZSP_LITE_SWAV", "swav_800ep_pretrain.pth.tar"), resnet50()
+        weights, ignored = renamed(read_checkpoint(path)[0]), ("projection_head.", "prototypes.")
+        load_weights(self.model, weights, f"swav {path}", ignored)
+        self.state_dict = self.model.state_dict  # the weights identify the extractor in the benchmark
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
@@ -73,21 +76,6 @@ class Swav:
             keys = third[0].permute(1, 2, 0)  # (28, 28, 1024); the paper does not state the layer
             maps.append(FeatureMap(keys, torch.ones(keys.shape[:2]), last.mean((2, 3))[0]))
         return maps
-
-
-def load_swav() -> Swav:
-    """Load the published network from $ZSP_LITE_SWAV, or from the cache folder."""
-    path, model = _checkpoint(SWAV_URL, "ZSP_LITE_SWAV", "swav_800ep_pretrain.pth.tar"), resnet50()
-    load_weights(model, renamed(read_checkpoint(path)[0]), f"swav {path}", ignored=("projection_head.", "prototypes."))
-    return Swav(model)
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """Rotation from the canonical frame of the category to the camera (OpenCV axes), and a feature of the image."""
-
-    rotation: Float[np.ndarray, "3 3"]
-    feature: Float[Tensor, " d"]
 
 
 class PoseContrast(nn.Module):
@@ -104,19 +92,18 @@ class PoseContrast(nn.Module):
         self.net_vp = nn.ModuleDict({"compress": nn.Sequential(*layers), **heads})
         self.eval().requires_grad_(False)
 
-    def describe(self, frames: Sequence[Frame]) -> list[Viewpoint]:
-        """Estimate the viewpoints of object crops: the most probable bin of each angle, and the offset in it."""
-        viewpoints = []
+    def describe(self, frames: Sequence[Frame]) -> list[tuple[Float[np.ndarray, "3 3"], Float[Tensor, " d"]]]:
+        """Estimate the rotation from the category's canonical frame to the camera of each crop, and its feature."""
+        found = []
         for frame in frames:
             last = self.net_feat(normalize(prepare_images([square_crop(frame)], _SIDE))).last_hidden_state
             feature, angles = last.mean((2, 3)), []
             x = self.net_vp["compress"](feature)
-            for angle in _BINS:
+            for angle in _BINS:  # the most probable bin, and the offset in it
                 chosen = int(self.net_vp[f"fc_cls_{angle}"](x).argmax())
                 angles.append((chosen + self.net_vp[f"fc_reg_{angle}"](x)[0, chosen]) * _BIN)
-            rotation = euler_to_rotation(torch.stack(angles).clamp(0, 360).numpy())
-            viewpoints.append(Viewpoint(rotation, feature[0]))
-        return viewpoints
+            found.append((euler_to_rotation(torch.stack(angles).clamp(0, 360).numpy()), feature[0]))
+        return found
 
 
 def load_posecontrast() -> PoseContrast:

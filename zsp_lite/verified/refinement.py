@@ -43,11 +43,16 @@ POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, s
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
-    score, fine_score = (partial(_score, scene, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
+
+    def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
+        totals = len(scene.reference_points), len(scene.target_points)
+        stride = tuple(max(round(total / count), 1) for total, count in zip(totals, points))
+        return WEIGHTS.score(score_terms(scene, poses, stride))
+
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
-    polished, _ = refine(poses[:_MAX_POLISHED], fine_score, POLISH, rng)
+    polished, _ = refine(poses[:_MAX_POLISHED], partial(score, points=_POLISH_POINTS), POLISH, rng)
     return concatenate([polished, poses[_MAX_POLISHED:]])
 
 
@@ -89,10 +94,3 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)
     translation = poses.translation[:, None] + schedule.translation * steps[..., 3:6]
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
-
-
-def _score(scene: Scene, counts: tuple[int, int], poses: Poses) -> Float[Tensor, " m"]:
-    """Score poses by about `counts` points of the reference and of the targets."""
-    totals = len(scene.reference_points), len(scene.target_points)
-    stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
-    return WEIGHTS.score(score_terms(scene, poses, stride))

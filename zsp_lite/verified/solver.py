@@ -60,14 +60,14 @@ class VerifiedSolver:
         )  # fmt: skip
 
     def solve(self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0) -> Solution:
-        """Run all stages on usable target views and their matches with the reference.
-
-        The result is equivariant to the order of the target views and to rotations of their world frame.
-        """
+        """Run all stages on usable target views, in any order and any world, and their matches with the reference."""
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
             with timed(timings, "scene"):
-                order = _content_order(targets)
+                # By a hash of their content, which neither the order of the targets nor the world's axes change.
+                content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+                digests = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
+                order = tuple(sorted(range(len(targets)), key=digests.__getitem__))
                 targets, matched = ([some[k] for k in order] for some in (targets, matched))
                 similarities, matches = [one.similarity for one in matched], [one.matches for one in matched]
                 scene = build_scene(reference, targets, similarities, matches)
@@ -100,9 +100,3 @@ class VerifiedSolver:
                 hypotheses = tuple(Hypothesis(*one) for one in zip(*parts))
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
-
-
-def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
-    """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
-    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
-    return tuple(sorted(range(len(targets)), key=lambda k: hashlib.blake2b(content[k], digest_size=16).digest()))

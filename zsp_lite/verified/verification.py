@@ -31,8 +31,8 @@ and the ninth, with l_v the feature similarity of target view v to the reference
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
-The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
-probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
+The weights w are those of a conditional logit (McFadden 1974), fitted by `tools/tuning.py`: among the hypotheses of a
+pair, the probability that one is correct is proportional to \exp(S).
 """
 
 from collections.abc import Iterator
@@ -42,9 +42,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from zsp_lite.verified.maps import Projection, project_points
 from zsp_lite.verified.poses import Poses, exp_, rotation_angles
-from zsp_lite.verified.scene import Scene
+from zsp_lite.verified.scene import Projection, Scene, project_points
 
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
@@ -55,7 +54,7 @@ _CHUNK = 250_000  # projected points at a time, so that intermediate results sta
 
 @dataclass(frozen=True)
 class ScoreCoefficients:
-    """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
+    """The weight of each term, in nats. The defaults were fitted on training categories."""
 
     forward_similarity: float = 13.3
     forward_overlap: float = 5.3
