@@ -19,7 +19,6 @@ from zsp_lite.baselines.networks import (
     PoseContrast,
     Swav,
     euler_to_rotation,
-    load_posecontrast,
     square_crop,
 )
 from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches, unproject_pixels
@@ -96,7 +95,7 @@ def test_the_swav_checkpoint_describes_patches_by_the_third_layer_on_the_papers_
 @pytest.mark.parametrize(
     ("load", "url", "variable"),
     [(Swav, "https://dl.fbaipublicfiles.com/.*swav", "ZSP_LITE_SWAV"),
-     (load_posecontrast, "https://github.com/.*PoseContrast", "ZSP_LITE_POSECONTRAST")],
+     (PoseContrast, "https://github.com/.*PoseContrast", "ZSP_LITE_POSECONTRAST")],
 )  # fmt: skip
 def test_without_a_checkpoint_one_line_says_where_to_get_it(tmp_path, monkeypatch, load, url, variable):
     monkeypatch.setenv(variable, str(tmp_path / "nowhere.pth"))
@@ -116,29 +115,32 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
 
 @pytest.mark.slow
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path, monkeypatch):
-    network, path = PoseContrast(), tmp_path / "posecontrast.pth"
-    head, weights = network.net_vp.state_dict(), torchvision_weights()
+    path, weights, layers = tmp_path / "posecontrast.pth", torchvision_weights(), []
+    for inputs, outputs in ((2048, 800), (800, 400), (400, 200)):
+        layers += [torch.nn.Linear(inputs, outputs), torch.nn.BatchNorm1d(outputs), torch.nn.ReLU()]
+    compress, bins = torch.nn.Sequential(*layers).eval().requires_grad_(False), {"azi": 24, "ele": 12, "inp": 24}
+    parts = {f"fc_{kind}_{name}": torch.nn.Linear(200, n) for name, n in bins.items() for kind in ("cls", "reg")}
+    head = torch.nn.ModuleDict({"compress": compress} | parts).state_dict()
     features = weights | {"fc.weight": torch.ones(128, 2048), "fc.bias": torch.ones(128)}
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head}, path)
     monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))
     frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
-    ((rotation, feature),) = load_posecontrast().describe([frame])
+    ((rotation, feature),) = PoseContrast().describe([frame])
     batch = normalize(torch.from_numpy(square_crop(frame)).permute(2, 0, 1)[None] / 255)
     x = resnet_by_hand(weights, batch)[-1].mean((2, 3))
     torch.testing.assert_close(feature, x[0], rtol=1e-3, atol=1e-3)
-    x, angles = network.net_vp["compress"](x)[0], []
-    for name, bins in (("azi", 24), ("ele", 12), ("inp", 24)):
+    x, angles = compress(x)[0], []
+    for name in bins:
         score, offset = (
             head[f"fc_{kind}_{name}.weight"] @ x + head[f"fc_{kind}_{name}.bias"] for kind in ("cls", "reg")
         )
-        assert len(score) == bins
         angles.append(15 * (int(score.argmax()) + float(offset[score.argmax()])))
     assert rotation_error(rotation, euler_to_rotation(np.clip(angles, 0, 360))) < 0.1
     assert {"compress.0.weight", "compress.1.running_mean", "compress.7.bias"} <= head.keys()
     for content in ([1], {"net_feat": features}, {"net_feat": {}, "net_vp": {}}):
         torch.save(content, path)
         with pytest.raises(InputError, match="posecontrast"):
-            load_posecontrast()
+            PoseContrast()
 
 
 def test_a_square_crop_has_the_aspect_ratio_of_the_photograph():

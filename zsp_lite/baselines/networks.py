@@ -29,8 +29,6 @@ POSECONTRAST_URL = "https://github.com/YoungXIAO13/PoseContrast"  # the authors'
 _SIDE = 224  # of PoseContrast's images, pixels
 _BIN = 15.0  # degrees
 _BINS = {"azi": 24, "ele": 12, "inp": 24}  # numbers of bins of azimuth, elevation and in-plane rotation
-# PoseContrast's cameras look along -z with +y up (OpenGL), ours along +z with +y down.
-_AXES = np.diag([1.0, -1.0, -1.0])
 
 
 def resnet50() -> nn.Module:
@@ -84,12 +82,21 @@ class PoseContrast(nn.Module):
     name = "posecontrast"
 
     def __init__(self):
+        """Load the published network from $ZSP_LITE_POSECONTRAST, or from the cache folder."""
         super().__init__()
+        path = _checkpoint(POSECONTRAST_URL, "ZSP_LITE_POSECONTRAST", "posecontrast.pth")
         self.net_feat, layers = resnet50(), []
         for inputs, outputs in pairwise((2048, 800, 400, 200)):
             layers += [nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU()]
         heads = {f"fc_{kind}_{angle}": nn.Linear(200, bins) for angle, bins in _BINS.items() for kind in ("cls", "reg")}
         self.net_vp = nn.ModuleDict({"compress": nn.Sequential(*layers), **heads})
+        content, weights = load_torch(path, "posecontrast"), {}
+        try:
+            for part in ("net_feat", "net_vp"):
+                weights |= {f"{part}.{key}": value for key, value in renamed(content[part]).items()}
+        except (AttributeError, KeyError, TypeError) as error:
+            raise InputError(f"posecontrast {path}: expected the weights of net_feat and net_vp") from error
+        load_weights(self, weights, f"posecontrast {path}", ignored=("net_feat.fc.",))
         self.eval().requires_grad_(False)
 
     def describe(self, frames: Sequence[Frame]) -> list[tuple[Float[np.ndarray, "3 3"], Float[Tensor, " d"]]]:
@@ -106,24 +113,11 @@ class PoseContrast(nn.Module):
         return found
 
 
-def load_posecontrast() -> PoseContrast:
-    """Load the published network from $ZSP_LITE_POSECONTRAST, or from the cache folder."""
-    path, model = _checkpoint(POSECONTRAST_URL, "ZSP_LITE_POSECONTRAST", "posecontrast.pth"), PoseContrast()
-    content, weights = load_torch(path, "posecontrast"), {}
-    try:
-        for part in ("net_feat", "net_vp"):
-            weights |= {f"{part}.{key}": value for key, value in renamed(content[part]).items()}
-    except (AttributeError, KeyError, TypeError) as error:
-        raise InputError(f"posecontrast {path}: expected the weights of net_feat and net_vp") from error
-    load_weights(model, weights, f"posecontrast {path}", ignored=("net_feat.fc.",))
-    return model
-
-
 def euler_to_rotation(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Convert azimuth, elevation and in-plane angle in degrees to the rotation from canonical frame to camera."""
-    # To an OpenGL camera, it is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
+    # To an OpenGL camera, which looks along -z with +y up, it is Rz(in-plane - 180) Rx(elevation - 180) Rz(azimuth).
     zxz = (np.asarray(angles, np.float64) - (0, 180, 180))[::-1]
-    return _AXES @ Rotation.from_euler("ZXZ", zxz, degrees=True).as_matrix()
+    return np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("ZXZ", zxz, degrees=True).as_matrix()
 
 
 def square_crop(frame: Frame) -> UInt8[np.ndarray, "s s 3"]:

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.baselines.networks import Swav, load_posecontrast
+from zsp_lite.baselines.networks import PoseContrast, Swav
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
@@ -23,7 +23,7 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "rootsift": lambda backbone: RootSift(),
     "sift": lambda backbone: Sift(),
     "swav": lambda backbone: Swav(),
-    "posecontrast": lambda backbone: load_posecontrast(),
+    "posecontrast": lambda backbone: PoseContrast(),
 }
 
 

@@ -32,8 +32,7 @@ def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
     fitted = umeyama_batch(*(points.double().numpy()[sample] for points in (source, target)))[:3]
     poses = Poses(*map(float_tensor, fitted))
-    smallest, largest = SCALE_RANGE
-    poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
+    poses = poses[poses.scale == poses.scale.clamp(*SCALE_RANGE)]
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
     # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)

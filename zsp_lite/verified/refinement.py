@@ -59,13 +59,10 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) 
 def refine(
     poses: Poses, score: Callable[[Poses], Float[Tensor, " _"]], schedule: SearchSchedule, rng: np.random.Generator
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores.
-
-    Each round keeps the best step if it raises the score. A candidate of the next round is the mean of the six best.
-    """
+    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores."""
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
-    # The logarithmic recombination weights of CMA-ES (Hansen 2016).
+    # A candidate of the next round is the mean of the best steps, with the weights of CMA-ES (Hansen 2016).
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None

@@ -28,8 +28,7 @@ class Solution:
     """Hypotheses of the verified solver, and what they were scored on."""
 
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
-    # (N,) angle in degrees between the reference's camera and each target view's under the best one
-    view_angles: Float[np.ndarray, " n"]
+    view_angles: Float[np.ndarray, " n"]  # degrees from the reference's camera to each target view's under the best one
     timings: dict[str, float]  # seconds per stage
     scene: Scene  # the scene that poses were scored on
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
