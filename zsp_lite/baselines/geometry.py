@@ -18,7 +18,6 @@ POINTS = 5000  # largest number of points per cloud
 _MIN_POINTS = 10
 # Every point has a correspondence at any distance, as in PyTorch3D's ICP, which the paper uses.
 _MAX_DISTANCE = 1e6
-_FEWEST_MATCHES = 5  # of an essential matrix
 
 
 def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Sim3:
@@ -68,7 +67,7 @@ def essential_rotation(
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
     threshold = reference.camera.size[0] / grid[0] / focal  # matches are patch centres: a patch is as far as one is off
     poses = []
-    if len(matches) >= _FEWEST_MATCHES:  # five-point RANSAC; OpenCV's draws are always the same
+    if len(matches) >= 5:  # five-point RANSAC; OpenCV's draws are always the same
         found, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, threshold)
         # OpenCV stacks several solutions of one sample; which is meant shows in how many points lie in front.
         for matrix in () if found is None else np.split(found, len(found) // 3):
