@@ -6,21 +6,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from synthetic_views import look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import normalize
-from zsp_lite.baselines import icp as icp_module
-from zsp_lite.baselines.essential_matrix import essential_rotation
-from zsp_lite.baselines.icp import align, icp
+from zsp_lite.baselines import geometry
+from zsp_lite.baselines.geometry import align, essential_rotation, icp
 from zsp_lite.baselines.networks import (
     PoseContrast,
-    ResNet50,
+    Swav,
     euler_to_rotation,
-    load_posecontrast,
-    load_swav,
     square_crop,
 )
 from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches, unproject_pixels
@@ -30,47 +28,74 @@ from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 
-
-def test_resnet50_has_torchvisions_weights_and_its_layers_their_strides():
-    model = ResNet50()
-    shapes = {key: tuple(x.shape) for key, x in model.state_dict().items()}
-    # torchvision's 25,557,032 parameters and 320 entries without the last layer
-    assert sum(x.numel() for x in model.parameters()) == 25_557_032 - 1000 * 2049 and len(shapes) == 318
-    assert shapes["conv1.weight"] == (64, 3, 7, 7) and shapes["layer1.0.downsample.0.weight"] == (256, 64, 1, 1)
-    assert shapes["layer2.0.conv2.weight"] == (128, 128, 3, 3) and shapes["layer3.5.bn3.running_var"] == (1024,)
-    assert shapes["layer4.0.downsample.1.bias"] == (2048,) and shapes["layer4.2.conv1.weight"] == (512, 2048, 1, 1)
-    assert [tuple(x.shape[1:]) for x in model(torch.zeros(1, 3, 64, 64))] == [(1024, 4, 4), (2048, 2, 2)]
+STAGES = ((64, 3), (128, 4), (256, 6), (512, 3))  # width and number of blocks of each layer of ResNet-50
+BLOCKS = [(f"layer{layer}.{k}", layer, k) for layer, (_, blocks) in enumerate(STAGES, 1) for k in range(blocks)]
 
 
-def test_a_block_is_three_convolutions_and_a_shortcut():
-    with torch.random.fork_rng():
-        torch.manual_seed(1)
-        block = ResNet50().layer1[1]
-    x = torch.rand(1, 256, 8, 8)
-    first = torch.relu(block.bn1(torch.conv2d(x, block.conv1.weight)))
-    second = torch.relu(block.bn2(torch.conv2d(first, block.conv2.weight, padding=1)))
-    third = block.bn3(torch.conv2d(second, block.conv3.weight))
-    assert torch.allclose(block(x), torch.relu(third + x), atol=1e-6)
+def torchvision_weights() -> dict[str, torch.Tensor]:
+    """Random weights by the names of torchvision's ResNet-50, without the last linear layer."""
+    shapes, inputs = {"conv1": (64, 3, 7, 7), "bn1": (64,)}, 64
+    for name, layer, block in BLOCKS:
+        width = STAGES[layer - 1][0]
+        kernels = {"conv1": (width, inputs, 1, 1), "conv2": (width, width, 3, 3), "conv3": (4 * width, width, 1, 1)}
+        kernels |= {"downsample.0": (4 * width, inputs, 1, 1)} if block == 0 else {}
+        for part, shape in kernels.items():
+            norm = part.replace("conv", "bn").replace("sample.0", "sample.1")
+            shapes |= {f"{name}.{part}": shape, f"{name}.{norm}": shape[:1]}
+        inputs = 4 * width
+    rng, weights = torch.Generator().manual_seed(0), {}
+    for name, shape in shapes.items():
+        spread = (2 / np.prod(shape[1:])) ** 0.5 if len(shape) > 1 else 0.1
+        weights[f"{name}.weight"] = spread * torch.randn(shape, generator=rng) + (len(shape) == 1)
+        if len(shape) == 1:
+            for part in ("bias", "running_mean", "running_var"):
+                weights[f"{name}.{part}"] = torch.rand(shape, generator=rng)
+            weights[f"{name}.num_batches_tracked"] = torch.tensor(1)
+    return weights
+
+
+def resnet_by_hand(weights: dict[str, torch.Tensor], x: torch.Tensor) -> list[torch.Tensor]:
+    """The outputs of the four layers."""
+
+    def convolved(x, conv, bn, stride=1):
+        x = torch.conv2d(x, kernel := weights[f"{conv}.weight"], stride=stride, padding=kernel.shape[-1] // 2)
+        return F.batch_norm(x, *(weights[f"{bn}.{part}"] for part in ("running_mean", "running_var", "weight", "bias")))
+
+    x, outputs = F.max_pool2d(convolved(x, "conv1", "bn1", 2).relu(), 3, stride=2, padding=1), {}
+    for name, layer, block in BLOCKS:
+        stride = 2 if layer > 1 and block == 0 else 1
+        y = convolved(x, f"{name}.conv1", f"{name}.bn1").relu()
+        y = convolved(y, f"{name}.conv2", f"{name}.bn2", stride).relu()
+        y = convolved(y, f"{name}.conv3", f"{name}.bn3")
+        shortcut = convolved(x, f"{name}.downsample.0", f"{name}.downsample.1", stride) if block == 0 else x
+        x = outputs[layer] = (y + shortcut).relu()
+    return list(outputs.values())
 
 
 @pytest.mark.slow
-def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path, monkeypatch):
+def test_the_swav_checkpoint_describes_patches_by_the_third_layer_on_the_papers_grid(tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
-    state = ResNet50().state_dict() | {"projection_head.0.weight": torch.ones(8), "prototypes.weight": torch.ones(8)}
+    weights = torchvision_weights()
+    assert len(weights) == 318  # of torchvision's 320 entries, those without the last layer
+    state = weights | {"projection_head.0.weight": torch.ones(8), "prototypes.weight": torch.ones(8)}
     state = {f"module.{key}": x for key, x in state.items()}
     path = tmp_path / "swav_800ep_pretrain.pth.tar"
     torch.save(state, path)
-    (found,) = load_swav()([np.full((224, 224, 3), 100, np.uint8)])
-    assert found.keys.shape == (28, 28, 1024) and found.global_feature.shape == (2048,) and found.saliency.min() == 1
+    image = np.random.default_rng(0).integers(0, 256, (448, 448, 3), dtype=np.uint8)
+    (found,) = Swav()([image])
+    *_, third, last = resnet_by_hand(weights, normalize(torch.from_numpy(image).permute(2, 0, 1)[None] / 255))
+    assert found.keys.shape == (28, 28, 1024) and found.saliency.min() == 1
+    torch.testing.assert_close(found.keys.permute(2, 0, 1), third[0], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(found.global_feature, last.mean((2, 3))[0], rtol=1e-3, atol=1e-3)
     torch.save(state | {"module.conv1.weight": torch.zeros(64, 3, 5, 5)}, path)
-    with pytest.raises(InputError, match="conv1.weight"):
-        load_swav()
+    with pytest.raises(InputError, match="swav.* the weights do not fit: .*size mismatch"):
+        Swav()
 
 
 @pytest.mark.parametrize(
     ("load", "url", "variable"),
-    [(load_swav, "https://dl.fbaipublicfiles.com/.*swav", "ZSP_LITE_SWAV"),
-     (load_posecontrast, "https://github.com/.*PoseContrast", "ZSP_LITE_POSECONTRAST")],
+    [(Swav, "https://dl.fbaipublicfiles.com/.*swav", "ZSP_LITE_SWAV"),
+     (PoseContrast, "https://github.com/.*PoseContrast", "ZSP_LITE_POSECONTRAST")],
 )  # fmt: skip
 def test_without_a_checkpoint_one_line_says_where_to_get_it(tmp_path, monkeypatch, load, url, variable):
     monkeypatch.setenv(variable, str(tmp_path / "nowhere.pth"))
@@ -90,29 +115,32 @@ def test_viewpoints_follow_the_convention_of_pascal3d():
 
 @pytest.mark.slow
 def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_pose(tmp_path, monkeypatch):
-    network, path = PoseContrast(), tmp_path / "posecontrast.pth"
-    head, features = network.net_vp.state_dict(), network.net_feat.state_dict()
-    features |= {"fc.weight": torch.ones(128, 2048), "fc.bias": torch.ones(128)}
+    path, weights, layers = tmp_path / "posecontrast.pth", torchvision_weights(), []
+    for inputs, outputs in ((2048, 800), (800, 400), (400, 200)):
+        layers += [torch.nn.Linear(inputs, outputs), torch.nn.BatchNorm1d(outputs), torch.nn.ReLU()]
+    compress, bins = torch.nn.Sequential(*layers).eval().requires_grad_(False), {"azi": 24, "ele": 12, "inp": 24}
+    parts = {f"fc_{kind}_{name}": torch.nn.Linear(200, n) for name, n in bins.items() for kind in ("cls", "reg")}
+    head = torch.nn.ModuleDict({"compress": compress} | parts).state_dict()
+    features = weights | {"fc.weight": torch.ones(128, 2048), "fc.bias": torch.ones(128)}
     torch.save({"epoch": 14, "net_feat": features, "net_vp": head}, path)
     monkeypatch.setenv("ZSP_LITE_POSECONTRAST", str(path))
     frame = object_crop(render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity()))
-    (found,) = load_posecontrast().describe([frame])
+    ((rotation, feature),) = PoseContrast().describe([frame])
     batch = normalize(torch.from_numpy(square_crop(frame)).permute(2, 0, 1)[None] / 255)
-    x = network.net_feat(batch)[-1].mean((2, 3))
-    torch.testing.assert_close(found.feature, x[0])
-    x, angles = network.net_vp["compress"](x)[0], []
-    for name, bins in (("azi", 24), ("ele", 12), ("inp", 24)):
+    x = resnet_by_hand(weights, batch)[-1].mean((2, 3))
+    torch.testing.assert_close(feature, x[0], rtol=1e-3, atol=1e-3)
+    x, angles = compress(x)[0], []
+    for name in bins:
         score, offset = (
             head[f"fc_{kind}_{name}.weight"] @ x + head[f"fc_{kind}_{name}.bias"] for kind in ("cls", "reg")
         )
-        assert len(score) == bins
         angles.append(15 * (int(score.argmax()) + float(offset[score.argmax()])))
-    assert rotation_error(found.rotation, euler_to_rotation(np.clip(angles, 0, 360))) < 0.1
+    assert rotation_error(rotation, euler_to_rotation(np.clip(angles, 0, 360))) < 0.1
     assert {"compress.0.weight", "compress.1.running_mean", "compress.7.bias"} <= head.keys()
     for content in ([1], {"net_feat": features}, {"net_feat": {}, "net_vp": {}}):
         torch.save(content, path)
         with pytest.raises(InputError, match="posecontrast"):
-            load_posecontrast()
+            PoseContrast()
 
 
 def test_a_square_crop_has_the_aspect_ratio_of_the_photograph():
@@ -134,7 +162,7 @@ def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
 def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     """Two sequences of the same object, whose first cameras differ by a few degrees."""
     clouds = []
-    monkeypatch.setattr(icp_module, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
+    monkeypatch.setattr(geometry, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
     cameras = [look_at(side) for side in [(1.0, 0.1, 0.3), (0.95, 0.2, 0.35), (-0.2, 1.0, 0.3)]]
     # As in CO3D, the first camera has the same rotation in the world of every sequence.
     turn = cameras[0].R.T @ cameras[1].R
@@ -146,7 +174,7 @@ def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     found = align(first, targets, 0, firsts, seed=0)
     assert rotation_error(found.R, np.eye(3)) < 1e-6
     source, target = clouds
-    assert len(source) <= icp_module.POINTS and len(target) == icp_module.POINTS
+    assert len(source) <= geometry.POINTS and len(target) == geometry.POINTS
     distance, _ = cKDTree(target).query(source)
     truth = true_pose(first.camera, placements[0], cameras[0], placements[1])
     assert np.median(distance) < 0.15 and 2 < rotation_error(found.R, truth.R) < 10

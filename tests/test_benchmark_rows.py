@@ -6,7 +6,6 @@ import pytest
 import torch
 from benchmark_folder import BACKBONE, run_rows, small_folder
 
-from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import problem
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
@@ -89,7 +88,7 @@ class TrueViewpoints:
         """The pose of each frame's label, and its viewing direction as its feature."""
         labels = read_labels(small_folder(), "pebble")
         found = ((frame.camera.R, labels[frame.name.split("/")[0]].trans[:3, :3]) for frame in frames)
-        return [Viewpoint(camera @ turn, torch.from_numpy(camera[2].copy())) for camera, turn in found]
+        return [(camera @ turn, torch.from_numpy(camera[2].copy())) for camera, turn in found]
 
 
 def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):

@@ -198,9 +198,9 @@ def scores(estimate: PoseEstimate) -> list[float]:
 
 
 def test_the_seed_reaches_the_verified_proposals_and_refinement(views, verified, monkeypatch):
-    propose, refine = solver.propose_poses, solver.refine_coarse_to_fine
+    propose, refine = solver.poses_from_matches, solver.refine_coarse_to_fine
     with monkeypatch.context() as patch:
-        patch.setattr(solver, "propose_poses", lambda scene, rng: propose(scene, np.random.default_rng(0)))
+        patch.setattr(solver, "poses_from_matches", lambda *args: propose(*args[:2], np.random.default_rng(0)))
         assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))
     monkeypatch.setattr(solver, "refine_coarse_to_fine", lambda *args: refine(*args[:2], np.random.default_rng(0)))
     assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.verified.maps import Projection
+from zsp_lite.verified.scene import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import plots, verified
 

@@ -41,7 +41,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
-from zsp_lite.verified.confidence import Calibration, different_poses, evidence, hidden_share, modes
+from zsp_lite.verified.confidence import Calibration, evidence, hidden_share, modes
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
@@ -102,7 +102,7 @@ class Outcome:
         """Return by how many nats each different pose is below the best under the weights, and its error."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
-        different = order[different_poses(modes(self.angles[np.ix_(order, order)]))]
+        different = order[modes(self.angles[np.ix_(order, order)]) == np.arange(len(order))]
         return scores[order[0]] - scores[different], self.errors[different]
 
     def evidence(self, weights: ScoreCoefficients) -> Float[np.ndarray, "6"]:

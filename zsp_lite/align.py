@@ -1,7 +1,4 @@
-"""A whole category in one frame, and one's own pair with the help of others.
-
-The pairs of a category go through the executors of the benchmark and are stored in the folder of a run.
-"""
+"""A whole category in one frame, as a run of the benchmark's kind, and one's own pair with the help of others."""
 
 import json
 import logging
@@ -55,7 +52,8 @@ class PairSolver:
     """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
 
     def __init__(self, root: str, category: str, backbone: FeatureExtractor | str | BackboneConfig, threads: int):
-        self._store = FrameStore(Co3D(root), category, {"backbone": _loaded(backbone)}, threads)
+        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+        self._store = FrameStore(Co3D(root), category, {"backbone": loaded}, threads)
 
     def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Find the hypotheses of the pairs of a chunk."""
@@ -66,10 +64,6 @@ class PairSolver:
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
                 line |= {"probabilities": found.probabilities.tolist()}
             yield line
-
-
-def _loaded(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
-    return load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
 
 
 def align_category(
@@ -103,7 +97,7 @@ def align_category(
             of them, or OUT holds another run.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
-    loaded = _loaded(backbone)
+    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
         open_workers(executor) as (pool, workers),
@@ -134,11 +128,9 @@ def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> t
     """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    alone = [((one.reference, one.target), one.sim3s[0]) for one in found.pairs]
-    together = [(pair, found.between(*pair)) for pair in true]
-    return tuple(
-        [float(rotation_error(sim3.R, true[pair])) for pair, sim3 in some if pair in true] for some in (together, alone)
-    )
+    together = [float(rotation_error(found.between(*pair).R, true[pair])) for pair in true]
+    alone = [((one.reference, one.target), one.sim3s[0].R) for one in found.pairs]
+    return together, [float(rotation_error(rotation, true[pair])) for pair, rotation in alone if pair in true]
 
 
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
@@ -160,15 +152,14 @@ def estimate_with_helpers(
 ) -> PairResult:  # fmt: skip
     """Estimate the pose between the first two of one's own objects; the others settle what these two cannot.
 
-    Others are unlabelled objects of the category. Of the hypotheses for the first two, the one that agrees with the
-    alignment of all objects comes first. An image alone is the reference of pairs only.
+    Of the hypotheses for these two, the one that agrees with the alignment of all objects comes first.
     """
     if len({one.path.resolve() for one in sources}) < len(sources):
         raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
     solve = partial(estimate_pose, solver="verified", targets=targets, backbone=_Remembering(backbone), upright=upright)
     found = {(0, 1): solve(*sources[:2], reference_frame=reference_frame)}
     for a, b in permutations(range(len(sources)), 2):
-        if (a, b) != (0, 1) and sources[b].format != "image":
+        if (a, b) != (0, 1) and sources[b].format != "image":  # an image alone is the reference of pairs only
             with suppress(InputError):  # a pair that has no pose says nothing
                 found[a, b] = solve(sources[a], sources[b], reference_frame=None if a else reference_frame)
     names = [f"{k} {one.name}" for k, one in enumerate(sources)]

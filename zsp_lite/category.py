@@ -67,11 +67,6 @@ class ObjectPose:
     alternative: Sim3 | None  # next best pose, more than 30 degrees off, all other objects fixed; None without one
     alternative_probability: float  # that this is the right one
 
-    @property
-    def turn(self) -> float:
-        """Angle in degrees between the pose and its alternative; 0 without one."""
-        return 0.0 if self.alternative is None else float(rotation_angle(self.sim3.R, self.alternative.R))
-
 
 @dataclass(frozen=True, eq=False)
 class CategoryAlignment:
@@ -90,12 +85,7 @@ class CategoryAlignment:
 def object_pairs(
     dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
 ) -> list[Pair]:
-    """Choose the pairs of objects, and their frames, that a category is aligned by.
-
-    Each object is the reference of `per_object` others; None is all below 12 objects, and 6 from there on. Each pair
-    becomes three pairs of frames: reference frames are evenly spaced over their sequence, to see several sides,
-    and so are the `targets` target frames, from random starts that depend on the two names only.
-    """
+    """Choose the pairs that a category is aligned by (see `align_category`): three pairs of frames for two objects."""
     numbers: dict[str, list[int]] = {}
     for key in dataset.frame_list(category):
         numbers.setdefault(key.sequence_name, []).append(key.frame_number)
@@ -114,6 +104,7 @@ def object_pairs(
     for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
         reference, target = names[a], names[b]
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
+        # Frames that are evenly spaced over a sequence show several sides; the random starts depend on the names only.
         first, around = sorted(numbers[reference]), sorted(numbers[target])
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
         for r in range(REFERENCES):
@@ -207,12 +198,9 @@ def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) 
 
 
 def _search(nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, "n 3 3"]:
-    """Return the rotations that maximise the objective, relative to the first object's.
-
-    In the given order of the objects, each but the first has a pair with an earlier one.
-    """
+    """Return the rotations that maximise the objective, relative to the first object's."""
     rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))
-    for k, i in enumerate(order[1:], 1):
+    for k, i in enumerate(order[1:], 1):  # in this order, each object has a pair with an earlier one
         earlier = np.isin(nodes[i].neighbour, order[:k])
         known = _Node(nodes[i].neighbour[earlier], nodes[i].turn[earlier], nodes[i].weight[earlier])
         _sample(known, rotations, int(i), 1.0, rng)
@@ -240,16 +228,14 @@ def _sample(node: _Node, rotations: _Rotations, i: int, temperature: float, rng:
 def _judge(
     node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int, agreeing: float
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
-    """Return the probability of an object's rotation, the best other one, all others fixed, and its probability.
-
-    They are a conditional logit, whose third alternative is that none is right; it is less probable if more of the
-    object's pairs agree. Its pairs err together, so the margin between the scores counts by the root of their number.
-    """
+    """Return the probability of an object's rotation, the best other one, all others fixed, and its probability."""
     proposals = node.proposals(rotations[None])
     others = proposals.reshape(-1, 3, 3)
     others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
     present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[0].tolist()
+    # The pairs of an object err together, so the margin counts by the root of their number.
     margin = (present - max(scores, default=-np.inf)) / np.sqrt(len(node.neighbour))
+    # A conditional logit; that none is right is less probable if more of the object's pairs agree.
     other, none = np.exp(-MARGIN * margin), np.exp(NONE + NONE_AGREEING * agreeing)
     best = others[np.argmax(scores)] if scores else None
     return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
@@ -258,11 +244,7 @@ def _judge(
 def _scales_and_translations(
     pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"], rotations: Float[np.ndarray, "n 3 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    r"""Fit scales and translations to the hypotheses that agree with the rotations; return the objects' centres too.
-
-    Hypothesis (\lambda, H, \tau) of a pair (a, b) demands \log s_a - \log s_b = \log\lambda. It takes the centre c of
-    a to y = \lambda H c + \tau, which demands t_a - t_b = s_b Q_b y - s_a Q_a c.
-    """
+    """Fit scales and translations to the hypotheses that agree with the rotations; return the objects' centres too."""
     a, b = np.repeat(ends, [len(pair.sim3s) for pair in pairs], axis=0).T
     sim3s = [one for pair in pairs for one in pair.sim3s]
     c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
@@ -270,6 +252,8 @@ def _scales_and_translations(
     angle = np.radians(rotation_angle(rotations[a], rotations[b] @ np.stack([one.R for one in sim3s])))
     probability = np.concatenate([pair.probabilities for pair in pairs])
     weight = probability * (np.exp(KAPPA * (np.cos(angle) - 1)) + _WEAK)
+    # Hypothesis (lambda, H, tau) demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y - s_a Q_a c with
+    # y = lambda H c + tau, the place in the world of b of the centre c of a.
     incidence = np.eye(len(rotations))[a] - np.eye(len(rotations))[b]
     scales = np.exp(_least_absolute(incidence, np.log([[one.scale] for one in sim3s]), weight))[:, 0]
     linear = scales[:, None, None] * rotations

@@ -70,12 +70,10 @@ def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np
 
 
 class RootSift:
-    """Feature extractor (see `features.FeatureExtractor`) with one RootSIFT descriptor per patch.
+    """Feature extractor without saliency: the keys (28, 28, 128) are upright SIFT descriptors at the patch centres.
 
-    The image is resized to 224 pixels. The keys, (28, 28, 128), are upright SIFT descriptors at the patch centres as
-    RootSIFT (Arandjelovic and Zisserman 2012): square roots of L1-normalised histograms, whose dot products are
-    Hellinger kernels. The saliency is 1 everywhere; use object masks. The global feature is the normalised mean of the
-    keys.
+    As RootSIFT (Arandjelovic and Zisserman 2012), they are square roots of L1-normalised histograms, whose dot products
+    are Hellinger kernels. The global feature is their normalised mean.
     """
 
     name = "rootsift"
@@ -100,11 +98,7 @@ class RootSift:
 def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
-    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding.
-
-    The weights of the histograms are separable in rows and columns: two small matrix products compute all of them, in
-    a hundredth of OpenCV's time.
-    """
+    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding."""
     n, side = len(grey), len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)
     right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # gradients are 0 at the border
@@ -114,6 +108,7 @@ def dense_sift(
     # Each gradient contributes to the two nearest orientations, with linear weights.
     distance = np.abs(angle * (_BINS / 360) - np.arange(_BINS, dtype=np.float32)[:, None, None])
     oriented = length * np.maximum(1 - np.minimum(distance, _BINS - distance), 0)
+    # The weights are separable in rows and columns: two small products do it in a hundredth of OpenCV's time.
     weights = _weights(n, centres, _CELL * size)
     cells = (weights @ oriented @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
     histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)

@@ -8,8 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.baselines.icp import align
-from zsp_lite.baselines.networks import Viewpoint
+from zsp_lite.baselines.geometry import align
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
@@ -50,11 +49,9 @@ def sift(problem: Problem) -> Answer:
 
 def posecontrast(problem: Problem) -> Answer:
     """Run "PoseContrast": the relative rotation of the viewpoints of the reference and the most similar view."""
-    first: Viewpoint
-    first, *others = (problem.store.describe("posecontrast", key) for key in problem.keys)
-    similarity = [float(F.cosine_similarity(first.feature, other.feature, dim=0)) for other in others]
-    view = int(np.argmax(similarity))
-    return Answer(others[view].rotation @ first.rotation.T, view)
+    (rotation, feature), *others = (problem.store.describe("posecontrast", key) for key in problem.keys)
+    view = int(np.argmax([float(F.cosine_similarity(feature, other, dim=0)) for _, other in others]))
+    return Answer(others[view][0] @ rotation.T, view)
 
 
 def category(problem: Problem) -> Answer:

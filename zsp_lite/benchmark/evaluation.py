@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.backbones.load import BackboneConfig, load_backbone
-from zsp_lite.baselines.essential_matrix import essential_rotation
+from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark.methods import METHODS, Method, make_extractors
 from zsp_lite.benchmark.own import describe_failure
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.baselines.networks import load_posecontrast, load_swav
+from zsp_lite.baselines.networks import PoseContrast, Swav
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
@@ -22,8 +22,8 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "backbone": lambda backbone: backbone,
     "rootsift": lambda backbone: RootSift(),
     "sift": lambda backbone: Sift(),
-    "swav": lambda backbone: load_swav(),
-    "posecontrast": lambda backbone: load_posecontrast(),
+    "swav": lambda backbone: Swav(),
+    "posecontrast": lambda backbone: PoseContrast(),
 }
 
 

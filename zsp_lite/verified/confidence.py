@@ -45,11 +45,7 @@ def evidence(
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda.
-
-    They are fitted on validation categories of equal weight, with target views all around the object and within arcs
-    of 30 to 120 degrees (`tools/tuning.py`).
-    """
+    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda (fit: `tools/tuning.py`)."""
 
     scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
@@ -75,23 +71,14 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
     return np.array(found)
 
 
-def different_poses(mode: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
-    """Return the indices of the hypotheses that stand for themselves (see `modes`), best first."""
-    return np.flatnonzero(mode == np.arange(len(mode)))
-
-
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses.
-
-    That is one of just two that are nearly as probable, and together more probable than not.
-    """
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
     terms, flags = hypotheses[0].terms, []
     probability = np.array([one.confidence for one in hypotheses])
-    different = different_poses(np.array([one.mode for one in hypotheses]))
-    tied = different[probability[different] > TIE_RATIO * probability[0]]
-    # More than 60 degrees apart, no rotation is within 30 degrees of both.
+    tied = [k for k, one in enumerate(hypotheses) if one.mode == k and probability[k] > TIE_RATIO * probability[0]]
+    # Together more probable than not; more than 60 degrees apart, no rotation is within 30 degrees of both.
     one_of_two = bool(len(tied) == 2 and probability[tied].sum() > 0.5 and angle[tied[0], tied[1]] > 2 * MODE_ANGLE)
     if len(tied) > 1:
         shown = " and ".join(f"{probability[i]:.2f}" for i in tied)

@@ -12,14 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.alignment import umeyama_batch
-from zsp_lite.verified.poses import (
-    SCALE_RANGE,
-    Poses,
-    concatenate,
-    float_tensor,
-    non_maximum_suppression,
-    rotation_matrices,
-)  # fmt: skip
+from zsp_lite.verified.poses import SCALE_RANGE, Poses, float_tensor, non_maximum_suppression, rotation_matrices
 from zsp_lite.verified.scene import Scene
 
 _TRIALS = 300  # samples of three matches, per view
@@ -32,38 +25,25 @@ _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about 
 _VIEW_SCALE = 0.9
 
 
-def propose_poses(scene: Scene, rng: np.random.Generator) -> Poses:
-    """Propose poses from the matches of each target view, and from viewpoints."""
-    proposals = [poses_from_matches(source, target, rng) for source, target in scene.matches]
-    return concatenate([*proposals, poses_from_views(scene)])
-
-
 def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator) -> Poses:
-    """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees.
-
-    Samples are scored as in MSAC (Torr and Zisserman 2000), by the truncated quadratic
-    sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2) over all matches.
-    """
+    """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees."""
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
     fitted = umeyama_batch(*(points.double().numpy()[sample] for points in (source, target)))[:3]
     poses = Poses(*map(float_tensor, fitted))
-    smallest, largest = SCALE_RANGE
-    poses = poses[(poses.scale >= smallest) & (poses.scale <= largest)]
+    poses = poses[poses.scale == poses.scale.clamp(*SCALE_RANGE)]
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
+    # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
     return poses[best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)]]
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return poses under which the reference has viewpoints all around the object, with the centroids aligned.
-
-    These are the viewpoints of the target views, and that of the scene's first view turned about the vertical by 30,
-    60, ..., 330 degrees. The vertical is the mean of the directions that are up in the target images.
-    """
+    """Return poses with the viewpoints of the target views, and that of the first one turned about the vertical."""
     views = scene.target_maps.rotation.transpose(1, 2)
+    # The mean of the directions that are up in the target images.
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)
     rotation = torch.cat([views, rotation_matrices(_TURNS[:, None] * vertical) @ views[0]])
     return Poses(torch.full((len(rotation),), _VIEW_SCALE), rotation, torch.zeros(len(rotation), 3))

@@ -43,25 +43,26 @@ POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, s
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
-    score, fine_score = (partial(_score, scene, counts) for counts in (_SEARCH_POINTS, _POLISH_POINTS))
+
+    def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
+        totals = len(scene.reference_points), len(scene.target_points)
+        stride = tuple(max(round(total / count), 1) for total, count in zip(totals, points))
+        return WEIGHTS.score(score_terms(scene, poses, stride))
+
     for schedule in (COARSE, FINE):
         poses, reached = refine(poses, score, schedule, rng)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
-    polished, _ = refine(poses[:_MAX_POLISHED], fine_score, POLISH, rng)
+    polished, _ = refine(poses[:_MAX_POLISHED], partial(score, points=_POLISH_POINTS), POLISH, rng)
     return concatenate([polished, poses[_MAX_POLISHED:]])
 
 
 def refine(
     poses: Poses, score: Callable[[Poses], Float[Tensor, " _"]], schedule: SearchSchedule, rng: np.random.Generator
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores.
-
-    Each round keeps the best step if it raises the score. The weighted mean of the six best steps is a candidate of
-    the next round, with the logarithmic recombination weights of CMA-ES (Hansen 2016), w_k ~ log(6.5) - log(k).
-    Rotations are about the centroid of the reference's points, which is the origin in working units.
-    """
+    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores."""
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
+    # A candidate of the next round is the mean of the best steps, with the weights of CMA-ES (Hansen 2016).
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None
@@ -78,12 +79,8 @@ def refine(
         mean = (steps[rows[:, None], top] * weights).sum(dim=1)
         # Relative to the pose from which the next round starts.
         recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
-        poses = Poses(
-            torch.where(improved, candidates.scale[index], poses.scale),
-            torch.where(improved[:, None, None], candidates.rotation[index], poses.rotation),
-            torch.where(improved[:, None], candidates.translation[index], poses.translation),
-        )
-        best_score = torch.where(improved, top_score[:, 0], best_score)
+        poses = concatenate([poses, candidates])[torch.where(improved, m + index, rows)]
+        best_score = torch.maximum(best_score, top_score[:, 0])
     return poses, best_score
 
 
@@ -94,10 +91,3 @@ def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: Search
     scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)
     translation = poses.translation[:, None] + schedule.translation * steps[..., 3:6]
     return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))
-
-
-def _score(scene: Scene, counts: tuple[int, int], poses: Poses) -> Float[Tensor, " m"]:
-    """Score poses by about `counts` points of the reference and of the targets."""
-    totals = len(scene.reference_points), len(scene.target_points)
-    stride = tuple(max(round(total / count), 1) for total, count in zip(totals, counts))
-    return WEIGHTS.score(score_terms(scene, poses, stride))

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
-from zsp_lite.verified.poses import Poses, non_maximum_suppression, rotation_angles
-from zsp_lite.verified.proposals import propose_poses
+from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles
+from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.verified.soft_icp import soft_icp
@@ -29,8 +28,7 @@ class Solution:
     """Hypotheses of the verified solver, and what they were scored on."""
 
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
-    # (N,) angle in degrees between the reference's camera and each target view's under the best one
-    view_angles: Float[np.ndarray, " n"]
+    view_angles: Float[np.ndarray, " n"]  # degrees from the reference's camera to each target view's under the best one
     timings: dict[str, float]  # seconds per stage
     scene: Scene  # the scene that poses were scored on
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
@@ -61,20 +59,20 @@ class VerifiedSolver:
         )  # fmt: skip
 
     def solve(self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0) -> Solution:
-        """Run all stages on usable target views and their matches with the reference.
-
-        The result is equivariant to the order of the target views and to rotations of their world frame.
-        """
+        """Run all stages on usable target views, in any order and any world, and their matches with the reference."""
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
             with timed(timings, "scene"):
-                order = _content_order(targets)
-                scene = build_scene(
-                    reference, [targets[k] for k in order], [matched[k].similarity for k in order],
-                    [matched[k].matches for k in order],
-                )  # fmt: skip
+                # By a hash of their content, which neither the order of the targets nor the world's axes change.
+                content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+                digests = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
+                order = tuple(sorted(range(len(targets)), key=digests.__getitem__))
+                targets, matched = ([some[k] for k in order] for some in (targets, matched))
+                similarities, matches = [one.similarity for one in matched], [one.matches for one in matched]
+                scene = build_scene(reference, targets, similarities, matches)
             with timed(timings, "proposals"):
-                poses = propose_poses(scene, rng)
+                by_view = [poses_from_matches(*points, rng) for points in scene.matches]
+                poses = concatenate([*by_view, poses_from_views(scene)])
             with timed(timings, "alignment"):
                 poses = soft_icp(scene, poses)
             with timed(timings, "verification"):
@@ -87,30 +85,17 @@ class VerifiedSolver:
                 best = non_maximum_suppression(poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
                 poses, terms = poses[best], terms[best]
                 angles = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
-                hypotheses = _hypotheses(scene, poses, terms, angles, order)
-        view_angles = np.empty(len(order))
-        view_angles[list(order)] = angles[0]
+                score, shape_fit = (one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape()))
+                mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
+                apart = float(angles[0].min())
+                facts = scene.view_span, len(order), apart, scene.view_similarity_std, float(shape_fit[0])
+                deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)  # of different poses
+                confidence = Calibration().probabilities(deficit, evidence(*facts))[mode]
+                nearest = angles.argmin(axis=1).tolist()  # the scene's view that is closest under each pose
+                sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
+                named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
+                views = [order[view] for view in nearest]
+                parts = sim3s, views, score.tolist(), named, confidence.tolist(), mode.tolist()
+                hypotheses = tuple(Hypothesis(*one) for one in zip(*parts))
+        view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
-
-
-def _hypotheses(
-    scene: Scene, poses: Poses, terms: Float[Tensor, "m 9"], angles: Float[np.ndarray, "m v"], order: Sequence[int]
-) -> tuple[Hypothesis, ...]:
-    """Build the hypotheses of ranked poses, each with the view of the scene that is closest under it."""
-    views = angles.argmin(axis=1)
-    score, shape_fit = (one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape()))
-    mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-    nearest, fit = float(angles[0].min()), float(shape_fit[0])
-    known = evidence(scene.view_span, len(order), nearest, scene.view_similarity_std, fit)
-    deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)  # of different poses
-    confidence = Calibration().probabilities(deficit, known)[mode]
-    sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(views.tolist())]
-    named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
-    parts = sim3s, [order[view] for view in views], score.tolist(), named, confidence.tolist(), mode.tolist()
-    return tuple(Hypothesis(*one) for one in zip(*parts))
-
-
-def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
-    """Sort the targets by a hash of their content, which neither their order nor the world's axes change."""
-    content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
-    return tuple(sorted(range(len(targets)), key=lambda k: hashlib.blake2b(content[k], digest_size=16).digest()))

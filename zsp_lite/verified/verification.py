@@ -31,8 +31,8 @@ and the ninth, with l_v the feature similarity of target view v to the reference
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
-The weights w are those of a conditional logit (McFadden 1974): S is in nats, and among the hypotheses of a pair the
-probability that one is correct is proportional to \exp(S). `tools/tuning.py` fits them.
+The weights w are those of a conditional logit (McFadden 1974), fitted by `tools/tuning.py`: among the hypotheses of a
+pair, the probability that one is correct is proportional to \exp(S).
 """
 
 from collections.abc import Iterator
@@ -42,9 +42,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from zsp_lite.verified.maps import Projection, project_points
 from zsp_lite.verified.poses import Poses, exp_, rotation_angles
-from zsp_lite.verified.scene import Scene
+from zsp_lite.verified.scene import Projection, Scene, project_points
 
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
@@ -55,7 +54,7 @@ _CHUNK = 250_000  # projected points at a time, so that intermediate results sta
 
 @dataclass(frozen=True)
 class ScoreCoefficients:
-    """The weight of each term, in nats. The defaults were fitted on training categories (`tools/tuning.py`)."""
+    """The weight of each term, in nats. The defaults were fitted on training categories."""
 
     forward_similarity: float = 13.3
     forward_overlap: float = 5.3
@@ -127,17 +126,14 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
         some = poses[first : first + size]
         forward, reverse = forward_terms(scene, some, stride[0]), reverse_terms(scene, some, stride[1])
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
-    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint_term(scene, poses)], dim=1)
-
-
-def viewpoint_term(scene: Scene, poses: Poses) -> Float[Tensor, " m"]:
-    """Compute the viewpoint term; its angle includes rotation about the line of sight, with which features change."""
+    # The angle includes rotation about the line of sight, with which features change.
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
-    return torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
+    viewpoint = torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
+    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint], dim=1)
 
 
 def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
-    """Compute the point terms of a projection."""
+    """Read the similarity of point i to patch j at index `offset[i] + patch_stride * j`."""
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
     free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)

@@ -59,7 +59,10 @@ def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
     """Return the lines of the table of objects: name, probability, and the next best turn with its probability."""
     rows = []
     for name, one in alignment.objects.items():
-        other = (f"{one.turn:.0f}°", f"{100 * one.alternative_probability:.0f}") if one.alternative else ("", "")
+        other = "", ""
+        if one.alternative:
+            turn = rotation_angle(one.sim3.R, one.alternative.R)
+            other = f"{turn:.0f}°", f"{100 * one.alternative_probability:.0f}"
         flag = " (look)" if name in doubtful(alignment) else ""
         rows.append((f"{name}{flag}", f"{100 * one.probability:.0f}", *other))
     return rows
