@@ -16,7 +16,7 @@ from nbgrader.api import Gradebook
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from traitlets.config import PyFileConfigLoader
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unchecked_annotations")]
 
 EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
@@ -166,10 +166,6 @@ STATEMENTS = {
         "13 that only the new method solves against 1": lambda cells: (
             [np.sum((cells[a] < 30) & (cells[b] >= 30)) for a, b in (("new", "old"), ("old", "new"))] == [13, 1]
         ),
-        # A gain of 3 points at a discordance of 12 %: z = 2, and z = 1.96 + 0.84 for a power of 80 %.
-        "exceeded from about 530 pairs on, and a power of 80 % takes about 1,050": lambda cells: (
-            round(0.12 * (2 / 0.03) ** 2, -1) == 530 and round(0.12 * (2.8 / 0.03) ** 2, -1) == 1050
-        ),
         "A has the smaller median and the larger Acc30, B the smaller mean and no error above 45°": lambda cells: (
             (cells["figures"]["A"] - cells["figures"]["B"] > 0).tolist() == [False, True, True]
             and cells["method_b"].max() <= 45
@@ -308,11 +304,24 @@ def {0}(*arguments):
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared, assignment):
+def test_functions_that_call_the_library_fail_all_tests(prepared, assignment):
+    notebook = source(assignment)
     for task in MISTAKES[assignment]:
-        notebook = source(assignment)
         graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
-        assert failing_tests(prepared(assignment), notebook, notebook) == {f"test_{task}_1", f"test_{task}_2"}
+    assert failing_tests(prepared(assignment), notebook, notebook) == set(graded(notebook, grade=True, locked=True))
+
+
+# Several commands in one process, because nbgrader takes long to import.
+NBGRADER = """
+import sys
+from nbgrader.apps.nbgraderapp import NbGraderApp
+for command in sys.argv[1:]:
+    NbGraderApp.clear_instance()
+    try:
+        NbGraderApp.launch_instance([command, *(["05_metrics"] if command != "export" else [])])
+    except SystemExit:  # autograde ends so after a damaged file
+        pass
+"""
 
 
 def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, monkeypatch):
@@ -327,11 +336,13 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     monkeypatch.setenv("PYTHONPATH", str(EXERCISES.parents[1]))
 
     def run(*words):
-        words = [sys.executable, "-m", "nbgrader", *words] if words[0] != "git" else words
         return subprocess.run(words, cwd=folder, capture_output=True, text=True)
 
+    def nbgrader(*commands):
+        return run(sys.executable, "-c", NBGRADER, *commands).stderr
+
     run("git", "init", str(tmp_path)), run("git", "add", str(tmp_path))
-    assert run("generate_assignment", name).returncode == 0
+    nbgrader("generate_assignment")
     handed_in = nbformat.read(folder / "release" / name / f"{name}.ipynb", as_version=4)
     solutions, answers = graded(source(name), solution=True), graded(handed_in, solution=True)
     first, second, _ = MISTAKES[name]
@@ -347,13 +358,10 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     lines = [["\ufeffIdentifier", "Grade"], *([f"Participant {number}", ""] for number in (123, 124, 125, 126))]
     (downloads / "worksheet.csv").write_text("\n".join(map(",".join, lines)))
 
-    for _ in range(2):  # a second time, after another download
-        assert run("zip_collect", name).returncode == 0
-    log = run("autograde", name).stderr
+    log = nbgrader("zip_collect", "zip_collect", "autograde", "export")  # the second as after another download
     assert set(re.findall("'checksum' for cell (\\w+) has changed", log)) == set(
         graded(source(name), locked=True, grade=True)
     )
-    log = run("export").stderr
     assert "123: answers to be graded by hand" in log and "124: not graded" in log
     assert "Eve_125_assignsubmission_file_homework.ipynb was not collected" in log
     with Gradebook(f"sqlite:///{folder / 'gradebook.db'}", "zsp-lite") as gradebook:
@@ -364,13 +372,12 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
                 grade.manual_score, grade.needs_manual_grade = 1.5, False
         gradebook.db.commit()
     assert points == {f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)}
-    run("export")
+    nbgrader("export", "generate_feedback")
     grades = [line.split(",") for line in (folder / "grades.csv").read_text().splitlines()]
     assert grades[1:] == [[name, "123", "5.5", "20", "graded"], [name, "124", "", "20", "not graded"]]
     filled = (downloads / "worksheet_filled.csv").read_text().splitlines()
     assert filled[1:] == ["Participant 123,5.5", "Participant 124,", "Participant 125,", "Participant 126,"]
 
-    assert run("generate_feedback", name).returncode == 0
     page = (folder / "feedback" / "123" / name / f"{name}.html").read_text(encoding="utf-8")
     scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
     assert scores[0] == ("Task 1 · Symmetric objects: An n-fold symmetry", "2.0", "2.0") and "HIDDEN TESTS" in page
@@ -393,13 +400,9 @@ def test_nbgrader_recognises_the_files_of_learning_platforms(config):
         assert found.groupdict() == {"student_id": "123", "file_id": "05_metrics"}
 
 
-def test_the_five_exercises_have_100_points_and_no_test_decides_more_than_two():
-    readme = (EXERCISES / "README.md").read_text()
-    for assignment in ASSIGNMENTS:
-        notebook = source(assignment)
-        points = {name: cell.metadata.nbgrader.points for name, cell in graded(notebook, grade=True).items()}
-        tests = [name for name in points if name.startswith("test_")]
-        assert tests == [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
-        assert [*points.values()] == [2] * 6 + [4] * 2 and "20 points: 12 by tests, 8 by" in notebook.cells[0].source
-        titles = [re.match(r"## Task \d · (.*) \(4 points", cell.source) for cell in notebook.cells]
-        assert all(title[1].lower() in readme.lower() for title in titles if title) and sum(map(bool, titles)) == 5
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_an_exercise_has_20_points_and_no_test_decides_more_than_two(assignment):
+    points = {name: cell.metadata.nbgrader.points for name, cell in graded(source(assignment), grade=True).items()}
+    tests = [name for name in points if name.startswith("test_")]
+    assert tests == [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
+    assert [*points.values()] == [2] * 6 + [4] * 2
