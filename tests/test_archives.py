@@ -212,13 +212,6 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     assert len(server.ranges) == 1  # the archive that was there is not downloaded again
 
 
-def test_an_archive_with_another_digest_is_not_unpacked(server, tmp_path, capsys):
-    server.files[CHUNKS[1]] = server.files[CHUNKS[1]][:-1] + b"x"
-    assert download(tmp_path / "co3d") == 2
-    assert "is another file" in capsys.readouterr().err
-    assert not (tmp_path / "co3d/toaster").exists() and files_of(tmp_path / "co3d") == []
-
-
 @pytest.mark.parametrize("name", ["../outside", "/outside", "toaster/../../outside", "toaster\\..\\x", "toaster//x"])
 def test_nothing_is_written_outside_the_folder_and_no_link_is_made(server, tmp_path, capsys, name):
     data, member = io.BytesIO(), zipfile.ZipInfo(name)
@@ -244,13 +237,21 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, capsys
     assert "leads out of the data folder" in capsys.readouterr().err and files_of(tmp_path / "elsewhere") == []
 
 
-@pytest.mark.parametrize("damage", [lambda whole: b"not a zip archive", lambda whole: whole.replace(b"JFIF", b"XXXX")])
-def test_a_damaged_archive_gives_one_line(server, tmp_path, capsys, damage):
+@pytest.mark.parametrize(
+    ("damage", "listed", "message"),
+    [(lambda whole: b"not a zip archive", True, "is damaged or encrypted"),
+     (lambda whole: whole.replace(b"JFIF", b"XXXX"), True, "is damaged or encrypted"),
+     (lambda whole: whole[:-1] + b"x", False, "is another file")],
+)  # fmt: skip
+def test_a_damaged_archive_or_one_with_another_digest_is_not_unpacked(
+    server, tmp_path, capsys, damage, listed, message
+):
     server.files[CHUNKS[1]] = damage(server.files[CHUNKS[1]])
-    write_catalogue(server)
+    if listed:
+        write_catalogue(server)
     assert download(tmp_path / "co3d") == 2
-    assert "is damaged or encrypted" in capsys.readouterr().err
-    assert Co3D(tmp_path / "co3d").categories() == []
+    assert message in capsys.readouterr().err
+    assert not list((tmp_path / "co3d").rglob("*.jgz"))  # without annotations there is no category
 
 
 def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path, capsys, monkeypatch):

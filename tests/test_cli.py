@@ -58,56 +58,45 @@ def test_help_imports_no_large_library():
     assert finished.stderr.strip() == "set()"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "Missing command"),
-        (["fly"], "No such command 'fly'"),
-        (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range 1<=x<=1000000"),
-        (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
-        (["benchmark", "--methods", ","], "expected names separated by commas"),
-        (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed', expected mean_category_median, acc30"),
-        (["synth", "--preset", "demo"], "Missing option '--out'"),
-        (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
-        (["synth", "--preset", "demo", "--frames", "3", "--out", "x"], "--frames does not go with --preset"),
-        (["synth", "--category", "mouse", "--up", "+z", "--out", "x"], "--up does not go with --category"),
-        (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
-        (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
-        (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
-    ],
-)
-def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
-    assert cli.main(arguments) == 2
-    line = assert_one_line(capsys)
-    assert message in line and "(see: zsp-lite" in line
+WRONG = [
+    ([], "Missing command"),
+    (["fly"], "No such command 'fly'"),
+    (["benchmark", "--pairs", "0"], "0 is not in the range"),
+    (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
+    (["benchmark", "--methods", ","], "expected names separated by commas"),
+    (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed'"),
+    (["synth", "--preset", "demo"], "Missing option '--out'"),
+    (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
+    (["synth", "--preset", "demo", "--frames", "3", "--out", "x"], "--frames does not go with --preset"),
+    (["synth", "--category", "mouse", "--up", "+z", "--out", "x"], "--up does not go with --category"),
+    (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
+    (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
+    (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
+    (["demo", "--data", "no/such/folder"], "no/such/folder"),
+    (["demo", "--backbone", "resnet"], "resnet"),
+    (["demo", "--layer", "block12"], "'block0' to 'block11'"),
+    (["benchmark", "--methods", "magic"], "magic"),
+    (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
+    (["tables", "."], "run.json"),
+    (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
+    (["synth", "--category", "sofa", "--out", "x"], "sofa"),
+    (["weights", "fetch", "resnet"], "resnet"),
+    (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
+    (["data", "check", "/nowhere"], "does not exist"),
+    (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
+    ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
+    ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
+    ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
+]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "names"),
-    [
-        (["demo", "--data", "no/such/folder"], "no/such/folder"),
-        (["demo", "--backbone", "resnet"], "resnet"),
-        (["demo", "--layer", "block12"], "'block0' to 'block11'"),
-        (["benchmark", "--methods", "magic"], "magic"),
-        (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
-        (["tables", "."], "is not the folder of a benchmark run: it has no run.json"),
-        (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
-        (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["weights", "fetch", "resnet"], "resnet"),
-        (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
-        (["data", "check", "/nowhere"], "does not exist"),
-        (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
-        ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
-        ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
-        ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
-    ],
-)
-def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys, ellipsoids, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("arguments", "part"), WRONG)
+def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, part, capsys, ellipsoids, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if arguments[0] in ("demo", "benchmark") and "--data" not in arguments:
+    if arguments and arguments[0] in ("demo", "benchmark") and "--data" not in arguments:
         arguments = [*arguments, "--data", str(ellipsoids.root)]
     assert cli.main(arguments) == 2
-    assert names in assert_one_line(capsys)
+    assert part in assert_one_line(capsys)
     assert not list(tmp_path.iterdir())
 
 
@@ -199,7 +188,7 @@ def test_benchmark_list_has_every_method_and_group_in_100_columns(capsys):
 
 
 def test_a_reader_that_ends_early_ends_the_output_without_an_error():
-    for command, reader in (("benchmark --list", "head -1"), ("weights list", "true"), ("--help", "true")):
+    for command, reader in (("benchmark --list", "head -1"), ("--help", "true")):
         pipe = f"{sys.executable} -u -m zsp_lite {command} | {reader}; exit ${{PIPESTATUS[0]}}"
         done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, ""), command

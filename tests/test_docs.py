@@ -6,7 +6,6 @@ import re
 import runpy
 import shlex
 from pathlib import Path
-from xml.etree import ElementTree
 
 import click
 import numpy as np
@@ -27,7 +26,6 @@ PAGES = [
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
-SVG = "{http://www.w3.org/2000/svg}"
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
@@ -72,15 +70,6 @@ def test_the_page_of_the_command_line_is_that_of_the_program():
     assert command_line.PAGE.read_text() == command_line.page(), "run python -m tools.command_line"
 
 
-def test_the_table_of_notebooks_has_every_notebook_and_the_start_page_includes_it():
-    readme, start = ((REPOSITORY / name).read_text() for name in ("README.md", "docs/index.md"))
-    marks = re.findall(r"^:(?:start-after|end-before): (.+)$", start, re.MULTILINE)
-    table = readme.partition(marks[0])[2].partition(marks[1])[0]
-    assert re.findall(r"\]\(notebooks/(.+?)\)", table) == sorted(
-        path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb")
-    )
-
-
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_module_and_file_of_the_package_that_is_named_exists(page):
     text = markdown(page)
@@ -97,23 +86,17 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
-def test_every_environment_variable_that_is_named_occurs_in_the_code(page):
+def test_every_environment_variable_and_make_target_that_is_named_exists(page):
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
-    named = set(re.findall(r"\bZSP_LITE_\w+", markdown(page)))
+    named, inline = set(re.findall(r"\bZSP_LITE_\w+", markdown(page))), _INLINE_CODE.findall(markdown(page))
     pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
-    named |= {code for code in _INLINE_CODE.findall(markdown(page)) if re.fullmatch(pattern, code)}
+    named |= {code for code in inline if re.fullmatch(pattern, code)}
     for name in named:
         assert any(name.removeprefix("$") in path.read_text() for path in files), name
-
-
-@pytest.mark.parametrize("page", PAGES, **ids)
-def test_every_make_target_that_is_named_exists(page):
     targets = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
-    commands = [*_INLINE_CODE.findall(markdown(page)), *command_blocks(page)]
-    for command in commands:
-        if words := re.findall(r"(?:^|\s)make ([a-z-]+)", command):
-            assert set(words) <= targets, command
+    for command in (*inline, *command_blocks(page)):
+        assert set(re.findall(r"(?:^|\s)make ([a-z-]+)", command)) <= targets, command
 
 
 def parse(words: list[str]) -> None:
@@ -234,10 +217,3 @@ def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
         assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
-
-
-@pytest.mark.parametrize("path", sorted(drawings.FOLDER.glob("*.svg")), ids=lambda path: path.stem)
-def test_every_drawing_is_described_and_needs_nothing_from_elsewhere(path):
-    root = ElementTree.parse(path).getroot()
-    assert len(root.find(f"{SVG}title").text) > 3 and len(root.find(f"{SVG}desc").text) > 60
-    assert not {f"{SVG}image", f"{SVG}use", f"{SVG}style"} & {element.tag for element in root.iter()}

@@ -114,16 +114,6 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     assert labelling.progress()[-1].state == "open"
 
 
-def test_a_change_that_is_refused_leaves_a_skipped_sequence_skipped(root):
-    labelling = Labelling(root, "chair")
-    labelling.skip("b")
-    labelling.undo("b")
-    with pytest.raises(InputError, match="all 0 keypoints are picked"):
-        labelling.pick("b", (0, 0, 0))
-    assert labelling.progress() == Labelling(root, "chair").progress()
-    assert labelling.progress()[-1].state == "skipped"
-
-
 def test_invalid_categories_sequences_and_picks_are_refused(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
