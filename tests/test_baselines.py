@@ -31,8 +31,13 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 
 
-def test_resnet50_has_torchvisions_weights_and_its_layers_their_strides():
-    model = ResNet50()
+@pytest.fixture(scope="module")
+def resnet():
+    return ResNet50()
+
+
+def test_resnet50_has_torchvisions_weights_and_its_layers_their_strides(resnet):
+    model = resnet
     shapes = {key: tuple(x.shape) for key, x in model.state_dict().items()}
     # torchvision's 25,557,032 parameters and 320 entries without the last layer
     assert sum(x.numel() for x in model.parameters()) == 25_557_032 - 1000 * 2049 and len(shapes) == 318
@@ -42,10 +47,8 @@ def test_resnet50_has_torchvisions_weights_and_its_layers_their_strides():
     assert [tuple(x.shape[1:]) for x in model(torch.zeros(1, 3, 64, 64))] == [(1024, 4, 4), (2048, 2, 2)]
 
 
-def test_a_block_is_three_convolutions_and_a_shortcut():
-    with torch.random.fork_rng():
-        torch.manual_seed(1)
-        block = ResNet50().layer1[1]
+def test_a_block_is_three_convolutions_and_a_shortcut(resnet):
+    block = resnet.layer1[1]
     x = torch.rand(1, 256, 8, 8)
     first = torch.relu(block.bn1(torch.conv2d(x, block.conv1.weight)))
     second = torch.relu(block.bn2(torch.conv2d(first, block.conv2.weight, padding=1)))
@@ -54,9 +57,9 @@ def test_a_block_is_three_convolutions_and_a_shortcut():
 
 
 @pytest.mark.slow
-def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(tmp_path, monkeypatch):
+def test_the_swav_checkpoint_loads_and_describes_patches_on_the_papers_grid(resnet, tmp_path, monkeypatch):
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path))
-    state = ResNet50().state_dict() | {"projection_head.0.weight": torch.ones(8), "prototypes.weight": torch.ones(8)}
+    state = resnet.state_dict() | {"projection_head.0.weight": torch.ones(8), "prototypes.weight": torch.ones(8)}
     state = {f"module.{key}": x for key, x in state.items()}
     path = tmp_path / "swav_800ep_pretrain.pth.tar"
     torch.save(state, path)

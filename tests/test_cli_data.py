@@ -1,6 +1,5 @@
 """The commands for data: their output, the files they write, and one line for bad input."""
 
-import re
 import shutil
 from pathlib import Path
 
@@ -69,15 +68,6 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
     assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
     capture = (Path("scan"), {"depth_unit": 0.5})
     assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
-
-
-def test_the_help_of_the_import_lists_what_every_format_holds(capsys):
-    assert main(["data", "import", "--help"]) == 0
-    text = capsys.readouterr().out
-    table = text[text.index("which holds:") : text.index("The object is given by")]
-    assert re.findall(r"^ {4}(\w+) ", table, re.MULTILINE) == list(READERS)
-    for name in ("transforms.json", "poses.txt", "--depth-unit"):
-        assert name in table, name
 
 
 def test_errors_of_the_import_name_the_option_that_cures(tmp_path, capsys):

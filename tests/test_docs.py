@@ -1,4 +1,4 @@
-"""README.md, docs/, text and drawings of notebooks: links lead somewhere, names exist, commands parse, code runs."""
+"""README.md, docs/, text and drawings of notebooks: names exist, commands parse, code runs."""
 
 import importlib.util
 import json
@@ -26,7 +26,6 @@ PAGES = [
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
-_LINK = re.compile(r"\]\(([^)\s]+)\)")
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 
@@ -46,24 +45,6 @@ def command_blocks(page: Path) -> list[str]:
     """The lines of indented code blocks, with continued lines joined."""
     lines = [line[4:] for line in markdown(page).splitlines() if line.startswith("    ")]
     return "\n".join(lines).replace("\\\n", " ").splitlines()
-
-
-def headings(page: Path) -> set[str]:
-    """The anchors that GitHub makes of a page's headings."""
-    text = re.sub(r"```.*?```", "", markdown(page), flags=re.DOTALL)
-    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
-
-
-@pytest.mark.parametrize("page", PAGES, **ids)
-def test_every_relative_link_leads_to_a_file_and_every_anchor_to_a_heading(page):
-    for link in _LINK.findall(markdown(page)):
-        if "://" in link:
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        assert target.exists(), f"{page.name}: {link}"
-        assert not anchor or anchor in headings(target), f"{page.name}: {link}"
 
 
 def test_the_page_of_the_command_line_is_that_of_the_program():

@@ -110,6 +110,9 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     labelling.skip("b")
     assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(root, "chair")
     labelling.clear("b")
+    labelling.skip("b")
+    labelling.undo("b")  # there is no pick, so nothing changes
+    assert labelling.progress()[-1].state == "skipped"
     labelling.pick("b", (0, 0, 0))
     assert labelling.progress()[-1].state == "open"
 

@@ -145,11 +145,10 @@ def test_the_reference_describes_every_public_class_and_function(pages):
 
 def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
     for path in (*NOTEBOOKS, *EXERCISES):
-        links = pages[page_of(path)].links
-        assert any(link.endswith(f"run/{path.relative_to(REPOSITORY)}") for link in links), path.name
-        copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
-        for drawing in re.findall(r"\]\((figures/[^)]+)\)", "\n".join(cell.source for cell in copy.cells)):
-            assert (site / "run" / path.relative_to(REPOSITORY).parent / drawing).is_file(), f"{path.name}: {drawing}"
+        copy = Path("run", path.relative_to(REPOSITORY))
+        assert any(link.endswith(str(copy)) for link in pages[page_of(path)].links), path.name
+        for drawing in re.findall(r"\]\((figures/[^)]+)\)", (site / copy).read_text(encoding="utf-8")):
+            assert (site / copy.parent / drawing).is_file(), f"{path.name}: {drawing}"
 
 
 def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monkeypatch):

@@ -32,7 +32,7 @@ from zsp_lite.verified.proposals import poses_from_matches, poses_from_views, pr
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_scene, double_centre, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
-from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms, viewpoint_term
+from zsp_lite.verified.verification import TERM_NAMES, score_terms, viewpoint_term
 from zsp_lite.views import View, extract_views, object_crop
 from zsp_lite.viz.reliability import auroc, reliability
 
@@ -292,16 +292,6 @@ def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
         assert found[name] == pytest.approx(value, abs=0.02), name
 
 
-def test_the_truth_scores_above_other_poses(scene, truth):
-    degrees = torch.tensor([[180.0, 0, 0], [0, 180, 0], [0, 0, 180], [40, 0, 0], [0, -40, 0]])
-    turns = rotation_matrices(torch.deg2rad(degrees))
-    others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
-    score = ScoreCoefficients().score(score_terms(scene, concatenate([truth, others])))
-    assert int(score.argmax()) == 0
-    terms = first_terms(scene, truth)
-    assert all(terms[name] < 0.02 for name in TERM_NAMES if name.endswith(("silhouette", "free_space")))
-
-
 def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
     scene = featureless_scene(views)
     table = scene.target_maps.table.clone()
@@ -413,18 +403,7 @@ def test_probabilities_by_hand():
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0, np.inf]))
     found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), known)
     np.testing.assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))
-    assert found[3] == 0
-
-
-@given(
-    st.lists(st.floats(0, 40), min_size=0, max_size=5),
-    st.builds(
-        evidence, st.floats(0, 340), st.integers(1, 10), st.floats(0, 180), st.floats(0, 0.3), st.floats(-40, 40)
-    ),
-)
-def test_probabilities_of_different_poses_are_ordered_and_sum_to_at_most_one(deficits, known):
-    found = Calibration().probabilities(np.cumsum([0.0, *deficits]), known)
-    assert (found >= 0).all() and (np.diff(found) <= 0).all() and found.sum() <= 1 + 1e-12
+    assert found[3] == 0 and (np.diff(found) <= 0).all() and found.sum() < 1
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,10 @@ from lab_in_browser import (
     open_notebook,
     photograph,
     run_all,
-    running_chromium,
     saved,
     serve,
     slider_moves_picture,
     slider_outputs,
-    without_chromium,
 )
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
@@ -31,12 +29,6 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with running_chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +60,6 @@ def page(browser, lab):
     yield context.new_page()
     context.close()
     lab.stop_kernels()
-
-
-@pytest.mark.parametrize(("ci", "outcome"), [("true", pytest.fail.Exception), ("", pytest.skip.Exception)])
-def test_without_chromium_tests_fail_in_continuous_integration_and_are_skipped_elsewhere(monkeypatch, ci, outcome):
-    monkeypatch.setenv("CI", ci)
-    with pytest.raises(outcome, match="no Chromium here"):
-        without_chromium()
 
 
 def test_errors_of_a_broken_notebook_are_found(page, lab):

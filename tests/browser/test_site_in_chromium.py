@@ -4,15 +4,9 @@ import subprocess
 import sys
 
 import pytest
-from lab_in_browser import REPOSITORY, running_chromium
+from lab_in_browser import REPOSITORY
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with running_chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
