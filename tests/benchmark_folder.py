@@ -60,17 +60,6 @@ class SlowBackbone(CoordinateBackbone):
         return super().__call__(images)
 
 
-@dataclass(frozen=True)
-class Sociable(CoordinateBackbone):
-    """Its features depend on how many images come together, as those of a real network do in their last bits."""
-
-    name: str = "sociable"
-
-    def __call__(self, images):
-        found = super().__call__(images)
-        return [replace(one, keys=one.keys * (1 + 0.3 * len(images))) for one in found]
-
-
 BACKBONE = CoordinateBackbone(grid=8)
 
 
@@ -140,7 +129,7 @@ PAIRS = 8
 
 def write_run(out, rows, categories=CATEGORIES, **settings):
     """Write a run's folder with results by row and pair."""
-    call = Call("now", [], {}, {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
+    call = Call("now", [], {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
     settings = {"data": "made up", "backbone": "none 0", "targets": 5, "labels": {}, "origins": {}} | settings
     methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
     with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):

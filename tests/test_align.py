@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from benchmark_folder import SEQUENCES, SlowBackbone, small_folder
+from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
 
 from zsp_lite import align
 from zsp_lite.align import align_category, estimate_with_helpers, read_hypotheses, write_labels
@@ -46,6 +46,11 @@ def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written
         write_labels(replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump")
 
 
+def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objects(tmp_path):
+    found = run_rows(["verified", "category"], tmp_path, 2, 3)
+    assert found["category"]["n"] == 2 and found["category"]["median"] < 20
+
+
 def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_path, monkeypatch):
     out, whole = run
     lines = (out / "run.jsonl").read_text().splitlines(keepends=True)
@@ -60,7 +65,7 @@ def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_
         assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
             name: pose.sim3.matrix.tolist() for name, pose in whole.objects.items()
         }
-    with pytest.raises(InputError, match="holds a run of another command"):
+    with pytest.raises(InputError, match="holds a run with command align, this is benchmark"):
         evaluate(small_folder(), BACKBONE, ["ours"], 1, 3, tmp_path)
     with pytest.raises(InputError, match="holds a run with targets 3, this is 2"):
         align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)

@@ -42,11 +42,10 @@ def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
         assert row["per_category"]["lump"]["n"] == 6
         assert row["acc30_ci"][0] <= row["acc30"] <= row["acc30_ci"][1]
     assert {"reading", "backbone", "similarity", "matching", "view", "alignment"} <= summary["timings"].keys()
-    assert all(0 < seconds < 60 for seconds in summary["timings"].values())
     settings = read_run(out).settings
     assert settings.origins == {"lump, N = 5": "sampled", "pebble, N = 5": "sampled"}
     (call,) = settings.calls
-    assert call.versions and call.machine and (call.rows, call.pairs) == ([*ROWS], {"lump": 6, "pebble": 6})
+    assert call.versions["numpy"] == np.__version__ and (call.rows, call.pairs) == ([*ROWS], {"lump": 6, "pebble": 6})
 
 
 def test_a_second_run_computes_nothing_again_and_says_the_same(run, monkeypatch):
@@ -126,7 +125,7 @@ def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_ar
         (small_folder(), BACKBONE, {"out": run[0], "targets": 3}, "a run with targets 5, this is 3"),
         (small_folder(), Renamed(grid=8), {"out": run[0]}, "a run with backbone .*Renamed"),
         (small_folder(), BACKBONE, new | {"methods": ("nonesuch",)}, "'nonesuch' is unknown; `zsp-lite"),
-        (small_folder(), BACKBONE, new | {"pairs": {"teapot": 1}}, r"\['teapot'\], found lump, pebble"),
+        (small_folder(), BACKBONE, new | {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
         (small_folder(), BACKBONE, new | {"pairs": {"lump": 0}}, "pairs of lump is 0"),
         (small_folder(), BACKBONE, new | {"targets": 0}, "targets is 0"),
         (tmp_path / "nowhere", BACKBONE, new, "nowhere"),

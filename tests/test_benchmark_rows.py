@@ -6,16 +6,13 @@ import pytest
 import torch
 from benchmark_folder import BACKBONE, run_rows, small_folder
 
-from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Sift
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark import problem
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_run
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -70,25 +67,19 @@ def test_rows_differ_as_their_names_say(run):
 @pytest.mark.parametrize("row", ["icp", "sift"])
 def test_a_pair_without_depth_fails(row, monkeypatch):
     dataset = Co3D(small_folder())
-    problem = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
-    crops = {key: replace(problem.store.frame(key), depth=None) for key in problem.keys}
-    monkeypatch.setattr(problem.store, "frame", crops.get)
+    one = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
+    crops = {key: replace(one.store.frame(key), depth=None) for key in one.keys}
+    monkeypatch.setattr(one.store, "frame", crops.get)
     with pytest.raises(InputError, match="no depth map: 100_a"):
-        METHODS[row].solve(problem)
-    assert problem.frames() == [*crops.values()]
+        METHODS[row].solve(one)
+    assert one.frames() == [*crops.values()]
 
 
-def test_stages_that_rows_have_in_common_are_done_once_and_others_are_not_shared(tmp_path, monkeypatch):
-    calls, match_views = [], ZeroShotPose.match_views
-    monkeypatch.setattr(
-        ZeroShotPose, "match_views", lambda *args: (calls.append(args[0].clusters), match_views(*args))[1]
-    )
-    rows = ("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-nodepth", "ours-n3", "icp-bv")
-    run_rows(rows, tmp_path / "a", 2, 3)
+def test_similarities_are_computed_once_for_all_rows_of_a_pair(tmp_path, monkeypatch):
+    calls, similarities = [], problem.similarities
+    monkeypatch.setattr(problem, "similarities", lambda *args: (calls.append(args), similarities(*args))[1])
+    run_rows(("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-k30", "ours-n3"), tmp_path, 2, 3)
     assert len(calls) == 2 * 3
-    calls.clear()
-    run_rows(["ours", "verified"], tmp_path / "b")  # the paper's takes matches that k-means selects, the other the best
-    assert sorted(calls) == [False, False, True, True]
 
 
 class TrueViewpoints:
@@ -116,19 +107,3 @@ def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, 
     with pytest.raises(InputError, match="posecontrast"):
         run_rows(["posecontrast"], tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_fingerprint_tells_apart_whatever_changes_the_features():
-    torch.manual_seed(0)
-    vit = VisionTransformer(32, 8, embed_dim=12, depth=3, num_heads=2)
-
-    def of(**options):
-        return fingerprint(Backbone(vit, "same name", device="cpu", **options))
-
-    plain = of()
-    assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults, said aloud
-    changes = {"layer": 1, "facet": "query", "saliency_heads": [1], "image_size": 64, "mean": (0,) * 3, "std": (1,) * 3}
-    assert len({plain, *(of(**{name: value}) for name, value in changes.items())}) == 1 + len(changes)
-    with torch.no_grad():
-        vit.cls_token += 1
-    assert of() != plain

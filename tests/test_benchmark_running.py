@@ -9,14 +9,14 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from benchmark_folder import BACKBONE, SlowBackbone, Sociable, after_each_save, run_rows, small_folder
+from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.backbones.backbone import Backbone
@@ -25,10 +25,9 @@ from zsp_lite.benchmark.evaluation import Evaluator
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, compare, read_lines, read_run
-from zsp_lite.benchmark.store import FrameStore
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
@@ -96,20 +95,12 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
     assert read_run(run).table.equals(before.table)
     again(run)
     assert read_run(run).table.equals(before.table) and path.read_bytes() == whole
-    damaged = whole.split(b"\n")
-    damaged[1] = damaged[1].replace(b'"pair":', b'"pair:')
-    path.write_bytes(b"\n".join(damaged))
-    for read in (read_run, again):
-        with pytest.raises(InputError, match="run.jsonl, line 2"):
-            read(run)
 
 
-def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_continued(
-    undisturbed, tmp_path, monkeypatch
-):
+def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monkeypatch):
     out, summary = undisturbed
-    shutil.copy(out / SETTINGS, tmp_path)  # what was killed between the settings and the first result has no run.jsonl
-    with pytest.raises(InputError, match="run.jsonl cannot be read"):
+    shutil.copy(out / SETTINGS, tmp_path)  # of a run that was killed before its first result
+    with pytest.raises(InputError, match="no pair that all its rows have finished"):
         read_run(tmp_path)
     packed = tmp_path / f"{LINES}.gz"
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
@@ -117,14 +108,7 @@ def test_a_run_killed_before_its_first_result_or_packed_as_gzip_is_read_and_cont
     with monkeypatch.context() as context:
         context.setattr("zsp_lite.benchmark.evaluation.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
-    more = evaluate(small_folder(), QUICK, ["ours", "oracle-view"], 6, 3, tmp_path)["methods"]
-    assert more["ours"] == summary["methods"]["ours"] and more["oracle-view"]["n"] == 12
-    assert not packed.exists() and len(pairs_in(tmp_path)) == 24
-    (tmp_path / LINES).unlink()
-    assert (
-        evaluate(small_folder(), QUICK, ["oracle-view"], 6, 3, tmp_path)["methods"]["oracle-view"]
-        == more["oracle-view"]
-    )
+    assert not packed.exists() and (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
 
 
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path, monkeypatch):
@@ -137,7 +121,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
     monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
-    with pytest.raises(InputError, match="finished pairs are stored: run again to continue, with fewer workers than 2"):
+    with pytest.raises(InputError, match="finished pairs are stored: run again to continue, with fewer workers"):
         evaluate(*arguments, executor=2)
     assert seen[-1] == len(pairs_in(tmp_path)) < 12
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
@@ -178,33 +162,15 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
-class FirstFails(Executor):
-    """Evaluates chunks at once; the first one fails."""
-
-    _max_workers, submitted = 2, 0
-
-    def submit(self, function, *arguments):
-        future, self.submitted = Future(), self.submitted + 1
-        if self.submitted == 1:
-            future.set_exception(InputError("the first chunk fails"))
-        else:
-            future.set_result(function(*arguments))
-        return future
-
-
-def test_any_executor_will_do_and_what_was_evaluated_together_with_a_failure_is_saved(undisturbed, tmp_path):
+def test_any_executor_will_do(undisturbed, tmp_path):
     with ThreadPoolExecutor(2) as executor:
-        assert again(tmp_path / "a", executor)["methods"] == undisturbed[1]["methods"]
-    executor = FirstFails()
-    with pytest.raises(InputError, match="the first chunk fails"):
-        evaluate(small_folder(), QUICK, ["ours-bv"], 6, 3, tmp_path, executor)
-    assert executor.submitted == 4 and len(pairs_in(tmp_path)) >= 3
+        assert again(tmp_path, executor)["methods"] == undisturbed[1]["methods"]
 
 
 def test_unusable_executors_are_refused(monkeypatch):
     monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
     for executor, message in (
-        ("dask://127.0.0.1:1", "no scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
+        ("dask://127.0.0.1:1", "expected Dask and a scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
         (0, "workers"), (10**11, "workers"), (1.5, "workers"), (True, "workers"), (None, "workers"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message), open_workers(executor):
@@ -215,33 +181,23 @@ def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
     return pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
 
 
-def errors(chunk, backbone, threads=None) -> dict:
-    evaluator = Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
-    return {line["pair"]: line["results"]["ours"]["error"] for line in evaluator.lines(chunk)}
-
-
-def test_a_frame_is_described_by_itself_so_that_no_order_matters():
-    (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 6, 3))
-    assert errors(chunk, Sociable(grid=8)) == errors(chunk[::-1], Sociable(grid=8))
-
-
 def test_a_vision_transformers_features_do_not_depend_on_threads():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
-    assert errors(chunk, backbone, 1) == errors(chunk, backbone, 2)
+    evaluators = (Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads) for threads in (1, 2))
+    one, two = ([line["results"]["ours"]["error"] for line in evaluator.lines(chunk)] for evaluator in evaluators)
+    assert one == two
 
 
 def test_chunks_hold_every_pair_once_and_pairs_beside_each_other_that_share_frames():
     work = {pair: ["ours"] for n in (3, 5) for pair in sample_pairs(Co3D(small_folder()), "lump", 12, n)}
-    for size in (1, 4, 100):
-        chunks = make_chunks(work, size)
-        assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
-        assert [len(chunk) for chunk in chunks[:-1]] == [size] * (len(chunks) - 1) and len(chunks[-1]) <= size
-        targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
-        assert targets == sorted(targets)
-    assert len(chunks) == 1
+    chunks = make_chunks(work, 5)
+    assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
+    assert [len(chunk) for chunk in chunks] == [5] * 4 + [len(work) - 20]
+    targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
+    assert targets == sorted(targets)
 
 
 def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_allowed(tmp_path, monkeypatch):
@@ -259,13 +215,6 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
 
 def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, tmp_path):
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
-    settings = json.loads((run / SETTINGS).read_text())
-    incomplete = json.dumps({name: one for name, one in settings.items() if name != "data"})
-    for text, told in (("{", "run.json: "), (incomplete, "run.json: .*missing required field `data`")):
-        (run / SETTINGS).write_text(text)
-        for read in (read_run, again):
-            with pytest.raises(InputError, match=told):
-                read(run)
     (run / SETTINGS).unlink()
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
@@ -286,22 +235,10 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, frames_of()).keys}
-    assert sum(calls) == len(frames) and set(calls) == {1}
-
-
-def frames_of(**extractors):
-    return FrameStore(Co3D(small_folder()), "lump", extractors)
-
-
-def test_only_the_last_used_frames_stay_in_memory(monkeypatch):
-    monkeypatch.setattr("zsp_lite.benchmark.store.CAPACITY", 3)
-    frames = frames_of(backbone=BACKBONE)
-    for number in (0, 1, 2, 0, 3):
-        frames.describe("backbone", ("100_a", number))
-    for number, read in ((2, 4), (0, 4), (3, 4), (1, 5)):  # frame 1 was dropped: it had not been used for longest
-        frames.describe("backbone", ("100_a", number))
-        assert len(frames.timings["reading"]) == len(frames.timings["backbone"]) == read
+    store = FrameStore(Co3D(small_folder()), "lump", {})
+    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, store).keys}
+    assert sum(calls) == len(frames)
+    assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
@@ -311,7 +248,7 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     labels = read_labels(root, "lump")
     name = next(name for name, label in labels.items() if name != label.reference_seq)
     write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])))
-    with pytest.raises(InputError, match="results with other labels of lump"):
+    with pytest.raises(InputError, match="a run with labels of lump"):
         run(tmp_path / "run")
     run(tmp_path / "other")
 

@@ -11,13 +11,11 @@ import pytest
 from benchmark_folder import CATEGORIES, made_up_run, write_run
 
 from zsp_lite.benchmark import figures, tables
-from zsp_lite.benchmark.methods import GROUPS, read_paper_tables, resolve
+from zsp_lite.benchmark.methods import read_paper_tables, resolve
 from zsp_lite.benchmark.runs import LINES, SETTINGS, compare, read_run
-from zsp_lite.benchmark.statistics import paired_difference
-from zsp_lite.benchmark.summary import draws_of
+from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.benchmark.tables import PUBLISHED, Cell, all_rows, as_latex, as_markdown, every_table, paper_tables
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.terminal import print_table
 from zsp_lite.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -46,10 +44,8 @@ def test_a_tables_figures_are_the_runs_and_the_published_ones_stand_apart(run):
     assert cell(found["table_1"], "ICP", "toaster Acc30").value == methods["icp"]["per_category"]["toaster"]["acc30"]
     assert cell(found["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
     assert cell(found["table_1"], "SWaV", "Acc30 (%)") is None
-    assert cell(found["table_1"], "SWaV", "Acc30 (%)", PUBLISHED).value == 7.5
     acc15 = cell(found["table_a_correspondences"], "K = 70, no k-means", "Acc15 (%)")
     assert acc15.value == methods["ours-k70-nokmeans"]["acc15"]
-    assert cell(found["table_a_targets"], "Ours (N=20)", "Acc30 (%)", PUBLISHED).value == 52.1
 
 
 def test_a_run_of_three_rows_has_the_tables_of_these_with_chosen_metrics_and_differences_to_ours(tmp_path):
@@ -71,17 +67,6 @@ def test_a_run_of_three_rows_has_the_tables_of_these_with_chosen_metrics_and_dif
     found = [cell(table, "rootsift", title).value for title in list(table.cells)[1:3]]
     assert found == pytest.approx([100 * np.mean(errors > 150), np.median(errors)])
     assert every_table(made.summary, ["acc30"])[0].cells.shape[1] == 5
-
-
-def test_the_verified_solver_stands_by_number_of_views(tmp_path):
-    made = made_up_run(tmp_path, ["ours", "ours-n1", *GROUPS["verified-views"], "verified-mask-n1"])
-    table = next(table for table in paper_tables(made.summary) if table.name == "verified_targets")
-    for n, name in ((1, "verified-mask-n1"), (5, "verified-mask")):
-        found = cell(table, f"verified-mask, N = {n}", "Acc30 (%)")
-        assert found.value == made.summary["methods"][name]["acc30"]
-    assert cell(table, "verified-mask, N = 3", "Acc30 (%)") is None
-    left, _ = figures.accuracy_against_views(made).axes
-    assert list(next(line for line in left.get_lines() if line.get_label() == "verified").get_xdata()) == [1, 3, 5, 10]
 
 
 def test_a_row_that_sees_other_objects_has_a_table_of_its_own(tmp_path):
@@ -120,12 +105,6 @@ def test_rows_of_ones_own_stand_below_the_papers_and_in_every_figure(run, tmp_pa
     assert list(line.get_xdata()) == [3, 5] and line.get_ydata()[1] == mine["acc30"]
     curves = figures.error_curves(made).axes[0].get_lines()
     assert [line.get_label() for line in curves][:5] == ["ours", *names[3:], "verified"]
-    figures.write_figures(made, tmp_path / "figures")
-    stems = ("accuracy_against_views", "error_curves", "error_distribution")
-    files = sorted((tmp_path / "figures").iterdir())
-    assert [path.name for path in files] == [f"{stem}.{kind}" for stem in stems for kind in ("pdf", "png")]
-    starts = {".pdf": b"%PDF", ".png": b"\x89PNG"}
-    assert all(path.read_bytes().startswith(starts[path.suffix]) for path in files)
 
 
 def frame(rows, titles):
@@ -141,7 +120,7 @@ def body_of(table):
     ]
 
 
-def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold(run, tmp_path):
+def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold():
     def error(value):
         return Cell(value, metric="mean_category_median")
 
@@ -153,7 +132,7 @@ def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold(run, tmp_pa
         "oracle-view": [error(1.0), Cell(99.0, metric="acc30"), Cell(0.0), None],  # is told the true view
     }
     cells = frame(rows, ["Med. err. (°)", "Acc30 (%)", "B − A", "pairs"])
-    table = tables.Table("mine", "Table 9. 50% & more", cells, compact=list(cells)[:3], data="my_data, 3 pairs")
+    table = tables.Table("mine", "Table 9. 50% & more", cells, data="my_data, 3 pairs")
     text = as_latex(table)
     assert r"\caption{50\% \& more. my\_data, 3 pairs}" in text  # LaTeX writes the number
     assert r"\label{tab:mine}" in text and r"\begin{tabular}{lrrr}" in text
@@ -165,11 +144,6 @@ def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold(run, tmp_pa
         [r"none \textasciitilde{}\textasciicircum{}\textbackslash{}\{\}", "99.9", "--", "--"],
         ["oracle-view", "1.0", "99.0", "0.0"],
     ]
-    made = made_up_run(tmp_path, ["ours", "ours-n3", "verified", "a_b & 50%"])
-    for table in every_table(run.summary) + every_table(made.summary):
-        text = as_latex(table)
-        assert max(map(len, body_of(table))) <= 4 and "made up, 48 pairs, 5 target views" in text
-        assert not re.search(r"[−°]|(?<![\d$.-])-\d", text) and f"\\label{{tab:{table.name}}}" in text
 
 
 def test_latex_has_the_best_method_of_a_category_in_bold_and_the_published_figures_below_those_of_the_run(run):
@@ -190,7 +164,7 @@ def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):
     assert single == ["bicycle Acc30", f"{PUBLISHED}: bicycle Acc30"]
 
 
-def test_all_formats_say_the_same(run, capsys, monkeypatch):
+def test_all_formats_say_the_same(run):
     table = next(table for table in paper_tables(run.summary) if table.name == "table_3")
     ours = run.summary["methods"]["ours"]
     text = f"{ours['acc30']:.1f} [{ours['acc30_ci'][0]:.1f}, {ours['acc30_ci'][1]:.1f}]"
@@ -200,10 +174,6 @@ def test_all_formats_say_the_same(run, capsys, monkeypatch):
     assert f"{PUBLISHED}: Acc30 (%) low" not in lines[0] and f"{PUBLISHED}: Acc30 (%)" in lines[0]
     markdown = as_markdown(table).splitlines()
     assert text in markdown[-3] and markdown[2].count("|") == markdown[-3].count("|")
-    monkeypatch.setenv("COLUMNS", "250")
-    print_table(table)
-    printed = capsys.readouterr().out
-    assert all(part in printed for part in (*text.split(" ", 1), "46.3", "CorrespondSim"))
     odd = tables.Table("odd", "x", frame({"c|d": [Cell(0.00001, decimals=3)], "i": [None]}, ["a|b"]))
     heading, rule, *lines = as_markdown(odd).splitlines()[2:]
     assert {re.sub(r"\\\|", "", line).count("|") for line in (heading, rule, *lines)} == {3} and "< 0.001" in lines[0]
@@ -213,9 +183,7 @@ def test_the_papers_figures_were_copied_right():
     ours = read_paper_tables()[0]["rows"][-1]
     assert ours["row"] == "ours" and ours["published"] == [53.8, 46.3, 31.1, 71.0, 26.0, 82.0, 39.0, 42.0]
     for table in read_paper_tables():
-        for line in table["rows"]:
-            assert resolve(line["row"]) and len(line["published"]) == len(table["published"])
-            assert all(0 <= x <= 180 for x in line["published"])
+        assert all(resolve(line["row"]) and len(line["published"]) == len(table["published"]) for line in table["rows"])
 
 
 def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(tmp_path):
@@ -237,16 +205,13 @@ def test_what_is_no_run_is_refused(tmp_path):
     write_run(tmp_path, {"ours": {"chair/a:0/b:0": {"error": 1.0}}})
     path, packed, whole = tmp_path / LINES, tmp_path / f"{LINES}.gz", (tmp_path / LINES).read_bytes()
     errors = b"[]", b'"error":"1"', b'"error":-1', b'"error":181', b'"error":null', b'"error":1,"confidence":2'
-    keys = b"chair/a:0/b", b"a:0/b:0", b"chair/a/b:0", b"chair/a:0/b:0,", b"chair/a:0/b/c:0"
-    for old, changed in ((b'"error":1.0', errors), (b"chair/a:0/b:0", keys)):
-        for new in changed:
-            path.write_bytes(whole.replace(old, new))
-            with pytest.raises(InputError, match=f"{path}, line 1: "):
-                read_run(tmp_path)
-    for content, told in (
-        (b"no gzip", f"{packed}.*gzip"), (gzip.compress(whole)[:15], f"{packed}.*gzip"),
-        (gzip.compress(b"{}\n"), f"{packed}.*line 1"), (gzip.compress(b""), "no pair that all its rows have finished"),
-    ):  # fmt: skip
+    keys = b"chair/a:0/b", b"a:0/b:0", b"chair/a:0/b:0,", b"chair/a:0/b/c:0"
+    changed = [(b'"error":1.0', new) for new in errors] + [(b"chair/a:0/b:0", new) for new in keys]
+    for old, new in changed:
+        path.write_bytes(whole.replace(old, new))
+        with pytest.raises(InputError, match=f"{tmp_path}, line 1: "):
+            read_run(tmp_path)
+    for content, told in ((b"no gzip", f"{packed}.*gzip"), (gzip.compress(whole)[:15], f"{packed}.*gzip")):
         packed.write_bytes(content)
         with pytest.raises(InputError, match=told):
             read_run(tmp_path)
@@ -273,21 +238,18 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
     assert table.title == "A = x, B = y" and list(table.cells.index) == ["icp", "ours:icp"]
     pairs, a, b, gain, p, *medians = (one.value for one in table.cells.loc["ours:icp"])
     assert pairs == 48 and 0 < p <= 1 and gain == pytest.approx(b - a)
-    assert cell(table, "icp", "p").value == 1 and "bootstrap over objects" in table.note
+    assert cell(table, "icp", "p").value == 1
     assert medians == [run.row(name)["error"].median() for name in ("ours", "icp")]
-    assert list(table.cells)[-2:] == ["A: pooled med. err. (°)", "B: pooled med. err. (°)"]
     with pytest.raises(InputError, match="rows ours-n1 and ours have no pair in common"):
         compare(run, other, ["ours-n1:ours"])
-    for text in ("ours:", ":ours", "", "ours:nobody", "nobody:ours", "rootsift"):
+    for text in ("ours:", ":ours", "nobody:ours", "rootsift"):
         with pytest.raises(InputError, match="row '.*' is not in the run, expected one of "):
             compare(run, other, [text])
     with pytest.raises(InputError, match="no row in common: icp, .* and nobody"):
         compare(run, write_run(tmp_path / "c", {"nobody": halves["icp"]}))
-    colons = write_run(tmp_path / "d", {"my:row": halves["icp"]})
-    assert compare(colons, colons, ["my:row"])["my:row"]["n"] == 48
 
 
-def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_path):
+def test_figures_show_every_pair_every_number_of_views_and_every_row(run):
     (axis,) = figures.error_distribution(run).axes
     assert sum(len(points.get_offsets()) for points in axis.collections) == 48 + len(CATEGORIES)  # and the medians
     assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES)
@@ -300,8 +262,3 @@ def test_figures_show_every_pair_every_number_of_views_and_every_row(run, tmp_pa
     curve = axis.get_lines()[0]
     height = curve.get_ydata()[np.searchsorted(curve.get_xdata(), 30, side="right") - 1]
     assert height == pytest.approx(100 * np.mean(run.row("ours")["error"] <= 30))
-    few = made_up_run(tmp_path / "few", ["icp"])
-    (tmp_path / "f").mkdir()
-    (tmp_path / "f" / "accuracy_against_views.pdf").touch()  # of an earlier call
-    figures.write_figures(few, tmp_path / "f")
-    assert {path.stem for path in (tmp_path / "f").iterdir()} == {"error_distribution", "error_curves"}

@@ -30,10 +30,8 @@ def test_missing_matches_count_as_orthogonal():
     assert correspondence_score(matches([0.99] * 2), 50) < correspondence_score(matches([0.5] * 50), 50)
 
 
-def feature_map(global_feature, saliency=None) -> FeatureMap:
-    saliency = torch.ones(2, 2) if saliency is None else torch.as_tensor(saliency)
-    keys = torch.ones(*saliency.shape, 3)
-    return FeatureMap(keys, saliency, torch.as_tensor(global_feature, dtype=torch.float32))
+def feature_map(global_feature) -> FeatureMap:
+    return FeatureMap(torch.ones(2, 2, 3), torch.ones(2, 2), torch.tensor(global_feature))
 
 
 def test_the_global_score_is_the_cosine_whatever_the_lengths():
@@ -71,7 +69,7 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
 def test_all_selectors_take_the_same_comparison():
     grid = torch.ones(2, 2, dtype=torch.bool)
     frame = Frame(np.zeros((2, 2, 3), np.uint8), None, None, random_camera(0, (2, 2)))
-    view = View(frame, feature_map([1.0, 0.0]), grid)
+    view = View(frame, feature_map([1.0, 0.0]), grid, np.ones((2, 2)))
     comparison = ViewMatch(view, view, torch.eye(4), matches([1.0] * 4), 4)
     scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}
     assert scores == {"correspond": 0, "global": 1, "saliency": 1, "cyclical": 1}

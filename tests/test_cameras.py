@@ -75,21 +75,15 @@ def test_matrix_and_intrinsics_compose_to_project(seed):
 
 
 @given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
-def test_cropping_shifts_pixels_by_the_corner_of_the_box(seed, top, left, height, width):
+def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height, width):
     camera, points = visible_points(seed)
-    cropped = camera.crop((top, left, height, width))
-    np.testing.assert_allclose(cropped.project(points)[0] + (left, top), camera.project(points)[0], rtol=1e-9)
-    assert cropped.size == (height, width)
-
-
-@given(seeds, st.integers(1, 500), st.integers(1, 500))
-def test_resizing_scales_pixels_and_keeps_depth(seed, height, width):
-    camera, points = visible_points(seed)
-    resized = camera.resize((height, width))
+    pixels, depth = camera.project(points)
+    cropped, resized = camera.crop((top, left, height, width)), camera.resize((height, width))
+    assert cropped.size == resized.size == (height, width)
+    np.testing.assert_allclose(cropped.project(points)[0] + (left, top), pixels, rtol=1e-9)
     scale = np.array([width / camera.size[1], height / camera.size[0]])
-    np.testing.assert_allclose(resized.project(points)[0], camera.project(points)[0] * scale, rtol=1e-9)
-    np.testing.assert_array_equal(resized.project(points)[1], camera.project(points)[1])
-    assert resized.size == (height, width)
+    np.testing.assert_allclose(resized.project(points)[0], pixels * scale, rtol=1e-9)
+    np.testing.assert_array_equal(resized.project(points)[1], depth)
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,10 @@ from transformers import AutoModel
 
 from zsp_lite import load_backbone
 from zsp_lite.backbones.backbone import prepare_images
-from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.load import verify
 from zsp_lite.backbones.pretrained import download
 from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.choices import FACETS
 from zsp_lite.errors import InputError
 
 
@@ -100,9 +100,8 @@ def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_outpu
         torch.testing.assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["vit_msn", "beit", "pixio"])
-def test_models_that_nobody_thought_of_are_read_by_the_names_of_their_parts(kind, tmp_path, pictures):
-    backbone = load_backbone(f"hf:{save_model(tmp_path / kind, configuration(kind))}", "cpu", image_size=48)
+def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path, pictures):
+    backbone = load_backbone(f"hf:{save_model(tmp_path, configuration('beit'))}", "cpu", image_size=48)
     assert [features.grid for features in backbone(pictures)] == [(3, 3), (3, 3)]
 
 
@@ -113,7 +112,6 @@ def test_models_that_nobody_thought_of_are_read_by_the_names_of_their_parts(kind
     "file, content, mean, std",
     [
         ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
-        ("processor_config.json", {"image_processor": {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}}, 0.5, 0.25),
         ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
     ],
 )
@@ -144,21 +142,15 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
     "kind, settings, match",
     [
         ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
-        ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
-        ("swin", {"embed_dim": 8, "depths": [1, 1], "num_heads": [1, 1], "patch_size": 4}, "a swin model"),
-        ("bert", {"vocab_size": 99}, "a bert model"),
+        ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
         ("vit", {"num_channels": 1}, "does not run"),
         ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
         ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
-        ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
+        ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
     ],
 )
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
-    if kind in ("siglip", "blip", "vit"):
-        config = configuration(kind, **settings)
-    else:
-        sizes = {"hidden_size": DIM, "num_hidden_layers": DEPTH, "num_attention_heads": HEADS, "intermediate_size": 64}
-        config = transformers.CONFIG_MAPPING[kind](**({} if kind in ("resnet", "swin") else sizes), **settings)
+    config = transformers.ResNetConfig(**settings) if kind == "resnet" else configuration(kind, **settings)
     refused(f"hf:{save_model(tmp_path / 'model', config)}", match, image_size=32)
 
 
@@ -187,7 +179,6 @@ def test_pickles_are_not_read(tmp_path):
     [
         ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
         ("config.json", b"{", "config.json"),
-        ("preprocessor_config.json", b"[]", ""),
         ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
     ],
 )
@@ -228,6 +219,6 @@ def test_what_the_hub_refuses_is_told_in_one_line(monkeypatch):
     refused("hf:someone/closed", "hf:someone/closed: neither a folder nor a model .* gives .503 Busy")
 
 
-@pytest.mark.parametrize("name", ["hf:", "hf:a/b/c", "hf:../nowhere", "hf:a b", "hf:facebook/dinov2-small"])
+@pytest.mark.parametrize("name", ["hf:", "hf:../nowhere", "hf:facebook/dinov2-small"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
     refused(name, "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives")

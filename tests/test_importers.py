@@ -42,9 +42,10 @@ def to_world(frame):
     return np.linalg.inv(frame.camera.matrix)
 
 
-def write_depth16(path, depth, unit):
+def write_depth16(path, depth):
+    """Write millimetres."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.rint(depth / unit).clip(0, 65535).astype(np.uint16))
+    assert cv2.imwrite(str(path), np.rint(1000 * depth).astype(np.uint16))
 
 
 def write_nerfstudio(folder, frames):
@@ -52,7 +53,7 @@ def write_nerfstudio(folder, frames):
     listed = []
     for frame in frames:
         write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
-        write_depth16(folder / f"depths/{frame.name}.png", frame.depth, 0.001)
+        write_depth16(folder / f"depths/{frame.name}.png", frame.depth)
         write_mask(folder / f"masks/{frame.name}.png", frame.mask)
         pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL: +y up, looking along -z
         listed.append({"file_path": f"images/{frame.name}.jpg", "depth_file_path": f"depths/{frame.name}.png",
@@ -177,7 +178,7 @@ def test_the_fused_cloud_lies_on_the_surface(views):
     assert colours.shape == points.shape
 
 
-def break_file(name, content):
+def replaced(name, content):
     return lambda folder: (folder / name).write_text(content)
 
 
@@ -200,9 +201,9 @@ def edited(change):
         ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
         ("nerfstudio", edited(lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)), "frame 1: pose is"),
         ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
-        ("lists", break_file("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
-        ("lists", break_file("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "expected a finite rigid"),
-        ("lists", break_file("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
+        ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
+        ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "expected a finite rigid"),
+        ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
     ],
 )
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
@@ -217,15 +218,15 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     write_nerfstudio(tmp_path, views[:1])
     height, width = views[0].camera.size
     plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
-    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane, 1)
+    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
     frame = READERS["nerfstudio"](tmp_path)[0]
     np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
-    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2], 1)
+    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2] / 1000)
     with pytest.raises(InputError, match=r"expected .* = \(96, 128\)"):
         frame.load()
 
 
-@pytest.mark.parametrize("values", [np.array([1 + 1j]), np.array(["x"]), np.float32(3), np.ones((4, 4, 3))])
+@pytest.mark.parametrize("values", [np.array(["x"]), np.float32(3), np.ones((4, 4, 3))])
 def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
     write_lists(tmp_path, views[:1])
     np.save(tmp_path / f"z/{views[0].name}.npy", values)
@@ -233,16 +234,8 @@ def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
         READERS["lists"](tmp_path)[0].load()
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_capture_of_few_frames_is_fused_as_well(views, count):
-    points, _, _ = fuse(views[:1] * count)
-    pixels, depth = views[0].camera.project(points)
-    column, row = np.floor(pixels).astype(int).T
-    assert len(points) > 200
-    assert np.median(np.abs(views[0].depth[row, column] - depth)) < 0.005
-
-
-def test_a_surface_that_one_of_many_frames_saw_is_left_out(views):
+def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
+    assert len(fuse(views[:1])[0]) > 200
     ghost = replace(views[0], depth=np.where(views[0].mask > 0.5, 0.5 * views[0].depth, 0).astype(np.float32))
     _, depth = views[0].camera.project(fuse([*views, ghost])[0])
     assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()

@@ -5,16 +5,10 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from zsp_lite.benchmark.statistics import (
-    bootstrap_ci,
-    figures_of,
-    object_draws,
-    pair_draws,
-    paired_test,
-)
+from zsp_lite.benchmark.statistics import bootstrap_ci, figures_of, object_draws, pair_draws, paired_test
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, rotation_error
 
@@ -30,12 +24,11 @@ def about(axis, degrees: float) -> np.ndarray:
 axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: np.linalg.norm(axis) > 0.1)
 
 
-@settings(deadline=None)
 @given(axes, axes, st.floats(0, 180))
 def test_the_error_is_the_angle_between_the_rotations(axis, other, degrees):
     base = about(other, 77)
     assert rotation_error(base, about(axis, degrees) @ base) == pytest.approx(degrees, abs=1e-11)
-    assert rotation_error(base, base @ about(axis, degrees)) == pytest.approx(degrees, abs=1e-11)
+    assert rotation_error(base @ about(axis, degrees), base) == pytest.approx(degrees, abs=1e-11)
 
 
 def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
@@ -48,14 +41,6 @@ def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
     assert 180 - rotation_error(np.eye(3), about((1, 2, 3), 180 - 1e-7)) == pytest.approx(1e-7, rel=1e-5)
     assert rotation_error(np.eye(3), np.eye(3)) == 0
     assert rotation_error(np.eye(3), np.diag([1.0, -1, -1])) == 180
-
-
-@settings(deadline=None)
-@given(axes, axes, st.floats(0, 180))
-def test_the_error_is_symmetric_and_unchanged_by_a_common_rotation(axis, other, degrees):
-    a, b, common = np.eye(3), about(axis, degrees), about(other, 123)
-    assert rotation_error(a, b) == pytest.approx(rotation_error(b, a), abs=1e-11)
-    assert rotation_error(common @ a, common @ b) == pytest.approx(rotation_error(a, b), abs=1e-11)
 
 
 def test_batches_broadcast_and_tensors_are_taken():

@@ -1,6 +1,5 @@
 """A reference turned in the image: `upright=False` finds the turn, and the pose is that of the image as given."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +9,9 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, reference_an
 
 from zsp_lite.cli import main as cli
 from zsp_lite.data.frames import turn_frame
-from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
-
-TURNS = (1, 2, 3)
 
 
 class UprightBackbone(CoordinateBackbone):
@@ -58,7 +54,7 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
 
 
 @pytest.mark.parametrize("solver", ["paper", "verified"])
-@pytest.mark.parametrize("quarters", TURNS)
+@pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_the_pose_of_a_turned_reference_is_that_of_the_image_as_given(frames, solver, quarters):
     rolled = turn_frame(frames[0], quarters)
     method = ZeroShotPose(UprightBackbone(), solver=solver, upright=False)
@@ -73,6 +69,7 @@ def test_the_pose_of_a_turned_reference_is_that_of_the_image_as_given(frames, so
     np.testing.assert_array_equal(found.reference_view.frame.rgb, crop.rgb)
     assert found.reference_view.frame.camera.size == crop.camera.size
     np.testing.assert_array_equal(found.reference_view.frame.camera.matrix, crop.camera.matrix)
+    assert np.abs(found.reference_view.soft_mask - crop.mask).mean() < 0.1
     first, second = found.points
     at_home = rolled.camera.to_world(first)
     elsewhere = ELSEWHERE.inverse().apply(found.target_camera.to_world(second))
@@ -91,12 +88,6 @@ def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
     assert method.estimate(turn_frame(frames[0], 1), frames[1:]).reference_turn == 270
 
 
-def test_without_a_usable_target_the_error_is_that_of_the_upright_method(frames):
-    blind = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames[1:]]
-    with pytest.raises(InputError, match="all 3 target views were left out"):
-        ZeroShotPose(CoordinateBackbone(), upright=False).estimate(frames[0], blind)
-
-
 def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames):
     plain = ZeroShotPose(UprightBackbone()).estimate(frames[0], frames[1:])
     tried = ZeroShotPose(UprightBackbone(), upright=False).estimate(frames[0], frames[1:])
@@ -107,15 +98,11 @@ def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames):
 
 
 @pytest.mark.slow
-def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path, capsys):
+def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
     folder = ellipsoids.root / "ellipsoid"
-    words = ["estimate", str(folder / "a"), str(folder / "b"), "--targets", "2", "--json", "--out", str(tmp_path)]
-    turns = []
-    for option in ([], ["--not-upright"]):
+    words = ["estimate", str(folder / "a"), str(folder / "b"), "--targets", "2", "--out", str(tmp_path)]
+    for options, images in (([], 3), (["--not-upright"], 6)):
         UprightBackbone.images = 0
-        assert cli.main([*words, *option]) == 0
-        turns.append(UprightBackbone.images)
-        content = json.loads(capsys.readouterr().out)
-        assert content["estimates"]["verified"]["reference_turn_degrees"] in (0, 90, 180, 270)
-    assert turns == [3, 6]
+        assert cli.main([*words, *options]) == 0
+        assert UprightBackbone.images == images

@@ -6,7 +6,6 @@ from dataclasses import asdict
 import pytest
 
 from tools import results_page
-from tools.models import read_catalogue
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.verified.verification import ScoreCoefficients
@@ -57,12 +56,6 @@ def test_the_marked_tables_are_those_of_the_runs():
     assert results_page.updated(text) == text, "run python -m tools.results_page"
     old = re.sub(r"^\| Ours \(K=50\).*\n", "", text, flags=re.MULTILINE)
     assert old != text and results_page.updated(old) == text
-
-
-def test_the_artists_run_has_30_pairs_of_each_category_of_the_catalogue(runs):
-    summary = runs["artists"].summary
-    assert summary["data"]["categories"] == sorted(read_catalogue(REPOSITORY / "tools" / "artists.json").models)
-    assert {one["n"] for row in summary["methods"].values() for one in row["per_category"].values()} == {30}
 
 
 def test_the_page_on_solvers_has_the_confidences(runs):

@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.choices import FACETS
 
 DEPTH, DIM, HEADS, PATCH = 3, 48, 6, 8
 

@@ -36,7 +36,7 @@ from zsp_lite import (
 )
 from zsp_lite.align import align_category as align_category
 from zsp_lite.alignment import Sim3 as Sim3
-from zsp_lite.backbones import checkpoints as checkpoints, facets as facets, huggingface as huggingface, vit as vit
+from zsp_lite.backbones import checkpoints as checkpoints, huggingface as huggingface, vit as vit
 from zsp_lite.backbones.backbone import Backbone as Backbone
 from zsp_lite.backbones.load import load_backbone as load_backbone
 from zsp_lite.data import (

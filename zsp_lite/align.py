@@ -24,10 +24,9 @@ from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.problem import Problem
+from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate_pairs
-from zsp_lite.benchmark.runs import Call, Settings, open_run, read_texts
-from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
 from zsp_lite.category import SAME_ANGLE, CategoryAlignment, PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
@@ -35,7 +34,7 @@ from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.io.files import decode_json, write_atomic
+from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import rotation_angle, rotation_error
 from zsp_lite.own_objects import Source, estimate_pose, known_errors
 from zsp_lite.verified.confidence import modes, reliability_flags
@@ -67,10 +66,6 @@ class PairSolver:
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
                 line |= {"probabilities": found.probabilities.tolist()}
             yield line
-
-
-def _read(out: str | Path) -> list[_Line]:
-    return [decode_json(text, _Line, where) for text, where in read_texts(out)]
 
 
 def _loaded(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
@@ -120,7 +115,7 @@ def align_category(
             calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
         )  # fmt: skip
         with open_run(folder, settings, allow_other_version):
-            known = {line.pair for line in _read(folder)}
+            known = {line.pair for line in read_lines(folder, _Line)}
             todo = {pair: ["alignment"] for key, pair in chosen.items() if key not in known}
             root, threads = str(dataset.root.resolve()), max(1, get_num_threads() // workers)
             make = partial(PairSolver, root, category, backbone if pool else loaded, threads)
@@ -149,7 +144,7 @@ def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> t
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames, for `synchronise`."""
     found = {}
-    for line in (line for line in _read(out) if line.matrices):
+    for line in (line for line in read_lines(out, _Line) if line.matrices):
         sim3s = []
         for matrix in np.array(line.matrices):
             scale = np.cbrt(np.linalg.det(matrix[:3, :3]))

@@ -15,9 +15,9 @@ from zsp_lite.errors import InputError, check_integer, check_magnitude, check_nu
 # paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
 SCALE_RANGE = (0.2, 5.0)
 # Points are treated as collinear, which leaves the rotation about their line undetermined, below these ratios of the
-# second to the first singular value: of the covariance, a ratio of squared widths, for a sample and for all points; and
-# of a single cloud, a ratio of widths, above the rounding of float32 coordinates on a line.
-_COLLINEAR_SAMPLE, _COLLINEAR, _COLLINEAR_CLOUD = 1e-6, 1e-10, 1e-5
+# second to the first singular value: of a sample's covariance, a ratio of squared widths; and of a cloud, a ratio of
+# widths, above the rounding of float32 coordinates on a line.
+_COLLINEAR_SAMPLE, _COLLINEAR_CLOUD = 1e-6, 1e-5
 MOST_TRIALS = 10_000_000
 
 
@@ -36,13 +36,12 @@ class Sim3:
     t: Float[np.ndarray, "3"]
 
     def __post_init__(self):
-        scale, rotation, translation = float(self.scale), real_array("Sim3: R", self.R), real_array("Sim3: t", self.t)
-        if translation.shape != (3,) or not np.isfinite(translation).all() or not 0 < scale < np.inf:
-            raise InputError(f"Sim3: scale is {scale} and t {translation}, expected a positive number and (3,) numbers")
-        orthogonal = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
-        if not orthogonal or np.linalg.det(rotation) < 0:
+        rotation, translation = real_array("Sim3: R", self.R, (3, 3)), real_array("Sim3: t", self.t, (3,))
+        if not np.isfinite(translation).all() or not 0 < self.scale < np.inf:
+            raise InputError(f"Sim3: scale is {self.scale} and t {translation}, expected finite numbers, scale above 0")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
             raise InputError(f"Sim3: R is {rotation.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
-        object.__setattr__(self, "scale", scale)
+        object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "R", rotation)
         object.__setattr__(self, "t", translation)
 
@@ -93,12 +92,8 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
             are all equal or collinear (which leaves the rotation about their line undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
-    scale, rotation, translation, conditioning = umeyama_batch(source[None], target[None], with_scale)
-    if not conditioning[0] > _COLLINEAR:
-        raise InputError(
-            f"umeyama: the {len(source)} points are all equal or collinear in source or target, "
-            "expected at least 3 that span a plane"
-        )
+    scale_range = (0.0, np.inf) if with_scale else (1.0, 1.0)
+    scale, rotation, translation, _ = umeyama_batch(source[None], target[None], scale_range)
     return Sim3(scale[0], rotation[0], translation[0])
 
 
@@ -122,7 +117,6 @@ def nearest_rotation(
 def umeyama_batch(
     source: Float[np.ndarray, "b n 3"],
     target: Float[np.ndarray, "b n 3"],
-    with_scale: bool = True,
     scale_range: tuple[float, float] = (0.0, np.inf),
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
     """Fit similarities to a batch of point sets, without checks (see `umeyama`).
@@ -133,13 +127,10 @@ def umeyama_batch(
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
-    rotation, singular, flip = nearest_rotation(centred_target.swapaxes(1, 2) @ centred_source)
-    if with_scale:
-        variance = np.square(centred_source).sum(axis=(1, 2))
-        scale = (singular[:, 0] + singular[:, 1] + flip * singular[:, 2]) / np.where(variance > 0, variance, 1)
-        scale = scale.clip(*scale_range)
-    else:
-        scale = np.ones(len(singular))
+    rotation, singular, sign = nearest_rotation(centred_target.swapaxes(1, 2) @ centred_source)
+    variance = np.square(centred_source).sum(axis=(1, 2))
+    scale = (singular[:, 0] + singular[:, 1] + sign * singular[:, 2]) / np.where(variance > 0, variance, 1)
+    scale = scale.clip(*scale_range)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
     conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
     return scale, rotation, translation, conditioning
@@ -189,13 +180,13 @@ def ransac(
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        raise InputError(
-            f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
-            f"collinear, or scale outside {scale_range}"
-        )
+        found = f"no usable sample in {trials} trials over {len(source)} points"
+        raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
 
-    residual = _residuals(scale, rotation, translation, source, target)
+    linear = scale[:, None, None] * rotation
+    offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
+    residual = np.sqrt(np.square(offset).sum(axis=1))
     inlier = residual < threshold
     counts = inlier.sum(axis=1)
     leaders = np.flatnonzero(counts == counts.max())
@@ -203,49 +194,16 @@ def ransac(
     chosen = inlier[best]
 
     if counts[best] >= 3:
-        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range=scale_range)
+        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
         if conditioning[0] > _COLLINEAR_SAMPLE:
             return Sim3(*(part[0] for part in fit)), chosen
     return Sim3(scale[best], rotation[best], translation[best]), chosen
 
 
-def _residuals(
-    scale: Float[np.ndarray, " trials"],
-    rotation: Float[np.ndarray, "trials 3 3"],
-    translation: Float[np.ndarray, "trials 3"],
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "n 3"],
-) -> Float[np.ndarray, "trials n"]:
-    """Compute |target - (scale * R @ source + t)| for every trial and point.
-
-    The squared residual, expanded, is a matrix product of coefficients per trial with coefficients per point. This
-    takes a third of the time of transforming the points by every trial. Coordinates are relative to the clouds' means,
-    which limits cancellation.
-    """
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    x, y = source - source_mean, target - target_mean
-    linear = scale[:, None, None] * rotation
-    t = translation + linear @ source_mean - target_mean
-    ones = np.ones((len(scale), 1))
-    trial_terms = np.hstack([
-        np.square(t).sum(axis=1, keepdims=True), ones, np.square(scale)[:, None],
-        2 * (t[:, None, :] @ linear)[:, 0], -2 * t, -2 * linear.reshape(-1, 9),
-    ])  # fmt: skip
-    point_terms = np.hstack([
-        np.ones((len(x), 1)),
-        np.square(y).sum(axis=1, keepdims=True), np.square(x).sum(axis=1, keepdims=True),
-        x, y, (y[:, :, None] * x[:, None, :]).reshape(-1, 9),
-    ])  # fmt: skip
-    return np.sqrt(np.maximum(trial_terms @ point_terms.T, 0))
-
-
 def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:
-    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials.
-
-    The k-th draw is a rank among the n - k indices left: it is moved up past each earlier index that is not larger.
-    """
+    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials."""
     samples = np.empty((trials, size), dtype=np.int64)
-    for k in range(size):
+    for k in range(size):  # a rank among the n - k indices left, moved up past each earlier index that is not larger
         draw = rng.integers(n - k, size=trials)
         for earlier in np.sort(samples[:, :k], axis=1).T:
             draw += draw >= earlier
@@ -260,12 +218,10 @@ def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np
         raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
-    check_magnitude("source", source)
-    check_magnitude("target", target)
     for name, points in (("source", source), ("target", target)):
+        check_magnitude(name, points)
         longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _COLLINEAR_CLOUD * longest:
-            raise InputError(
-                f"the {len(points)} {name} points are all equal or collinear, expected points that span a plane"
-            )
+            found = f"the {len(points)} {name} points are all equal or collinear"
+            raise InputError(f"{found}, expected points that span a plane")
     return source, target

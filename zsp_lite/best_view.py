@@ -33,10 +33,6 @@ class ViewMatch:
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 
-    def __repr__(self) -> str:
-        foregrounds = int(self.reference.foreground.sum()), int(self.target.foreground.sum())
-        return f"ViewMatch({foregrounds[0]} and {foregrounds[1]} foreground patches, k={self.k},\n  {self.matches!r})"
-
 
 @runtime_checkable
 class ViewSelector(Protocol):
@@ -93,13 +89,8 @@ def cyclical_iou(
     The distance is that of a cycle from a target patch through the reference back to the target. The paper gives no
     threshold; 1.5 patches take a return to the patch itself or to one of its eight neighbours.
     """
-    distances = cyclical_distances(
-        similarity.T,
-        tuple(target_foreground.shape),
-        tuple(reference_foreground.shape),
-        target_foreground,
-        reference_foreground,
-    )
+    grids = tuple(target_foreground.shape), tuple(reference_foreground.shape)
+    distances = cyclical_distances(similarity.T, *grids, target_foreground, reference_foreground)
     return mask_iou(distances >= -threshold, target_foreground)
 
 

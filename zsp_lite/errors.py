@@ -39,23 +39,22 @@ def check_integer(name: str, value: object, minimum: int, maximum: int | float =
         raise InputError(f"{name} is {value!r}, expected an integer {limits}")
 
 
-def check_number(name: str, value: object, above: float = -math.inf) -> None:
+def check_number(name: str, value: object, above: float) -> None:
     """Raise InputError if a value is not a finite real number greater than `above`."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not above < value < math.inf:
-        expected = "a finite number" + (f" greater than {above:g}" if above > -math.inf else "")
-        raise InputError(f"{name} is {value!r}, expected {expected}")
+        raise InputError(f"{name} is {value!r}, expected a finite number greater than {above:g}")
 
 
-def check_magnitude(name: str, values: object, most: float = MAX_LENGTH) -> None:
-    """Raise InputError if a number of an array is not finite, or above `most` in magnitude.
+def check_magnitude(name: str, values: object) -> None:
+    """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in magnitude.
 
     Beyond about 1e150, squares overflow and LAPACK's SVD may never return.
     """
     import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
 
     sizes = np.abs(values)
-    if not (sizes <= most).all():  # False for NaN too
-        raise InputError(f"{name} holds {np.max(sizes)}, expected finite numbers of at most {most:g}")
+    if not (sizes <= MAX_LENGTH).all():  # False for NaN too
+        raise InputError(f"{name} holds {np.max(sizes)}, expected finite numbers of at most {MAX_LENGTH:g}")
 
 
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:

@@ -98,21 +98,17 @@ class PoseEstimate:
         matches = f"{int(self.inliers.sum())} of {len(self.matches)} matches agree"
         sure = "" if self.confidence is None else f", confidence {self.confidence:.2f}"
         angle = rotation_error(np.eye(3), self.sim3.R)
-        lines = [
-            f"PoseEstimate(target view {self.view} of {len(self.target_views)}, {matches}{sure},",
-            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale {self.sim3.scale:.3f},",
-            f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})",
-        ]
-        return "\n".join(lines)
+        return (
+            f"PoseEstimate(target view {self.view} of {len(self.target_views)}, {matches}{sure},\n"
+            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale {self.sim3.scale:.3f},\n"
+            f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})"
+        )
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6)."""
         best = self.target_camera
-        poses = []
-        for camera in cameras:
-            rotation = camera.R @ best.R.T
-            poses.append(Sim3(1.0, rotation, camera.t - rotation @ best.t) @ self.sim3)
-        return poses
+        turns = [camera.R @ best.R.T for camera in cameras]
+        return [Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3 for turn, camera in zip(turns, cameras)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,11 +235,9 @@ def match_points(
 
 
 def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) -> PoseEstimate:
-    """Express an estimate for a turned reference in the camera of the reference as it is.
+    """Express an estimate for a reference turned by `quarters` (see `numpy.rot90`) in the camera of the reference.
 
-    `quarters` counts turns by 90 degrees, counterclockwise as in `numpy.rot90`. With Q the rotation from the camera
-    points of `reference` to those of the turned camera (see `Camera.turn`), the pose T of the turned reference becomes
-    T Q. Feature maps and matches are turned back.
+    With Q the rotation from the camera points of `reference` to those of the turned camera, the pose T becomes T Q.
     """
     camera = reference.frame.camera
     turn = Sim3(1.0, camera.turn(quarters).R @ camera.R.T, np.zeros(3))

@@ -44,7 +44,7 @@ class FeatureMap:
         keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
         if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
-                f"FeatureMap: keys and saliency have shapes {keys} and {saliency}, expected (H, W, D), (H, W)"
+                f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, W, D), (H, W)"
             )
         if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
             raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
@@ -112,20 +112,18 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
         return torch.stack(filled).flatten(1)
 
 
-def average_pool(x: Tensor, axis: int) -> Tensor:
-    """Average each index with its two neighbours along one axis; the ends are averaged with their one neighbour.
-
-    Applied to rows and to columns, this is 3x3 average pooling at stride 1 with count_include_pad=False.
-    """
-    n = x.shape[axis]
-    if n == 1:
-        return x
-    total = x.clone()
-    total.narrow(axis, 1, n - 1).add_(x.narrow(axis, 0, n - 1))
-    total.narrow(axis, 0, n - 1).add_(x.narrow(axis, 1, n - 1))
-    count = torch.full((n,), 3.0, dtype=x.dtype, device=x.device)
-    count[0] = count[-1] = 2.0
-    return total.div_(count.view(-1, *[1] * (x.ndim - 1 - axis)))
+def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
+    """Average over 3x3 windows of two axes at stride 1, smaller ones at the border (count_include_pad=False)."""
+    for axis in axes:
+        n = x.shape[axis]
+        total = x.clone()
+        total.narrow(axis, 1, n - 1).add_(x.narrow(axis, 0, n - 1))
+        total.narrow(axis, 0, n - 1).add_(x.narrow(axis, 1, n - 1))
+        count = torch.full((n,), 3.0, dtype=x.dtype, device=x.device)
+        count[0] -= 1
+        count[-1] -= 1
+        x = total.div_(count.view(-1, *[1] * (x.ndim - 1 - axis)))
+    return x
 
 
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
@@ -136,7 +134,7 @@ def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float
     """
     x = torch.as_tensor(x)
     b, h, w, d = x.shape
-    pooled = average_pool(average_pool(x, 1), 2)
+    pooled = average_pool(x, (1, 2))
     index = bin_indices((h, w)).to(x.device)
     near, far = x.flatten(1, 2)[:, index[:9]], pooled.flatten(1, 2)[:, index[9:]]  # (B, 9 or 8, H*W, D)
     return torch.cat([near, far], dim=1).transpose(1, 2).reshape(b, h, w, 17 * d)

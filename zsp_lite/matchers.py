@@ -50,49 +50,31 @@ TRANSPORT_REGULARISATION = 0.05
 TRANSPORT_STEPS = 100
 
 
-def mutual_nearest_neighbours(
-    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
-) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-    """Match mutual nearest neighbours among the foreground patches, scored by their similarity."""
-
-    def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
-        best, partner = sim.max(dim=1)
-        returned = sim.argmax(dim=0)[partner]
-        return partner, best.masked_fill(returned != torch.arange(len(sim), device=sim.device), -torch.inf)
-
-    return _match_foreground(choose, similarity, foreground1, foreground2)
+def mutual_nearest_neighbours(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+    """Match mutual nearest neighbours, scored by their similarity."""
+    best, partner = similarity.max(dim=1)
+    returned = similarity.argmax(dim=0)[partner]
+    return partner, best.masked_fill(returned != torch.arange(len(best), device=best.device), -torch.inf)
 
 
-def dual_softmax(
-    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
-) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
+def dual_softmax(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
     """Match each patch with the partner of highest probability under a dual softmax (Cheng et al. 2021).
 
     The score is the logarithm of the product of the softmax over rows and the softmax over columns.
     """
-
-    def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
-        sharp = sim / SOFTMAX_TEMPERATURE
-        # The sum of logarithms keeps the order where a product of small probabilities would underflow.
-        best, partner = (sharp.log_softmax(0) + sharp.log_softmax(1)).max(dim=1)
-        return partner, best
-
-    return _match_foreground(choose, similarity, foreground1, foreground2)
+    sharp = similarity / SOFTMAX_TEMPERATURE
+    # The sum of logarithms keeps the order where a product of small probabilities would underflow.
+    score, partner = (sharp.log_softmax(0) + sharp.log_softmax(1)).max(dim=1)
+    return partner, score
 
 
-def optimal_transport(
-    similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"]
-) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
+def optimal_transport(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
     """Match each patch with the partner that receives most of its mass under optimal transport (Liu et al. 2020).
 
-    The plan moves uniform mass between the foreground patches at cost 1 - similarity. The score is the mass moved.
+    The plan moves uniform mass between the patches at cost 1 - similarity. The score is the mass moved.
     """
-
-    def choose(sim: Tensor) -> tuple[Tensor, Tensor]:
-        best, partner = sinkhorn(1 - sim, TRANSPORT_REGULARISATION, TRANSPORT_STEPS).max(dim=1)
-        return partner, best
-
-    return _match_foreground(choose, similarity, foreground1, foreground2)
+    score, partner = sinkhorn(1 - similarity, TRANSPORT_REGULARISATION, TRANSPORT_STEPS).max(dim=1)
+    return partner, score
 
 
 def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
@@ -110,21 +92,23 @@ def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) ->
     return rows[:, None] * kernel * columns
 
 
+def on_foreground(choose: Callable[[Float[Tensor, "m n"]], tuple[Int[Tensor, " m"], Float[Tensor, " m"]]]) -> Matcher:
+    """Make a matcher of a function that matches the foreground patches alone, given their similarities."""
+
+    def matcher(similarity, foreground1, foreground2):
+        partner = torch.zeros(len(foreground1), dtype=torch.long, device=similarity.device)
+        score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64, device=similarity.device)
+        if foreground1.any() and foreground2.any():
+            chosen, found = choose(similarity[foreground1][:, foreground2])
+            partner[foreground1] = foreground2.nonzero()[:, 0][chosen]
+            score[foreground1] = found.to(torch.float64)
+        return partner, score
+
+    return matcher
+
+
 MATCHERS: dict[str, Matcher] = {
-    "mutual": mutual_nearest_neighbours,
-    "dual softmax": dual_softmax,
-    "optimal transport": optimal_transport,
+    "mutual": on_foreground(mutual_nearest_neighbours),
+    "dual softmax": on_foreground(dual_softmax),
+    "optimal transport": on_foreground(optimal_transport),
 }
-
-
-def _match_foreground(
-    choose: Callable[[Tensor], tuple[Tensor, Tensor]], similarity: Tensor, foreground1: Tensor, foreground2: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Apply `choose` to the similarities of the foreground patches; return its matches by index of all patches."""
-    partner = torch.zeros(len(foreground1), dtype=torch.long, device=similarity.device)
-    score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64, device=similarity.device)
-    if foreground1.any() and foreground2.any():
-        chosen, found = choose(similarity[foreground1][:, foreground2])
-        partner[foreground1] = foreground2.nonzero()[:, 0][chosen]
-        score[foreground1] = found.to(torch.float64)
-    return partner, score

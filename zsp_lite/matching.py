@@ -13,7 +13,6 @@ P S: a dozen additions of S to itself.
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -100,7 +99,6 @@ def cyclical_distances(
     grid2: Grid,
     fg1: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
-    published: bool = False,
 ) -> Float[Tensor, "h1 w1"]:
     """Compute the cyclical distance map C_u = -d(u, u') (eq. 2): u's nearest neighbour is v, and v's is u'.
 
@@ -110,15 +108,14 @@ def cyclical_distances(
         grid2: Rows and columns of image 2.
         fg1: (H1, W1) foreground of image 1; None for all patches.
         fg2: (H2, W2) foreground of image 2; None for all patches.
-        published: Mask the cycles as the published code does. It does not check that u' is foreground, and discards
-            every u' in row 0 or column 0: it marks "no cycle" by index 0, and looks for the mark in each coordinate.
 
     Returns:
         (H1, W1) negative distances in patches; -inf where u, v or u' is not foreground.
     """
     sim = torch.as_tensor(sim)
-    on1, on2 = _foreground(fg1, grid1, sim.device), _foreground(fg2, grid2, sim.device)
-    return _cycles(sim, grid1, on1, on2, published)[0].view(grid1)
+    on1 = torch.ones(grid1, dtype=torch.bool) if fg1 is None else torch.as_tensor(fg1)
+    on2 = torch.ones(grid2, dtype=torch.bool) if fg2 is None else torch.as_tensor(fg2)
+    return _cycles(sim, on1.to(sim.device), on2.to(sim.device))[0].view(grid1)
 
 
 def match(
@@ -147,8 +144,8 @@ def match(
         kmeans: False returns the k best patches without clustering.
         seed: Seed or generator of k-means.
         cycle_from: Image in which cycles start and whose patches are clustered and compared in saliency. "reference"
-            is the paper's; "target" follows the cycle step of the published code, with its masking (see
-            `cyclical_distances`). docs/published_code.md lists all differences.
+            is the paper's; "target" follows the cycle step of the published code, with its masking.
+            docs/published_code.md lists all differences.
         ref_foreground: (H1, W1) foreground of the reference; by default `ref.foreground()`.
         target_foreground: (H2, W2) foreground of the target.
         sim: (H1 * W1, H2 * W2) similarities, if they are computed already.
@@ -165,8 +162,7 @@ def match(
     else:
         start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
     if matcher == "cyclical":
-        published = cycle_from == "target"
-        score, neighbour = _cycles(sim, start.grid, on_start.flatten(), on_end.flatten(), published)
+        score, neighbour = _cycles(sim, on_start, on_end, published=cycle_from == "target")
     else:
         rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
         neighbour, score = rank(sim, on_start.flatten(), on_end.flatten())
@@ -174,7 +170,7 @@ def match(
 
     # The rest works on a few hundred numbers, in NumPy.
     score, best, neighbour = (x.cpu().numpy() for x in (score, best, neighbour))
-    order = np.lexsort((np.arange(len(best)), -best, -score))
+    order = np.lexsort((-best, -score))
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
@@ -186,24 +182,27 @@ def match(
 
 
 def _cycles(
-    sim: Float[Tensor, "n1 n2"], grid1: Grid, on1: Bool[Tensor, " n1"], on2: Bool[Tensor, " n2"], published: bool
+    sim: Float[Tensor, "n1 n2"], on1: Bool[Tensor, "h1 w1"], on2: Bool[Tensor, "h2 w2"], published: bool = False
 ) -> tuple[Float[Tensor, " n1"], Int[Tensor, " n1"]]:
     """Compute the scores of `cyclical_distances`, and each foreground patch's nearest neighbour; 0 for the others.
 
     Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
     """
+    columns, on1, on2 = on1.shape[1], on1.flatten(), on2.flatten()
     u = on1.nonzero()[:, 0]
     forth = sim[u].argmax(dim=1)
     reached, position = forth.unique(return_inverse=True)
     back = sim[:, reached].argmax(dim=0)[position]
-    row, column = back // grid1[1], back % grid1[1]
-    offset = torch.stack([u // grid1[1] - row, u % grid1[1] - column])
+    row, column = back // columns, back % columns
+    distance = torch.stack([u // columns - row, u % columns - column]).to(torch.float32).square().sum(0).sqrt()
+    # The published code does not check that u' is foreground, and discards every u' in row 0 or column 0: it marks "no
+    # cycle" by index 0, and looks for the mark in each coordinate.
     valid = on2[forth] & ((row > 0) & (column > 0) if published else on1[back])
-    distance = -offset.to(torch.float32).square().sum(0).sqrt()
-    score = torch.full(on1.shape, -torch.inf, device=sim.device).index_copy(
-        0, u, distance.masked_fill(~valid, -torch.inf)
-    )
-    return score, torch.zeros_like(on1, dtype=torch.long).index_copy(0, u, forth)
+    score = torch.full((len(sim),), -torch.inf, device=sim.device)
+    score[u] = torch.where(valid, -distance, -torch.inf)
+    neighbour = torch.zeros(len(sim), dtype=torch.long, device=sim.device)
+    neighbour[u] = forth
+    return score, neighbour
 
 
 def _keys(features: Keys) -> Float[Tensor, "h w d"]:
@@ -211,84 +210,60 @@ def _keys(features: Keys) -> Float[Tensor, "h w d"]:
     return torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
 
 
-def _foreground(mask, grid: Grid, device: torch.device) -> Bool[Tensor, " n"]:
-    """Flatten a foreground mask; None selects all patches."""
-    if mask is None:
-        return torch.ones(grid[0] * grid[1], dtype=torch.bool, device=device)
-    return torch.as_tensor(mask, device=device).flatten()
-
-
 def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
     """Sum the products of keys over the 17 bins, as the module's docstring explains."""
-
-    def pool(x: Tensor) -> Tensor:
-        return average_pool(average_pool(x, 0), 2)
 
     def columns(x: Tensor) -> Tensor:
         return x.permute(1, 0, 3, 2)
 
-    pooled = pool(products)
+    # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along their columns.
+    pooled = average_pool(products, (0, 2))
     near, far, centre = (columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled))
-    return columns(_joint_shifts(near, 1).add_(_joint_shifts(pool(far), 3)).sub_(pool(centre)))
+    far, centre = average_pool(far, (0, 2)), average_pool(centre, (0, 2))
+    return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
 
 
 def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
-    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its own border."""
+    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its border."""
     total = x.clone()
     for shift in (-step, step):
-        for (to1, from1), (to2, from2) in product(*(_clamped_shift(n, shift) for n in (x.shape[0], x.shape[2]))):
-            total[to1, :, to2].add_(x[from1, :, from2])
+        index1, index2 = ((torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2])
+        total.add_(x.index_select(0, index1).index_select(2, index2))
     return total
-
-
-def _clamped_shift(n: int, shift: int) -> list[tuple[slice, slice]]:
-    """Return the entries of an axis that read others `shift` away, and those, clamped, that read its first or last."""
-    size = min(abs(shift), n)
-    front, back = slice(0, n - size), slice(size, n)
-    if shift > 0:
-        return [(front, back), (slice(n - size, n), slice(n - 1, n))]
-    return [(back, front), (slice(0, size), slice(0, 1))]
 
 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     """Compute 1 / length of each patch's log-binned descriptor."""
     index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
-    raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(average_pool(keys, 0), 1)))
+    raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(keys, (0, 1))))
     squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
 
 def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
-    """Compute the cosines between the descriptors of a few patches, which are few enough to build.
-
-    They are rounded to six decimals: greedy k-means++ has exact ties (of two points that are each other's nearest,
-    either lowers the sum of squares by the same amount), which rounding errors would break differently each time.
-    """
+    """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
     keys = features.keys.cpu().double()
     index = torch.from_numpy(index)
     descriptors = keys.flatten(0, 1)[index]
     if binning:
-        bins = bin_indices(features.grid)[:, index]
-        pooled = average_pool(average_pool(keys, 0), 1)
+        bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
         descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
         descriptors = descriptors.transpose(0, 1).flatten(1)
     descriptors = F.normalize(descriptors, dim=1)
+    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest, either lowers the
+    # sum of squares by the same amount), which rounding errors would break differently each time.
     return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
-@lru_cache(maxsize=1)
-def _thread_pools() -> ThreadpoolController:
-    return ThreadpoolController()
+_thread_pools = lru_cache(ThreadpoolController)
 
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
-    """Cluster m points, given by their inner products, by k-means; returns their labels.
-
-    The eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions with the same inner
-    products, hence the same distances. k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
-    One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
-    """
+    """Cluster m points, given by their inner products, by k-means; returns their labels."""
+    # One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
     with _thread_pools().limit(limits=1, user_api="blas"), warnings.catch_warnings():
+        # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same inner products,
+        # hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
         values, vectors = np.linalg.eigh(gram)
         points = vectors * np.sqrt(np.maximum(values, 0.0))
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.
@@ -298,6 +273,6 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -
 
 def _most_salient(labels: Int[np.ndarray, " m"], salience: Float[np.ndarray, " m"]) -> Int[np.ndarray, " clusters"]:
     """Find the index of each cluster's most salient point (ties: the first), in ascending order."""
-    order = np.lexsort((np.arange(len(labels)), -salience, labels))
+    order = np.lexsort((-salience, labels))
     _, first = np.unique(labels[order], return_index=True)
     return np.sort(order[first])

@@ -1,6 +1,4 @@
-"""Pose errors, and the paper's figures of them.
-
-Source: sec. 5.1; supplement, "Choice of evaluation metrics".
+"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation metrics").
 
 `benchmark.statistics` has their intervals and tests. A bootstrap replicate is a row of weights, one per pair.
 """
@@ -92,6 +90,7 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None) -> np.ndarray | 
 
 
 def _rotations(name: str, values: ArrayLike) -> Float[np.ndarray, "*batch 3 3"]:
+    """Convert and check rotation matrices."""
     matrices = real_array(f"rotation_error: {name}", values)
     if matrices.shape[-2:] != (3, 3):
         raise InputError(f"rotation_error: {name} has shape {matrices.shape}, expected (..., 3, 3)")

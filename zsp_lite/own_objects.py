@@ -38,9 +38,7 @@ _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
 _TAKEN = {"open": (), "image": ("mask", "box", "intrinsics", "depth", "depth_unit")}
 _TAKEN |= {"sequence": ("mask", "box"), "nerfstudio": ("mask", "box"), "lists": ("mask", "box", "depth_unit")}
-# What to do where the depth of a format seems to have another unit. Lengths are metres, if they are known at all.
-_UNIT_OPTION = "give the unit of its depth as --depth-unit (0.001: millimetres, 1: metres)"
-_UNITS = {"nerfstudio": "set depth_unit_scale_factor in transforms.json"}
+_UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
@@ -56,7 +54,6 @@ class Source:
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    unit_given: bool = True  # whether the unit of the depth is not the default, but the user's or the format's
 
     @property
     def name(self) -> str:
@@ -81,8 +78,6 @@ class Source:
         others = {"given": [], "box": [0], "auto": np.linspace(0, len(self.numbers) - 1, _CONTEXT).round()}[self.mask]
         frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
-        if not self.unit_given and (flags := self.unit_flags(some)):
-            raise InputError(flags[0])
         if self.mask != "given":
             frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
         elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
@@ -90,21 +85,16 @@ class Source:
             raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
         return [frames[position] for position in positions]
 
-    def unit_flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length if the object, or what is near in frames without masks, is implausibly far."""
-        if self.format == "sequence":
-            return ()
+    def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
+        """Question the unit of length where the object is implausibly far, and the masks of frames if not given."""
+        found = [] if self.mask == "given" else list(mask_flags(frames))
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
-        if _NEAREST <= distance <= _FARTHEST:
-            return ()
-        cure = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {_UNITS.get(self.format, _UNIT_OPTION)}"
-        return (f"{self.path}: the object is {distance:.3g} m from the camera, {cure}",)
-
-    def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length, and the masks of frames if they were not given."""
-        masks = () if self.mask == "given" else mask_flags(frames)
-        return *self.unit_flags(frames), *(f"{self.path}: {flag}" for flag in masks)
+        if self.format != "sequence" and not _NEAREST <= distance <= _FARTHEST:
+            cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit (0.001: millimetres, 1: metres)")
+            expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; the unit of its depth is given by {cure}"
+            found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
+        return tuple(f"{self.path}: {flag}" for flag in found)
 
     def reference(self, number: int | None) -> tuple[int, Frame]:
         """Return the position and the frame of a number; by default, of the first usable one among some."""
@@ -115,9 +105,8 @@ class Source:
             (frame,) = self.load([position])
             if not (defect := frame_defect(frame)):
                 return position, frame
-        raise InputError(
-            f"{self.path}: no usable reference frame: {defect}, expected another --reference-frame, --mask or --box"
-        )
+        expected = "another --reference-frame, --mask or --box"
+        raise InputError(f"{self.path}: no usable reference frame: {defect}, expected {expected}")
 
 
 def estimate_pose(
@@ -156,7 +145,7 @@ def estimate_pose(
     check_integer("targets", targets, 1)
     given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
-        first, second = open_pair(reference, target, given)
+        first, second = sources = open_pair(reference, target, given)
         position, frame = first.reference(reference_frame)
         positions = second.spread(targets)
         frames = second.load(positions)
@@ -164,9 +153,8 @@ def estimate_pose(
         method = ZeroShotPose(model, foreground="saliency" if has_saliency(model) else "mask", upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        spreads = [axis_deviation(cloud) if len(cloud) > 1 else 0.0 for cloud in clouds]
-        unscaled = [one.format == "sequence" for one in (first, second)]
-        scales = [1.0 if known else 1 / (spread or 1) for known, spread in zip(unscaled, spreads)]
+        unscaled = [one.format == "sequence" or not len(cloud) for one, cloud in zip(sources, clouds)]
+        scales = [1.0 if done else 1 / (axis_deviation(cloud) or 1) for done, cloud in zip(unscaled, clouds)]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
         solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
@@ -236,16 +224,13 @@ def open_source(
         if name not in _TAKEN[layout]:
             raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
     if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
-        raise InputError(
-            f"{path}: mask is {mask!r} and box is {box}, expected --mask given, --mask auto, or --mask box with --box "
-            "TOP,LEFT,HEIGHT,WIDTH"
-        )
+        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
+        raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
     if layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])
-        frames = dataset.frames(folder.parent.name, folder.name)
-        frames = [one for one in frames if one.viewpoint is not None and one.depth is not None]
-        if not frames:
+        every = dataset.frames(folder.parent.name, folder.name)
+        if not (frames := [one for one in every if one.viewpoint is not None and one.depth is not None]):
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
@@ -253,7 +238,7 @@ def open_source(
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box, depth_unit is not None or "depth_unit" not in _TAKEN[layout])
+    return Source(path, layout, numbers, read, mask, box)
 
 
 def open_pair(
@@ -261,8 +246,8 @@ def open_pair(
 ) -> list[Source]:
     """Open two sources with the options of a command line, by the names of arguments of `open_source`.
 
-    An option has one value for each path that takes it, or one for all of them: but one `depth` for each image, and a
-    single `box` is for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
+    An option has one value for each path that takes it (`depth`: each image), or one for all of them. A single `box` is
+    for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
     """
     sides = reference, target
     formats = ["open" if isinstance(side, Source) else _format(Path(side)) for side in sides]
@@ -314,9 +299,8 @@ def _open_image(
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
     camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}")
     if not all(0 < place < side for place, side in zip(camera.principal_point, camera.size[::-1])):
-        raise InputError(
-            f"image {path}: CX,CY is {intrinsics[2:]}, expected a point inside its {camera.size[::-1]} pixels"
-        )
+        expected = f"a point inside its {camera.size[::-1]} pixels"
+        raise InputError(f"image {path}: CX,CY is {intrinsics[2:]}, expected {expected}")
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 

@@ -52,10 +52,9 @@ class ZeroShotPose:
             "verified", or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
         upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
-            degrees, because the features of a turned image are others and phones may store images turned. The estimate
-            with the highest score is kept, and its pose is that of the image as given. The score is that of the first
-            hypothesis, or that of the chosen view where a solver has none. Confidence and alternatives are those within
-            the chosen turn. Keep True where images are upright: fewer wrong poses compete.
+            degrees, since phones may store images turned, and keeps the estimate with the highest score: that of the
+            first hypothesis, or of the chosen view where a solver has none. The pose is that of the image as given.
+            Keep True where images are upright: fewer wrong poses compete.
 
     Raises:
         InputError: A setting is out of range.
@@ -77,18 +76,12 @@ class ZeroShotPose:
     upright: bool = True
 
     def __post_init__(self):
-        names = {
-            "matcher": ("cyclical", *MATCHERS),
-            "view_selector": tuple(VIEW_SELECTORS),
-            "solver": ("paper", *SOLVER_CLASSES),
-            "foreground": ("saliency", "mask"),
-            "cycle_from": ("reference", "target"),
-            "kmeans": (None, True, False),
-        }
-        for name, allowed in names.items():
+        stages = {"matcher": ("cyclical", *MATCHERS), "view_selector": VIEW_SELECTORS}
+        stages["solver"] = ("paper", *SOLVER_CLASSES)
+        options = {"foreground": ("saliency", "mask"), "cycle_from": ("reference", "target")}
+        for name, allowed in (stages | options | {"kmeans": (None, True, False)}).items():
             value = getattr(self, name)
-            plugged_in = name in ("matcher", "view_selector", "solver") and callable(value)
-            if not plugged_in:
+            if name not in stages or not callable(value):  # else a plug-in
                 check_choice(name, value, allowed)
         for name, *limits in (("k", 1), ("trials", 1, MOST_TRIALS), ("sample_size", 3), ("seed", 0)):
             check_integer(name, getattr(self, name), *limits)
@@ -128,7 +121,7 @@ class ZeroShotPose:
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
         size = crop_size(self.backbone)
-        return self._views([object_crop(frame, size) for frame in frames])
+        return extract_views(self.backbone, [object_crop(frame, size) for frame in frames], self.foreground)
 
     def match_views(
         self,
@@ -138,11 +131,7 @@ class ZeroShotPose:
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
-        Args:
-            reference: Reference view.
-            targets: Target views.
-            similarities: For each target view, the cosines between the reference's patches and its own, if they are
-                known already.
+        `similarities` are the cosines of the reference's patches with those of each view, if they are known already.
         """
         if similarities is None:
             compare = cosine_similarities if self.binning else key_similarities
@@ -162,12 +151,8 @@ class ZeroShotPose:
     ) -> PoseEstimate:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
-        If the reference is not `upright`, the features of its other three turns are extracted here.
-
-        Args:
-            reference: Reference view (see `views`).
-            targets: Target views.
-            matched: The result of `match_views`, for the reference as it is, if it is known already.
+        `matched` is the result of `match_views`, if it is known already; the reference is then taken as it is. Else, if
+        it is not `upright`, the features of its other three turns are extracted here.
         """
         if not targets:
             raise InputError("no target views, expected at least one")
@@ -175,7 +160,8 @@ class ZeroShotPose:
             raise InputError(f"reference {reference.frame.name or 'view'}: {defect}")
         if self.upright or matched is not None:
             return self._solve(reference, targets, matched)
-        turns = [reference, *self._views([turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)])]
+        turned = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
+        turns = [reference, *extract_views(self.backbone, turned, self.foreground)]
         found, failures, timings = [], [], Counter()
         for quarters, view in enumerate(turns):
             try:
@@ -191,9 +177,6 @@ class ZeroShotPose:
         _, quarters, best = max(found, key=lambda one: one[0])
         best = turn_reference_back(best, reference, quarters) if quarters else best
         return replace(best, timings=dict(timings))
-
-    def _views(self, crops: Sequence[Frame]) -> list[View]:
-        return extract_views(self.backbone, crops, self.foreground)
 
     def _solve(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None
@@ -228,10 +211,7 @@ class ZeroShotPose:
 def solve_pair(
     method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
 ) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own.
-
-    Crops and features are computed once.
-    """
+    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with shared features."""
     first, *others = method.views([reference, *targets])
     if solvers is None:
         name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
@@ -279,13 +259,12 @@ def align_best_view(
 def view_alignment(reference: View, target: View) -> Sim3:
     """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
 
-    Returns:
-        Identity rotation, with the scale and translation that map the standard deviation and the centroid of the
-        reference's foreground points onto those of the target's.
+    The rotation is the identity. Scale and translation map the standard deviation and the centroid of the reference's
+    foreground points onto those of the target's.
     """
     first, second = _foreground_points(reference), _foreground_points(target)
-    spread, target_spread = standard_deviation(first), standard_deviation(second)
-    scale = target_spread / spread if spread > 0 and target_spread > 0 else 1.0
+    spreads = standard_deviation(first), standard_deviation(second)
+    scale = spreads[1] / spreads[0] if min(spreads) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 
 

@@ -20,10 +20,9 @@ def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray
     return known if frame.mask is None else known & (frame.mask > threshold)
 
 
-def object_points(frame: Frame, threshold: float = ON_OBJECT) -> Float[np.ndarray, "n 3"]:
+def object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """Unproject the pixels of `object_pixels` to camera-frame points; N may be 0."""
-    pixels = object_pixels(frame, threshold)
-    return unproject_depth(frame.depth, frame.camera)[pixels]
+    return unproject_depth(frame.depth, frame.camera)[object_pixels(frame)]
 
 
 def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:

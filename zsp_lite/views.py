@@ -26,8 +26,7 @@ class View:
     frame: Frame  # the crop
     features: FeatureMap  # features of the crop's image
     foreground: Bool[torch.Tensor, "rows cols"]  # patches on the object
-    # probability of each pixel of being on the object, in [0, 1]; None if unknown
-    object_mask: Float[np.ndarray, "height width"] | None = None
+    soft_mask: Float[np.ndarray, "height width"]  # probability of each pixel of being on the object, in [0, 1]
 
     def __repr__(self) -> str:
         (height, width), (rows, columns) = self.frame.camera.size, self.features.grid
@@ -35,14 +34,6 @@ class View:
             f"View({self.frame.name!r}, {height} x {width} pixels, {int(self.foreground.sum())} of {rows} x {columns} "
             f"patches foreground)"
         )
-
-    @property
-    def soft_mask(self) -> Float[np.ndarray, "height width"]:
-        """`object_mask`, or if there is none, the foreground patches interpolated between their centres."""
-        if self.object_mask is not None:
-            return self.object_mask
-        patches = self.foreground.cpu().numpy().astype(np.float32)
-        return cv2.resize(patches, self.frame.camera.size[::-1], interpolation=cv2.INTER_LINEAR)
 
     @cached_property
     def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
@@ -104,8 +95,8 @@ def turn_view(view: View, quarters: int) -> View:
     keys, saliency, foreground = (
         torch.rot90(values, quarters, (0, 1)) for values in (features.keys, features.saliency, view.foreground)
     )
-    mask = None if view.object_mask is None else np.ascontiguousarray(np.rot90(view.object_mask, quarters))
     features = FeatureMap(keys, saliency, features.global_feature)
+    mask = np.ascontiguousarray(np.rot90(view.soft_mask, quarters))
     return View(turn_frame(view.frame, quarters), features, foreground, mask)
 
 
@@ -127,10 +118,7 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
 
 
 def soft_saliency(features: FeatureMap, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on.
-
-    `size` is (height, width) in pixels; values are interpolated between the patches' centres.
-    """
+    """Turn saliency into a soft mask: 0 for no saliency, 0.5 at the foreground's threshold, 1 from twice that on."""
     ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
     return cv2.resize(ramp, size[::-1], interpolation=cv2.INTER_LINEAR)
 

@@ -1,5 +1,6 @@
 """A vision transformer with its preprocessing: a list of images in, a list of FeatureMaps out."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from zsp_lite.backbones.facets import FACETS, Facet, block_index
 from zsp_lite.backbones.huggingface import HuggingFaceViT
 from zsp_lite.backbones.vit import VisionTransformer, nearest_multiple
+from zsp_lite.choices import FACETS, Facet
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.features import FeatureMap
 
@@ -21,7 +22,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Backbone:
-    """Vision transformer as feature extractor of the method (section 4.1).
+    """Vision transformer as feature extractor of the method (section 4.1). The arguments are attributes, too.
 
     Args:
         model: Network.
@@ -36,12 +37,6 @@ class Backbone:
         image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default:
             the model's.
         mean, std: Normalisation of RGB values in [0, 1].
-
-    Attributes:
-        layer: Index of the block, counted from 0.
-        patch_size, embed_dim: Those of the model.
-
-    The other arguments are attributes of the same name.
 
     Raises:
         InputError: If an argument is out of range or the device is not available.
@@ -108,6 +103,17 @@ class Backbone:
         return [
             FeatureMap(*(values[index].to(torch.float32, copy=True) for values in parts)) for index in range(len(batch))
         ]
+
+
+def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:
+    """Return the index from 0 of a block given as "last", "block9" or an integer; negative ones count from the end."""
+    found = re.fullmatch(r"(?:block(?=\d))?(-?\d+)", "-1" if layer == "last" else str(layer).strip())
+    if not found or not -depth <= int(found[1]) < depth:
+        raise InputError(
+            f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or a number from {-depth} "
+            f"to {depth - 1}"
+        )
+    return int(found[1]) % depth
 
 
 def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:

@@ -15,13 +15,9 @@ from zsp_lite.io.tensors import MAX_WEIGHTS, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a .safetensors file, or a torch file that contains tensors only. No code from the file is executed.
+    """Read weights with DINO's state-dict keys, and metadata, from a .safetensors file or a torch file of tensors only.
 
-    Returns:
-        Weights with DINO's state-dict keys, and the metadata (empty unless the file is a .safetensors file).
-
-    Raises:
-        InputError: If the file is damaged or contains anything but tensors.
+    No code from the file is executed. A torch file has no metadata. InputError if there is anything but tensors.
     """
     path = Path(path)
     if path.suffix == ".safetensors":
@@ -71,25 +67,13 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
 
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ignored: Sequence[str] = ()) -> None:
-    """Load a state dict into a module, as float32, without the keys of the prefixes `ignored`.
-
-    `name` stands in errors: a key is missing, unknown or of another shape, or a weight is not of finite floats.
-    """
-    state = model.state_dict()
-    weights = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
-    expected = {key: tuple(x.shape) for key, x in state.items()}
-    found = {key: tuple(x.shape) if torch.is_tensor(x) else f"a {type(x).__name__}" for key, x in weights.items()}
-    for key in expected.keys() & found.keys():
-        x = weights[key]
-        if state[key].is_floating_point() and torch.is_tensor(x) and not (x.is_floating_point() and x.isfinite().all()):
-            found[key] = "values that are not finite floats"
-    # Older checkpoints have no counter of the batches in batch normalisation, which inference does not use.
-    counters = {key for key in expected.keys() - found.keys() if key.endswith("num_batches_tracked")}
-    wrong = sorted(key for key in (expected.keys() | found.keys()) - counters if expected.get(key) != found.get(key))
-    if wrong:
-        key = wrong[0]
-        raise InputError(
-            f"{name}: {len(wrong)} weights do not fit the architecture, first {key}: "
-            f"expected {expected.get(key, 'none')}, got {found.get(key, 'none')}"
-        )
-    model.load_state_dict({key: x.to(state[key].dtype) for key, x in weights.items()}, strict=False, assign=True)
+    """Load a state dict of finite weights into a module, as float32, without the keys of the prefixes `ignored`."""
+    state = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
+    for key, x in state.items():
+        if torch.is_tensor(x) and not x.isfinite().all():
+            raise InputError(f"{name}: {key} holds values that are not finite")
+    state = {key: x.float() if torch.is_tensor(x) and x.is_floating_point() else x for key, x in state.items()}
+    try:
+        model.load_state_dict(state, assign=True)
+    except RuntimeError as error:  # several lines that name every key
+        raise InputError(f"{name}: the weights do not fit: {' '.join(str(error).split())[:300]}") from error

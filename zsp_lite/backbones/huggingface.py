@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from zsp_lite.backbones.facets import Facet
 from zsp_lite.backbones.vit import Tokens, nearest_multiple
+from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError
 
 PREFIX = "hf:"
@@ -34,15 +34,8 @@ _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
 class HuggingFaceViT(nn.Module):
     """Adapter of a Hugging Face model with the attributes and the `extract` of `vit.VisionTransformer`.
 
-    Args:
-        model: Vision model that computes attention eagerly, so that it returns it.
-        config: Its configuration.
-        image_size: Side in pixels of the images, rounded to a multiple of the patch size.
-        name: Name for error messages.
-
-    Raises:
-        InputError: If the model has no CLS token, no query, key and value projections in every block, or does not run
-            at that image size.
+    The model must compute attention eagerly, so that it returns it. InputError if it has no CLS token or no query, key
+    and value projections in every block, or does not run on images of `image_size`.
     """
 
     def __init__(self, model: nn.Module, config, image_size: int, name: str):
@@ -76,9 +69,8 @@ class HuggingFaceViT(nn.Module):
         so that they do not depend on the position.
         """
         grid = images.shape[2] // self.patch_size, images.shape[3] // self.patch_size
-        options = {}
-        if "interpolate_pos_encoding" in self._arguments:  # models without this option always interpolate
-            options["interpolate_pos_encoding"] = True
+        # Models without this option always interpolate.
+        options = {"interpolate_pos_encoding": True} if "interpolate_pos_encoding" in self._arguments else {}
         if "noise" in self._arguments:  # a masked autoencoder orders the patches by it: keep their order
             options["noise"] = torch.arange(grid[0] * grid[1], device=images.device).float().expand(len(images), -1)
         projected: list[Tensor] = []
@@ -110,7 +102,7 @@ class HuggingFaceViT(nn.Module):
 
 
 def load_huggingface(
-    name: str, image_size: int = IMAGE_SIZE
+    name: str, image_size: int | None
 ) -> tuple[HuggingFaceViT, tuple[list[float], list[float]] | None]:
     """Load the model of "hf:NAME": a folder in Hugging Face's format or the name of a model on the hub.
 
@@ -141,7 +133,7 @@ def load_huggingface(
         if key in report["missing_keys"]:
             weight.data.zero_()  # random values would give the backbone another identity at every start
     model = getattr(model, "vision_model", model).eval()
-    return HuggingFaceViT(model, vision, image_size, name), normalisation
+    return HuggingFaceViT(model, vision, IMAGE_SIZE if image_size is None else image_size, name), normalisation
 
 
 def model_folder(name: str) -> Path:

@@ -9,9 +9,9 @@ import torch
 
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone
 from zsp_lite.backbones.checkpoints import build_vit, metadata_integers, read_checkpoint
-from zsp_lite.backbones.facets import Facet
-from zsp_lite.backbones.huggingface import IMAGE_SIZE, PREFIX, load_huggingface
+from zsp_lite.backbones.huggingface import PREFIX, load_huggingface
 from zsp_lite.backbones.pretrained import DEFAULT, available_backbones, check_authentic, download, obtained_by
+from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError
 
 
@@ -85,15 +85,11 @@ def verify(name_or_path: str | Path) -> None:
         raise InputError(f"backbone {name}: {obtained_by(name)}")
     backbone = load_backbone(name_or_path, "cpu")
     side = backbone.image_size
-    ramp = np.broadcast_to(np.linspace(0, 255, side, dtype=np.uint8)[:, None, None], (side, side, 3))
-    try:
-        backbone([ramp])
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+    backbone([np.broadcast_to(np.linspace(0, 255, side, dtype=np.uint8)[:, None, None], (side, side, 3))])
 
 
 def _load_huggingface(config: BackboneConfig, device: str | torch.device | None) -> Backbone:
-    model, normalisation = load_huggingface(config.name, IMAGE_SIZE if config.image_size is None else config.image_size)
+    model, normalisation = load_huggingface(config.name, config.image_size)
     mean, std = normalisation or (IMAGENET_MEAN, IMAGENET_STD)
     folder = Path(config.name.removeprefix(PREFIX)).expanduser()
     label = PREFIX + folder.resolve().name if os.path.isdir(folder) else config.name

@@ -1,8 +1,4 @@
-"""Backbones that have a name: the embedded one, and the DINO models released by Caron et al. (2021).
-
-The SHA-256 of the embedded weights is in weights/SHA256SUMS. Of the released models only the first digits of an MD5
-digest were published.
-"""
+"""Backbones that have a name: the embedded one, and the DINO models released by Caron et al. (2021)."""
 
 import os
 from dataclasses import dataclass
@@ -23,11 +19,11 @@ SUMS = "SHA256SUMS"  # written by: cd zsp_lite/weights && sha256sum *.safetensor
 
 @dataclass(frozen=True)
 class PretrainedWeights:
-    """A released checkpoint: its path below the DINO URL, first digits of its MD5 digest, and bytes if known."""
+    """A released checkpoint."""
 
-    file: str
-    md5_prefix: str
-    size: int | None = None
+    file: str  # path below the DINO URL
+    md5_prefix: str  # no more digits of a digest were published
+    size: int | None = None  # bytes
 
     @property
     def url(self) -> str:

@@ -1,8 +1,7 @@
 """A vision transformer in the layout of the public DINO checkpoints (Caron et al. 2021).
 
-The method uses three outputs (Goodwin et al., sections 4.1 and 5.3): the *keys* of one block as patch
-descriptors, the *attention* of the last block's CLS token as saliency, and the CLS output token as global feature.
-`VisionTransformer.extract` returns these three and computes nothing else.
+The method uses three outputs (sections 4.1 and 5.3): the *keys* of one block as patch descriptors, the *attention* of
+the last block's CLS token as saliency, and the CLS output token as global feature.
 """
 
 import math
@@ -14,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from zsp_lite.backbones.facets import Facet
+from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_integer
 
 MOST_INPUT = 2048  # pixels of an image's side; the time of attention grows with the fourth power of the side
@@ -28,53 +27,35 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 
 @dataclass(frozen=True)
 class Tokens:
-    """Outputs of a forward pass that the method uses; the n patches are in row-major order.
+    """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    Attributes:
-        keys: Patch descriptors: the keys of one block (or another facet), heads concatenated.
-        attention: Attention of the last block from CLS to the patches; softmax over all 1 + n tokens.
-        cls: CLS output token after the final normalisation.
-        grid: (rows, columns) of the patch grid; rows * columns = n.
-    """
-
-    keys: Float[Tensor, "batch n dim"]
-    attention: Float[Tensor, "batch heads n"]
-    cls: Float[Tensor, "batch dim"]
-    grid: tuple[int, int]
+    keys: Float[
+        Tensor, "batch n dim"
+    ]  # patch descriptors: the keys of one block (or another facet), heads concatenated
+    attention: Float[Tensor, "batch heads n"]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
+    cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
+    grid: tuple[int, int]  # rows and columns of patches; their product is n
 
 
 @dataclass(frozen=True)
 class TrainingTokens:
-    """Outputs of a forward pass that training losses use, with gradients.
+    """Outputs of a forward pass that training losses use, with gradients."""
 
-    Attributes:
-        tokens: All output tokens after the final normalisation, CLS first.
-        keys: Keys of the patches in one block, heads concatenated.
-        key_input: Normalised patch tokens of that block; the keys are a linear function of them.
-        cls_logits: Scaled attention logits of the last block from CLS to all tokens, float32.
-    """
-
-    tokens: Float[Tensor, "batch tokens dim"]
-    keys: Float[Tensor, "batch n dim"]
-    key_input: Float[Tensor, "batch n dim"]
-    cls_logits: Float[Tensor, "batch heads tokens"]
+    tokens: Float[Tensor, "batch tokens dim"]  # all output tokens after the final normalisation, CLS first
+    keys: Float[Tensor, "batch n dim"]  # keys of the patches in one block, heads concatenated
+    key_input: Float[Tensor, "batch n dim"]  # normalised patch tokens of that block: the keys are linear in them
+    cls_logits: Float[Tensor, "batch heads tokens"]  # scaled attention logits of the last block from CLS to all tokens
 
 
 @dataclass(frozen=True)
 class BlockActivations:
-    """Intermediate results of one transformer block, CLS first.
+    """Intermediate results of one transformer block, CLS first."""
 
-    Attributes:
-        normed: Input after the first normalisation.
-        query, key, value: Linear functions of `normed`, heads concatenated.
-        token: Output of the block, not normalised.
-    """
-
-    normed: Float[Tensor, "batch tokens dim"]
-    query: Float[Tensor, "batch tokens dim"]
+    normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
+    query: Float[Tensor, "batch tokens dim"]  # like key and value a linear function of `normed`, heads concatenated
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
-    token: Float[Tensor, "batch tokens dim"]
+    token: Float[Tensor, "batch tokens dim"]  # output of the block, not normalised
 
 
 class Attention(nn.Module):
@@ -176,10 +157,8 @@ class VisionTransformer(nn.Module):
         super().__init__()
         sizes = image_size, patch_size, embed_dim, depth, num_heads
         if min(sizes) < 1 or image_size % patch_size or embed_dim % num_heads:
-            raise InputError(
-                f"VisionTransformer: image_size, patch_size, embed_dim, depth and num_heads are {sizes}, expected "
-                "positive numbers, image_size a multiple of patch_size and embed_dim one of num_heads"
-            )
+            found = f"image_size, patch_size, embed_dim, depth and num_heads are {sizes}"
+            raise InputError(f"VisionTransformer: {found}, expected positive multiples of patch_size and num_heads")
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))

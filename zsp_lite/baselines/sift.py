@@ -55,8 +55,9 @@ def mutual_matches(
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return indices in both images, and cosines, of the k most similar mutual nearest neighbours, best first."""
     similarity = torch.from_numpy(first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64))
-    everywhere = (torch.ones(n, dtype=torch.bool) for n in similarity.shape)
-    partner, score = mutual_nearest_neighbours(similarity, *everywhere)
+    if not similarity.numel():  # an image without keypoints
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    partner, score = mutual_nearest_neighbours(similarity)
     best = score.argsort(descending=True, stable=True)[: min(k, int(score.isfinite().sum()))]
     return best.numpy(), partner[best].numpy(), score[best].numpy()
 

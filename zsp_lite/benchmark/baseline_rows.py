@@ -1,6 +1,7 @@
 """The paper's baselines (sec. 5.2 and supplement), and a solver of whole categories, as rows of the benchmark."""
 
 from contextlib import suppress
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from zsp_lite.baselines.icp import align
 from zsp_lite.baselines.networks import Viewpoint
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
-from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
 from zsp_lite.errors import InputError
@@ -58,19 +59,21 @@ def posecontrast(problem: Problem) -> Answer:
 
 def category(problem: Problem) -> Answer:
     """Run "category": the pose from the alignment of all objects of the category, which needs no label of any."""
-    store, views = problem.store, len(problem.pair.target_frames)
-
     own = hypotheses(problem)
-    if ("category", views) not in store.lasting:
-        others: list[PairHypotheses] = []
-        for pair in object_pairs(store.dataset, store.category, None, None, views):
-            with suppress(InputError):  # the views determine no pose
-                others.append(hypotheses(Problem(pair, store)))
-        store.lasting["category", views] = others
-    alignment = synchronise([*store.lasting["category", views], own])
+    alignment = synchronise([*_of_all_objects(problem.store, len(problem.pair.target_frames)), own])
     first, second = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = second @ alignment.between(own.reference, own.target) @ first.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
+
+
+@lru_cache(1)  # for all pairs of a category
+def _of_all_objects(store: FrameStore, views: int) -> list[PairHypotheses]:
+    """Find the hypotheses between all objects of a category."""
+    found = []
+    for pair in object_pairs(store.dataset, store.category, None, None, views):
+        with suppress(InputError):  # the views determine no pose
+            found.append(hypotheses(Problem(pair, store)))
+    return found
 
 
 def hypotheses(problem: Problem) -> PairHypotheses:

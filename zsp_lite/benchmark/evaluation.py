@@ -13,8 +13,7 @@ from zsp_lite.backbones.load import BackboneConfig, load_backbone
 from zsp_lite.baselines.essential_matrix import essential_rotation
 from zsp_lite.benchmark.methods import METHODS, Method, make_extractors
 from zsp_lite.benchmark.own import describe_failure
-from zsp_lite.benchmark.problem import Answer, Problem, as_answer
-from zsp_lite.benchmark.store import FrameStore
+from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.errors import FatalError, InputError
@@ -22,8 +21,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import view_alignment
 from zsp_lite.synthetic.recording import read_poses
 
-# Error in degrees of a failed pair. Without these pairs, methods that fail often would look better.
-FAILED = 180.0
+FAILED = 180.0  # error of a failed pair: without these pairs, methods that fail often would look better
 Poses = Float[np.ndarray, "n 4 4"]
 
 
@@ -31,7 +29,7 @@ class Evaluator:
     """Evaluates chunks in one process; frames and features are kept from chunk to chunk."""
 
     def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int | None = None):
-        """Make the extractors; `threads` are torch's in feature extraction."""
+        """Make the extractors; `threads` are those of feature extraction."""
         loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
         self._dataset, self._methods, self._threads = Co3D(root), methods, threads
         self._extractors, self._store = make_extractors(loaded, methods), None
@@ -49,10 +47,7 @@ class Evaluator:
 def evaluate_pair(
     pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
 ) -> dict[str, Any]:
-    """Evaluate rows on a pair: a line of the run's results, with the medians of the store's timings.
-
-    A row's result is what `_measure` finds, or {"error": 180, "failed": the reason} if it raises InputError.
-    """
+    """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
     store.timings.clear()
     problem = Problem(pair, store)
     first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
@@ -72,7 +67,7 @@ def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dic
             raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
     except FatalError:
         raise
-    except InputError as error:
+    except InputError as error:  # there is no pose
         return {"error": FAILED, "failed": str(error)}
     except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
         if replace(method, targets=None) in METHODS.values():
@@ -88,23 +83,21 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
     "symmetric_error" is up to turns after which both objects look the same, "translation" the error of the object's
     centre in diameters of the target, "scale" estimated over labelled, which is 1.
     """
-    store, pair, result = problem.store, problem.pair, {}
-    for name in ("view", "note", "scale", "inliers", "confidence"):
-        if (value := getattr(answer, name)) is not None:
-            result[name] = value.item() if isinstance(value, np.generic) else value
-    result["error"] = float(rotation_error(answer.rotation, truth[:3, :3]))
+    known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known["error"] = rotation_error(answer.rotation, truth[:3, :3])
     reference, *targets = (frame.camera for frame in problem.frames())
     if (symmetries := _symmetries(problem)) is not None:
         to_camera = targets[answer.view].R
         turned = to_camera @ symmetries @ to_camera.T @ truth[:3, :3]
-        result["symmetric_error"] = float(np.min(rotation_error(answer.rotation, turned)))
-    ends = store.extent(pair.reference_sequence), store.extent(pair.target_sequence)
+        known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
+    ends = [problem.store.extent(name) for name in (problem.pair.reference_sequence, problem.pair.target_sequence)]
     if answer.translation is not None and None not in ends:
         (first, _), (_, diameter) = ends
         centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
         found = scale * answer.rotation @ centre + answer.translation
-        result["translation"] = float(np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter)
-    return result
+        known["translation"] = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in known.items()}
+    return {name: value for name, value in plain.items() if value is not None}
 
 
 def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
@@ -119,19 +112,17 @@ def _symmetries(problem: Problem) -> Float[np.ndarray, "s 3 3"] | None:
 
 def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
-    nearest = None
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
-    estimate = problem.estimate(method.features, method.settings, nearest)
+        return replace(as_answer(problem.estimate(method.features, method.settings, nearest)), view=nearest)
+    estimate = problem.estimate(method.features, method.settings)
     answer = as_answer(estimate)
-    if nearest is not None:
-        return replace(answer, view=nearest)
     reference, target = estimate.reference_view, estimate.target_views[estimate.view]
     if method.answer == "best view":
         sim3 = view_alignment(reference, target)
         return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
     if method.answer == "essential matrix":
-        found = essential_rotation(reference.frame, target.frame, estimate.matches, reference.features.grid)
-        rotation, inliers, note = found
+        frames, grid = (reference.frame, target.frame), reference.features.grid
+        rotation, inliers, note = essential_rotation(*frames, estimate.matches, grid)
         return Answer(rotation, answer.view, note=note, inliers=inliers)
     return answer

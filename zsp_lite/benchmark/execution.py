@@ -7,9 +7,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from typing import Any
 from uuid import uuid4
@@ -18,26 +17,20 @@ import cloudpickle
 import cv2
 from threadpoolctl import threadpool_limits
 
-from zsp_lite.benchmark.store import torch_threads
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
-MOST_WORKERS = 4096  # also of threads
+_MOST_WORKERS = 4096
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
     """Divide pairs into chunks of one category and at most `size` pairs, which share frames."""
-
-    def order(pair: Pair) -> tuple:
-        frames = pair.target_sequence, pair.reference_sequence, pair.reference_frame, len(pair.target_frames)
-        return pair.category, *frames, pair.key
-
     chunks: list[Chunk] = []
-    for pair in sorted(work, key=order):
+    for pair in sorted(work, key=lambda pair: (pair.category, pair.target_sequence, pair.key)):
         if not chunks or len(chunks[-1]) == size or chunks[-1][0][0].category != pair.category:
             chunks.append([])
         chunks[-1].append((pair, work[pair]))
@@ -45,12 +38,9 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, workers: int
+    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None
 ) -> Iterator[list[dict[str, Any]]]:
-    """Evaluate chunks with an `evaluation.Evaluator` or what else `make` makes, by its method `lines`.
-
-    Yields the lines of each chunk, or of each pair where this process evaluates them.
-    """
+    """Yield the lines that the method `lines` of what `make` makes, such as an `evaluation.Evaluator`, finds."""
     if executor is None:
         evaluator = make()
         with one_thread():
@@ -58,27 +48,21 @@ def evaluate_chunks(
                 yield from ([line] for line in evaluator.lines(chunk))
         return
     # cloudpickle: methods and backbones that are defined in a notebook travel by value.
-    pickled, waiting, running = cloudpickle.dumps((uuid4(), make)), iter(chunks), set[Future]()
+    make = cloudpickle.dumps((uuid4(), make))
+    futures = []
     try:
-        while True:
-            # Two chunks per worker keep it busy; more would fill queues with copies of the backbone.
-            for chunk in islice(waiting, 2 * workers - len(running)):
-                running.add(executor.submit(_evaluate_chunk, pickled, chunk))
-            if not running:
-                return
-            finished, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
-            # Failures last: all that has been evaluated is saved before an error ends the run.
-            for future in sorted(finished, key=lambda one: one.cancelled() or one.exception() is not None):
-                yield future.result()
+        futures += [executor.submit(_evaluate_chunk, make, chunk) for chunk in chunks]
+        for future in as_completed(futures):
+            yield future.result()
     except Exception as error:
         if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
             raise InputError(
                 "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-                f"with fewer workers than {workers}"
+                "with fewer workers"
             ) from error
         raise
     finally:
-        for future in running:
+        for future in futures:
             future.cancel()
 
 
@@ -97,12 +81,12 @@ def _evaluate_chunk(make: bytes, chunk: Chunk) -> list[dict[str, Any]]:
 def one_thread() -> Iterator[None]:
     """Restrict all libraries to one thread within a block: more are slower on small matrices, and disturb workers."""
     cv2_threads = cv2.getNumThreads()
-    with threadpool_limits(1), torch_threads(1):
-        cv2.setNumThreads(1)
-        try:
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1):  # torch, BLAS, OpenMP
             yield
-        finally:
-            cv2.setNumThreads(cv2_threads)
+    finally:
+        cv2.setNumThreads(cv2_threads)
 
 
 @contextmanager
@@ -113,26 +97,25 @@ def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor 
     """
     if isinstance(executor, Executor):
         yield executor, getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
-    elif isinstance(executor, str):
+        return
+    if isinstance(executor, str):
         with _dask(executor) as client:
             # A chunk depends on files: equal arguments need not give equal results.
             yield client.get_executor(pure=False), sum(client.nthreads().values())
-    else:
-        check_integer("workers", executor, 1, MOST_WORKERS)
-        if executor == 1:
-            yield None, 1
-            return
-        before = set(active_children())
-        # Spawned, not forked: a fork of a process whose threads have already computed may hang.
-        pool = ProcessPoolExecutor(executor, get_context("spawn"), _start_worker)
+        return
+    check_integer("workers", executor, 1, _MOST_WORKERS)
+    if executor == 1:
+        yield None, 1
+        return
+    before = set(active_children())
+    # Spawned, not forked: a fork of a process whose threads have already computed may hang.
+    with ProcessPoolExecutor(executor, get_context("spawn"), _start_worker) as pool:
         try:
             yield pool, executor
-        except BaseException:
+        except BaseException:  # ends at once, without waiting for what is being evaluated
             for child in set(active_children()) - before:
                 child.terminate()
             raise
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def _start_worker() -> None:
@@ -155,8 +138,6 @@ def _dask(address: str) -> Any:
 
         client = Client(f"tcp://{address.removeprefix('dask://')}", timeout=_DASK_TIMEOUT)
         client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
-    except ImportError as error:
-        raise InputError(f"executor {address}: needs Dask: pip install dask distributed") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"executor {address}: no scheduler with workers answers there ({error})") from error
+    except (ImportError, OSError, ValueError) as error:
+        raise InputError(f"executor {address}: {error}; expected Dask and a scheduler with workers") from error
     return client

@@ -37,23 +37,20 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     return show_panels({"": curves}, size=(6.5, 4), **labels)
 
 
-def accuracy_against_views(run: Run) -> Figure | None:
-    """Draw Acc30 and Acc15 against the number of target views, with 95 % intervals; None without two numbers of views.
+def accuracy_against_views(run: Run) -> Figure:
+    """Draw Acc30 and Acc15 of rows that the run has at several numbers of target views, with 95 % intervals.
 
     The results that the paper published for CO3D are grey.
     """
     published = {line["row"]: line["published"] for spec in read_paper_tables() for line in spec["rows"]}
-    numbers, methods = (1, 3, 5, 10, 20), run.summary["methods"]
-    drawn = {}
+    numbers, methods, drawn = (1, 3, 5, 10, 20), run.summary["methods"], {}
     for name in dict.fromkeys(map(library_row, important_rows(run.summary))):
-        rows = {n: row_name(f"{name}-n{n}", run.summary) for n in numbers}
-        if len(known := {n: methods[row] for n, row in rows.items() if row in methods}) > 1:
-            drawn[name] = known
-    if not drawn:
-        return None
+        rows = {n: methods.get(row_name(f"{name}-n{n}", run.summary)) for n in numbers}
+        drawn[name] = {n: row for n, row in rows.items() if row}
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
     for place, (axis, metric) in enumerate(zip(axes, ("acc30", "acc15"), strict=True)):
-        for (name, rows), colour, marker in zip(drawn.items(), COLOURS, cycle("os^Dv")):
+        several = ((name, rows) for name, rows in drawn.items() if len(rows) > 1)
+        for (name, rows), colour, marker in zip(several, COLOURS, cycle("os^Dv")):
             low, high = zip(*(one[f"{metric}_ci"] for one in rows.values()))
             axis.fill_between(list(rows), low, high, color=colour, alpha=0.18, lw=0)
             axis.plot(list(rows), [one[metric] for one in rows.values()], f"{marker}-", color=colour, label=name)
@@ -67,21 +64,12 @@ def accuracy_against_views(run: Run) -> Figure | None:
 
 
 def write_figures(run: Run, folder: str | Path) -> None:
-    """Write the figures for which the run has rows as PDF and PNG files, and remove others of an earlier call."""
+    """Write the errors of the first row by category, and the error curves, as PDF and PNG files."""
     Path(folder).mkdir(parents=True, exist_ok=True)
     first = [*own_rows(run.summary), *important_rows(run.summary)][0]
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
-        figures = {
-            "error_distribution": error_distribution(run, first),
-            "error_curves": error_curves(run),
-            "accuracy_against_views": accuracy_against_views(run),
-        }
+        figures = {"error_distribution": error_distribution(run, first), "error_curves": error_curves(run)}
         for name, figure in figures.items():
-            pdf, png = Path(folder) / f"{name}.pdf", Path(folder) / f"{name}.png"
-            if figure is None:
-                pdf.unlink(missing_ok=True)
-                png.unlink(missing_ok=True)
-            else:
-                figure.savefig(pdf, metadata={"CreationDate": None})
-                figure.savefig(png, dpi=150)
-                plt.close(figure)
+            figure.savefig(Path(folder) / f"{name}.pdf", metadata={"CreationDate": None})
+            figure.savefig(Path(folder) / f"{name}.png", dpi=150)
+            plt.close(figure)

@@ -3,24 +3,23 @@
 import dataclasses
 import functools
 import hashlib
-import os
 import platform
 import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import scipy
 import torch
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
 
 _PACKAGE = Path(__file__).parents[1]
-_DEPENDENCIES = {"torch", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "open3d-cpu", "open3d"}
 
 
 def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
@@ -31,16 +30,15 @@ def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
             part = part.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
         elif isinstance(part, np.ndarray):
             found.update(f"{part.dtype}{part.shape}".encode())
-        found.update(part.encode() if isinstance(part, str) else part if isinstance(part, bytes) else part.tobytes())
+            part = np.ascontiguousarray(part)
+        found.update(part.encode() if isinstance(part, str) else part)
     return found.hexdigest()[:16]
 
 
 def described(value: Any) -> str:
     """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with its public fields."""
-    if value is None or isinstance(value, bool | int | float | str):
+    if value is None or isinstance(value, bool | int | float | str | list | tuple):
         return str(value)
-    if isinstance(value, list | tuple):
-        return f"({', '.join(map(described, value))})"
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -76,12 +74,11 @@ def library_version() -> dict[str, str | None]:
 
 
 def environment() -> dict[str, Any]:
-    """Describe this call: time, command, versions of the library's dependencies, and machine."""
-    program, installed = Path(sys.argv[0]).name, {one.name for one in distributions()}
-    words = ["zsp-lite" if program == "__main__.py" else program, *sys.argv[1:]]
+    """Describe this call: time, command, and versions of the library's dependencies."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": [text.encode(errors="replace").decode() for text in words],
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _DEPENDENCIES & installed},
-        "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "versions": {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+        | {"python": platform.python_version(), "machine": platform.platform()},
     }

@@ -1,14 +1,9 @@
-"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own.
-
-A row is the paper's method with some settings changed, or a function (`solve`). `problem` defines the argument and the
-results of such functions.
-"""
+"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own."""
 
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -34,7 +29,7 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the tables."""
+    """A row of the tables: the paper's method with some settings changed, or a function of one's own."""
 
     features: str = "backbone"  # name of the feature extractor in `EXTRACTORS`
     # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
@@ -46,8 +41,7 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-_MASK, _VERIFIED = {"foreground": "mask"}, {"solver": "verified"}
-_MUTUAL = {"foreground": "mask", "matcher": "mutual", "kmeans": False, "binning": False}
+_MASK = {"foreground": "mask"}
 
 METHODS: dict[str, Method] = {
     "ours": Method(),
@@ -78,11 +72,11 @@ METHODS: dict[str, Method] = {
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
-    "swav": Method("swav", settings=_MUTUAL),
+    "swav": Method("swav", settings=_MASK | {"matcher": "mutual", "kmeans": False, "binning": False}),
     "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
     # Beyond the paper.
-    "verified": Method(settings=_VERIFIED),
-    "verified-mask": Method(settings=_VERIFIED | _MASK),
+    "verified": Method(settings={"solver": "verified"}),
+    "verified-mask": Method(settings={"solver": "verified"} | _MASK),
     # Sees all other objects of the category, too, without labels.
     "category": Method(solve=baseline_rows.category),
 }
@@ -94,18 +88,19 @@ def read_paper_tables() -> list[dict[str, Any]]:
     return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 
 
-_CHECKPOINTS = ("swav", "posecontrast")  # rows that are in no group: their checkpoints have to be downloaded
-# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them.
-GROUPS: dict[str, list[str]] = {"default": ["ours", "ours-bv", "rootsift"]} | {
-    table["group"]: [line["row"] for line in table["rows"] if line["row"] not in _CHECKPOINTS]
-    for table in read_paper_tables() if "group" in table
-}  # fmt: skip
-GROUPS |= {
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. The checkpoints of
+# the rows that are in no group have to be downloaded.
+GROUPS: dict[str, list[str]] = {
+    "default": ["ours", "ours-bv", "rootsift"],
+    **{
+        table["group"]: [line["row"] for line in table["rows"] if line["row"] not in ("swav", "posecontrast")]
+        for table in read_paper_tables() if "group" in table
+    },
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
     "ablations": ["ours", "table3", "matchers", "correspondences", "trials", "depth", "published"],  # at one N
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
     "all": ["paper", "verified-views", "oracle-view"],
-}
+}  # fmt: skip
 
 
 def _members(name: str) -> list[str]:
@@ -138,10 +133,9 @@ def _method(name: str, meant: Any) -> Method:
         if meant.endswith(".csv"):
             return Method("none", solve=read_poses(meant))
         if ":" not in meant:
-            close = get_close_matches(meant, [*METHODS, *GROUPS])
             raise InputError(
-                f"method {meant!r} is unknown{', close are ' if close else ''}{', '.join(close)}; "
-                "`zsp-lite benchmark --list` lists all, NAME=module:thing and NAME=poses.csv are your own"
+                f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, NAME=module:thing and "
+                "NAME=poses.csv are your own"
             )
         meant = import_object(meant)
     if isinstance(meant, Method):

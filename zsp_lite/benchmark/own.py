@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from torch import nn
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
@@ -35,22 +34,19 @@ def kind_of(name: str, thing: Any) -> str:
     The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
     InputError if it is none of these.
     """
-    found = f"of type {type(thing).__name__}"
-    if not isinstance(thing, type) and callable(getattr(thing, "estimate", None)):
-        return "estimator"
-    if (kind := getattr(thing, "kind", None)) in KINDS:
-        return kind
-    if callable(thing) and not isinstance(thing, type):
-        with suppress(TypeError, ValueError):  # some functions of compiled modules have no signature
-            signature = inspect.signature(thing.forward if isinstance(thing, nn.Module) else thing)
-            found = f"a function of {signature}"
-            parameters = signature.parameters.values()
+    if not isinstance(thing, type):
+        if callable(getattr(thing, "estimate", None)):
+            return "estimator"
+        if (kind := getattr(thing, "kind", None)) in KINDS:
+            return kind
+        with suppress(TypeError, ValueError):  # no function, or one of a compiled module, which has no signature
+            parameters = inspect.signature(getattr(thing, "forward", thing)).parameters.values()
             needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
             if all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed):
                 return KINDS[range(1, 4).index(len(needed))]
     raise InputError(
-        f"method {name!r} is {found}, expected a function of one argument (problem), two (two images) or three "
-        "(similarities, two foregrounds), or an object with estimate(reference, targets)"
+        f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
+        "images) or three (similarities, two foregrounds), or an object with estimate(reference, targets)"
     )
 
 
@@ -67,8 +63,7 @@ def import_object(path: str) -> Any:
     try:
         return pkgutil.resolve_name(path)
     except (Exception, SystemExit) as error:  # a module may raise anything
-        reason = error if isinstance(error, ImportError | AttributeError) else describe_failure(error)
-        raise InputError(f"{path!r} cannot be imported: {reason}") from error
+        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,7 @@ class Estimator:
     own: Any
 
     def __call__(self, problem: Problem) -> Any:
-        reference, *targets = (problem.store.full_frame(key) for key in problem.keys)
-        return self.own.estimate(reference, targets)
+        return self.own.estimate(*problem.store.dataset.load_pair(problem.pair))
 
 
 @dataclass(frozen=True)
@@ -92,10 +86,8 @@ class KeypointMatcher:
         reference, *targets = problem.frames()
         found = [self.own(reference.rgb, target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
-        if any((one < 0).any() for one in scores):
-            raise FatalError(
-                "scores of matches are negative, expected 0 or more: the view of the highest sum is chosen"
-            )
+        if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
+            raise FatalError("scores of matches are negative, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
         return fit_keypoints(problem, view, *found[view][:2])
 
@@ -121,19 +113,18 @@ class StoredPoses:
     _poses: Mapping[tuple, Answer]
 
     def __call__(self, problem: Problem) -> Answer:
-        if not (found := self.of(problem.pair)):
+        pair, found = problem.pair, self.of(problem.pair)
+        if not found:
             raise InputError(f"{self.path} has no pose")
         if len(found) > 1:
-            raise FatalError(
-                f"poses {self.path}: {len(found)} target views of the pair {problem.pair.key}, expected one"
-            )
+            raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
         return found[0]
 
     def of(self, pair: Pair) -> list[Answer]:
         """Look up the poses of a pair."""
-        key = (pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence)
+        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
         found = [(view, self._poses.get((*key, frame))) for view, frame in enumerate(pair.target_frames)]
-        return [replace(answer, view=view) for view, answer in found if answer is not None]
+        return [replace(answer, view=view) for view, answer in found if answer]
 
 
 def read_poses(path: str | Path) -> StoredPoses:
@@ -151,8 +142,7 @@ def read_poses(path: str | Path) -> StoredPoses:
             key = tuple(int(line[name]) if name.endswith("frame") else line[name] for name in _QUESTION)
             if key in poses:
                 raise ValueError("second pose of the same frames")
-            answer = Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0])
-            poses[key] = as_answer(answer)
+            poses[key] = as_answer(Answer(rotation.reshape(3, 3), 0, translation, None if scale is None else scale[0]))
         except ValueError as error:  # an InputError is one, too
             raise InputError(f"poses {path}, line {number}: {error}") from error
     return StoredPoses(str(path), digest(data), poses)

@@ -1,25 +1,29 @@
-"""Argument and results of a benchmark row: `Problem` and `Answer`."""
+"""Argument and results of a benchmark row: `Problem`, whose frames a `FrameStore` keeps, and `Answer`."""
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.benchmark.store import FrameKey, FrameStore
 from zsp_lite.best_view import ViewMatch
-from zsp_lite.data.co3d import Pair
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.estimates import PoseEstimate
+from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import View
+from zsp_lite.views import View, crop_size, frame_view, object_crop
 
-# What decides the matches of a ZeroShotPose: rows that agree in it share the matches.
-_MATCH_SETTINGS = ("k", "clusters", "foreground", "cycle_from", "matcher", "binning")
+FrameKey = tuple[str, int]  # sequence name and frame number
+CAPACITY = 128  # frames in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,56 @@ def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
     return Sim3(1.0, real_array("pose of the row", pose), np.zeros(3)).R
 
 
+class FrameStore:
+    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage.
+
+    `frame`, `describe` and `view` compute once what they return, and keep it while it is among the last used.
+    """
+
+    def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
+        """Make an empty store; `threads` are those of feature extraction, None leaves them as they are."""
+        self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
+        self.timings: dict[str, list[float]] = {}
+        self.frame, self.extent = lru_cache(CAPACITY)(self._frame), cache(self._extent)
+        self.describe, self.view = (lru_cache(CAPACITY * len(extractors))(one) for one in (self._describe, self._view))
+
+    def _frame(self, key: FrameKey) -> Frame:
+        """Return a frame's object crop, resized to the backbone's input."""
+        size, annotation = crop_size(self.extractors.get("backbone")), self.dataset.frame(self.category, *key)
+        return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
+
+    def _describe(self, features: str, key: FrameKey) -> Any:
+        """Return what an extractor computes from a frame's crop."""
+        extractor, crop = self.extractors[features], self.frame(key)
+        describe = getattr(extractor, "describe", None)
+        # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+        with threadpool_limits(self.threads):
+            return self.timed(features, describe or extractor, [crop if describe else crop.rgb])[0]
+
+    def _view(self, features: str, key: FrameKey, foreground: str) -> View:
+        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
+        return frame_view(self.frame(key), self.describe(features, key), foreground)
+
+    def _extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
+        """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
+
+        They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        """
+        try:
+            points, _ = self.dataset.point_cloud(self.category, sequence)
+        except InputError:
+            return None
+        low, high = np.quantile(points, (0.02, 0.98), axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
+
+    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function, and add the time that it takes to the `timings` of a stage."""
+        start = time.perf_counter()
+        found = function(*arguments)
+        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
+        return found
+
+
 class Problem:
     """One pair as a method sees it: everything but the true pose. Results are computed once and shared by all methods.
 
@@ -80,8 +134,9 @@ class Problem:
     def __init__(self, pair: Pair, store: FrameStore):
         self.pair, self.seed, self.store = pair, pair.seed, store
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
-        # (sequence, frame number) of the reference and of each target
         self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
+        self._estimates: dict[tuple, PoseEstimate] = {}
+        self._similarity = cache(self._compare)
 
     @property
     def reference(self) -> View:
@@ -110,37 +165,24 @@ class Problem:
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
     ) -> PoseEstimate:
-        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index.
-
-        Rows that differ in later stages only share the similarities and the matches.
-        """
-        settings, store = settings or {}, self.store
-        first, *others = self.keys if target is None else (self.keys[0], self.keys[1 + target])
-        method = ZeroShotPose(store.extractors[features], **settings, seed=self.seed)
-        matching = [getattr(method, name) for name in _MATCH_SETTINGS]
-
-        def match(key: FrameKey, reference: View, view: View) -> ViewMatch:
-            @store.timed("similarity")
-            def compare() -> list[Any]:
-                return (similarities if method.binning else key_similarities)(reference.features, [view.features])
-
-            @store.timed("matching")
-            def select() -> ViewMatch:
-                return method.match_views(reference, [view], similarity)[0]
-
-            similarity = self._shared(("similarity", key, features, method.binning), compare)
-            return self._shared(("matches", key, self.seed, features, *matching), select)
-
-        def solve() -> PoseEstimate:
-            reference, *targets = (store.view(features, key, method.foreground) for key in (first, *others))
+        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index."""
+        settings = settings or {}
+        name = (features, target, *sorted(settings.items()))
+        if name not in self._estimates:
+            method = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
+            keys = self.keys if target is None else [self.keys[0], self.keys[1 + target]]
+            reference, *targets = (self.store.view(features, key, method.foreground) for key in keys)
             # A reference that may stand on its side is matched in four turns, by the method itself.
-            matched = [match(key, reference, view) for key, view in zip(others, targets)] if method.upright else None
-            found = method.estimate_from_views(reference, targets, matched)
-            for stage, seconds in found.timings.items():
-                store.timings.setdefault(stage, []).append(seconds)
-            return found
+            matched = [self._match(method, reference, view) for view in targets] if method.upright else None
+            self._estimates[name] = method.estimate_from_views(reference, targets, matched)
+            for stage, seconds in self._estimates[name].timings.items():
+                self.store.timings.setdefault(stage, []).append(seconds)
+        return self._estimates[name]
 
-        return self._shared(("estimate", *others, self.seed, features, *sorted(settings.items())), solve)
+    def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
+        similarity = self._similarity(reference.features, target.features, method.binning)
+        return self.store.timed("matching", method.match_views, reference, [target], similarity)[0]
 
-    def _shared(self, name: tuple, make: Callable[[], Any]) -> Any:
-        return self.store.shared((self.keys[0], self.pair.target_sequence), name, make)
+    def _compare(self, reference: FeatureMap, target: FeatureMap, binning: bool) -> list[torch.Tensor]:
+        compare = similarities if binning else key_similarities
+        return self.store.timed("similarity", compare, reference, [target])

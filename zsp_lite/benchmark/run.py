@@ -25,7 +25,7 @@ from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import write_atomic
 from zsp_lite.pipeline import ZeroShotPose
@@ -59,7 +59,7 @@ def evaluate(
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
 
     Returns:
-        The content of OUT/summary.json (see `summary.summarise`); `write_reports` writes tables and figures.
+        The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
@@ -74,9 +74,7 @@ def evaluate(
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
         elif isinstance(row.solve, StoredPoses) and not any(map(row.solve.of, work)):
-            raise InputError(
-                f"{row.solve.path} has no pose for any of the {len(work)} pairs, which --list-pairs writes"
-            )
+            raise InputError(f"{row.solve.path} has no pose for any of the {len(work)} pairs of --list-pairs")
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
@@ -102,15 +100,13 @@ def evaluate(
 def write_reports(run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN) -> dict:
     """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return the summary.
 
-    `metrics` are the figures of the table of all rows. Tables and figures that an earlier call has written, and which
-    have no rows now, are removed.
+    `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
     """
     found, out = read_run(run), Path(out or run)
-    tables = every_table(found.summary, metrics)
-    for name in {"with_others", *(spec["name"] for spec in read_paper_tables())} - {table.name for table in tables}:
+    for name in ("with_others", *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    write_tables(tables, out / "tables")
+    write_tables(every_table(found.summary, metrics), out / "tables")
     write_figures(found, out / "figures")
     return _write_summary(found, out)
 
@@ -130,7 +126,7 @@ def evaluate_pairs(
     hidden = None if logger.isEnabledFor(logging.INFO) else True
     with (
         tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar,
-        closing(execution.evaluate_chunks(make, chunks, pool, workers)) as found,
+        closing(execution.evaluate_chunks(make, chunks, pool)) as found,
     ):
         for lines in found:
             add_lines(out, lines, kind)
@@ -141,11 +137,8 @@ def pairs_of_rows(
     dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
 ) -> dict[Pair, list[str]]:
     """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as many target views."""
-    known = dataset.categories()
-    unknown = sorted(set(numbers) - set(known))
-    if unknown or not numbers:
-        raise InputError(f"{dataset.root}: no categories {unknown or ''}, found {', '.join(known) or 'none'}")
     for category, number in numbers.items():
+        check_choice("category", category, dataset.categories())
         check_integer(f"pairs of {category}", number, 1)
     work: dict[Pair, list[str]] = {}
     for n_targets in {row.targets or targets for row in rows.values()}:
@@ -163,5 +156,5 @@ def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list
 
 def _labels(dataset: Co3D, category: str) -> str:
     """Hash of the pose labels of a category."""
-    labels = read_labels(dataset.root, category)
-    return digest(*(part for name, label in labels.items() for part in (name, label.trans, label.reference_seq)))
+    labels = read_labels(dataset.root, category).items()
+    return digest(*(part for name, label in labels for part in (name, label.trans, label.reference_seq)))

@@ -1,10 +1,9 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
-run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl is what `evaluate_pair`
-returned for a pair; run.jsonl.gz may take its place. One process writes to a folder; others can read it meanwhile.
+run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of run.jsonl.gz, is what
+`evaluate_pair` returned for a pair. One process writes to a folder; others can read it meanwhile.
 """
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,8 +14,7 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from zsp_lite.benchmark.statistics import paired_difference
-from zsp_lite.benchmark.summary import draws_of, summarise
+from zsp_lite.benchmark.statistics import draws_of, paired_difference, summarise
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
 from zsp_lite.io.locks import writing
@@ -25,7 +23,6 @@ from zsp_lite.metrics import accuracy, median
 SETTINGS, LINES = "run.json", "run.jsonl"
 _KEY = r"^(?P<problem>(?P<reference>(?P<category>[^/]+)/[^/]+):\d+/(?P<target>[^/]+)):\d+(?:,\d+)*$"
 _Degrees = Annotated[float, msgspec.Meta(ge=0, le=180)]
-_Key = Annotated[str, msgspec.Meta(pattern=_KEY)]
 
 
 class Call(msgspec.Struct):
@@ -34,7 +31,6 @@ class Call(msgspec.Struct):
     time: str
     command: list[str]
     versions: dict[str, str]
-    machine: dict[str, Any]
     workers: int
     rows: list[str]
     pairs: dict[str, int]  # by category
@@ -70,7 +66,7 @@ class _Result(msgspec.Struct):
 
 
 class ResultLine(msgspec.Struct):
-    pair: _Key
+    pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
     results: dict[str, _Result]
     timings: dict[str, float] = {}
 
@@ -109,12 +105,9 @@ def open_run(out: str | Path, settings: Settings, allow_other_version: bool = Fa
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
-        if any(map(os.path.lexists, (out / SETTINGS, out / LINES, packed))):
+        if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings, allow_other_version)
-        lines = read_texts(out) if packed.exists() or (out / LINES).exists() else ()
-        write_atomic(
-            out / LINES, b"".join(text + b"\n" for text, _ in lines)
-        )  # unpacked, and without an unfinished line
+        write_atomic(out / LINES, _finished_lines(out))
         packed.unlink(missing_ok=True)
         settings.calls[-1].finished = False
         _write_settings(out, settings)
@@ -130,24 +123,27 @@ def _write_settings(out: Path, settings: Settings) -> None:
 def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
-    for name in ("data", "backbone", "targets"):
-        if (held := getattr(before, name)) != (asked := getattr(now, name)):
-            raise InputError(f"{out} holds a run with {name} {held}, this is {asked}; choose another folder")
-    if ("alignment" in before.methods) != ("alignment" in now.methods):
-        raise InputError(f"{out} holds a run of another command; choose another folder")
-    groups = {name: (getattr(before, name), getattr(now, name)) for name in ("methods", "labels", "origins")}
-    for name, (held, asked) in groups.items():
-        for one in asked:
-            if (was := held.get(one, asked[one])) != asked[one]:
-                what = f"other {name} of {one}: {was}, not {asked[one]}"
-                raise InputError(f"{out} holds results with {what}; choose another folder")
-    if now.library[0] not in before.library and not allow_other_version:
-        versions = (f"zsp-lite {one['version']} (commit {one['commit']})" for one in (before.library[-1], *now.library))
-        other = "choose another folder, or continue with --allow-other-version"
-        raise InputError(f"{out} was measured with {', this is '.join(versions)}; {other}")
-    library = [*before.library, *(one for one in now.library if one not in before.library)]
-    merged = {name: held | asked for name, (held, asked) in groups.items()}
+    held, asked = _compared(before), _compared(now)
+    if allow_other_version:
+        held["version"] = asked["version"]
+    for name in asked:
+        if held.get(name, asked[name]) != asked[name]:
+            more = ", or continue with --allow-other-version" if name == "version" else ""
+            told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
+            raise InputError(f"{out} holds a run with {told}")
+    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins")}
+    library = [*(one for one in before.library if one != now.library[0]), *now.library]
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
+
+
+def _compared(settings: Settings) -> dict[str, Any]:
+    """What has to be equal in two calls that add to one run, where both have it, by its name."""
+    groups = {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
+    parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
+    whole = {name: getattr(settings, name) for name in ("data", "backbone", "targets")}
+    version = "{version} (commit {commit})".format(**settings.library[-1])
+    command = "align" if "alignment" in settings.methods else "benchmark"
+    return {"command": command} | whole | parts | {"version": version}
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
@@ -161,20 +157,19 @@ def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = 
         raise InputError(f"{Path(out) / LINES} cannot be written: {error}") from error
 
 
-def read_texts(out: str | Path) -> Iterator[tuple[bytes, str]]:
-    """Yield the finished lines of a run's folder, and where each stands."""
-    path, packed, what = Path(out) / LINES, Path(out) / f"{LINES}.gz", "results of a run"
+def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
+    """Read the results of the finished pairs of a run's folder, lines of a `kind`."""
+    lines = enumerate(_finished_lines(Path(out)).splitlines(), 1)
+    return [decode_json(text, kind, f"results of a run in {out}, line {number}") for number, text in lines]
+
+
+def _finished_lines(out: Path) -> bytes:
+    """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without these."""
+    path, packed, what = out / LINES, out / f"{LINES}.gz", "results of a run"
+    data = read_bytes(path, what) if path.exists() else b""
     if packed.exists():
-        path, data = packed, decompress(read_bytes(packed, what), f"{what} {packed}")
-    else:
-        data = read_bytes(path, what)
-    for number, text in enumerate(data.split(b"\n")[:-1], 1):
-        yield text, f"{what} {path}, line {number}"
-
-
-def read_lines(out: str | Path) -> list[ResultLine]:
-    """Read the results of the finished pairs of a run's folder."""
-    return [decode_json(text, ResultLine, where) for text, where in read_texts(out)]
+        data = decompress(read_bytes(packed, what), f"{what} {packed}")
+    return data[: data.rfind(b"\n") + 1]
 
 
 def read_run(out: str | Path) -> Run:
@@ -186,7 +181,20 @@ def read_run(out: str | Path) -> Run:
     if not (Path(out) / SETTINGS).is_file():
         raise InputError(f"{out} is not the folder of a benchmark run: it has no {SETTINGS}")
     settings, lines = read_json(Path(out) / SETTINGS, Settings, "settings of a run"), read_lines(out)
-    last = settings.calls[-1]
+    table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
+    if table.empty:
+        raise InputError(f"{out}: the run has no pair that all its rows have finished")
+    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
+    notes, rows = [], table["row"].unique()
+    if not last.finished:
+        notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
+    if hidden := [name for name in settings.methods if name not in rows]:
+        notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
+    return Run(settings, table, timings, " ".join(notes))
+
+
+def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
+    """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = [
         {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
@@ -194,34 +202,28 @@ def read_run(out: str | Path) -> Run:
     table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
-    table["views"] = table["pair"].str.count(",")
-    table = table[table["category"].isin(last.pairs)]
-    finished: dict[int, set[str]] = {}  # by number of target views, the pairs that all rows of the last call have
-    for views, found in table[table["row"].isin(last.rows)].groupby("views"):
+    orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
+    for column, names in orders.items():
+        table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
+    return table.sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(orders, object))
+
+
+def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
+    """Keep the pairs that all rows of the last call have finished, and the rows that have all of these."""
+    views = table["pair"].str.count(",")  # one less than the target views
+    finished = {}  # by number of views
+    for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
         rows_of_pair = found.groupby("pair")["row"].nunique()
-        finished[views] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
-    problems = set(table["problem"][table["pair"].isin(set[str]().union(*finished.values()))])
-    if not problems:
-        raise InputError(f"{out}: the run has no pair that all its rows have finished")
-    rows = []
-    for row, found in table.groupby("row"):
-        views = found["views"].iloc[0]
-        of_row, wanted = ("pair", finished[views]) if views in finished else ("problem", problems)
-        table = table[(table["row"] != row) | table[of_row].isin(wanted)]
-        rows += [row] if wanted <= set(found[of_row]) else []
-    rows = [row for row in settings.methods if row in rows]
-    table = table[table["row"].isin(rows)].drop(columns="views")
-    if table.empty:
-        raise InputError(f"{out}: the run has no results of the rows that its {SETTINGS} names")
-    kinds = {"row": pd.CategoricalDtype(rows), "category": pd.CategoricalDtype(list(last.pairs))}
-    table = table.astype(kinds).sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(kinds, object))
-    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
-    notes, most = [], max(map(len, finished.values()))
-    if not last.finished:
-        notes.append(f"Not finished: {most} of {sum(last.pairs.values())} pairs.")
-    if hidden := [row for row in settings.methods if row not in rows]:
-        notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    return Run(settings, table.reset_index(drop=True), timings, " ".join(notes))
+        finished[number] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
+    problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
+    kept = [table[:0]]
+    for _, found in table.groupby("row", sort=False):
+        number = views[found.index[0]]
+        column, wanted = ("pair", finished[number]) if number in finished else ("problem", problems)
+        found = found[found[column].isin(wanted)]
+        if wanted <= set(found[column]):
+            kept.append(found)
+    return pd.concat(kept, ignore_index=True)
 
 
 def compare(first: Run, second: Run, rows: Sequence[str] | None = None) -> dict[str, dict[str, Any]]:

@@ -1,13 +1,14 @@
-"""Intervals and tests of pose errors.
+"""Figures of a run with their intervals and tests (paper sec. 5.1).
 
 Pairs that share an object are not independent: `object_draws` resamples objects, and its draws give the intervals of
 this project. Draws are weights: a row for each bootstrap replicate, a column for each pair.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
@@ -17,6 +18,41 @@ from zsp_lite.metrics import accuracy, median, weighted_mean
 Draws = Float[np.ndarray, "resamples n"]
 RESAMPLES = 2000
 _FEWEST_OBJECTS = 3
+_REFERENCE = "ours"  # the row that all others are compared with
+
+
+def summarise(table: pd.DataFrame) -> dict[str, Any]:
+    """Summarise the results of a run (see `runs.Run`).
+
+    "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where they are known
+    "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
+    `paired_difference` of each row of the same problems to "ours". All draws resample objects.
+    """
+    rows = {str(name): row for name, row in table.groupby("row", sort=False)}
+    methods, against, ours = {}, {}, rows.get(_REFERENCE)
+    for name, row in rows.items():
+        errors, drawn, categories = row["error"].to_numpy(), draws_of(row), row["category"].to_numpy(str)
+        methods[name] = figures_of(errors, drawn, categories) | {
+            "failed": int((row["failed"] != "").sum()),
+            "per_category": {
+                category: figures_of(errors[members], drawn[:, members])
+                for category in dict.fromkeys(categories) for members in [categories == category]
+            },
+        }  # fmt: skip
+        for part in ("translation", "scale"):
+            if row[part].notna().any():
+                methods[name][part] = float(row[part].median())
+        if row["symmetric_error"].notna().any():
+            known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
+            methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
+        if ours is not None and name != _REFERENCE and row["problem"].tolist() == ours["problem"].tolist():
+            against[name] = paired_difference(ours["error"], errors, weights=drawn)
+    return {"methods": methods} | ({} if ours is None else {"against": against})
+
+
+def draws_of(row: pd.DataFrame) -> Draws:
+    """Draw bootstrap weights of a row's pairs from resampled objects."""
+    return object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
 
 
 def object_draws(
@@ -25,14 +61,13 @@ def object_draws(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Draws:
-    """Draw bootstrap weights of pairs by resampling the objects that the pairs are made of.
+    """Draw bootstrap weights (resamples, n) of pairs by resampling the objects (n, 2) that the pairs are made of.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
     its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one set of objects on both sides, as in
     the vertex bootstrap of a network (Snijders & Borgatti 1999). If the errors depend little on the objects, the
     intervals are too wide: the estimated variance is then up to three times the true one. Every category keeps its
-    total weight. Pairs of a category with fewer than three objects are resampled as if they were independent: the
-    spread between objects cannot be estimated from two.
+    total weight. With fewer than three objects, which do not tell the spread, pairs are resampled as independent.
     """
     objects = np.asarray(objects, dtype=str)
     categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
@@ -62,10 +97,9 @@ def pair_draws(n: int, resamples: int = RESAMPLES, seed: int = 0) -> Draws:
 def bootstrap_ci(
     errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None
 ) -> tuple[float, float]:
-    """Compute the 95 % percentile bootstrap interval of a statistic.
+    """Compute the 95 % percentile bootstrap interval of a statistic, such as `median`.
 
-    The statistic maps errors (n,) and weights (resamples, n) to (resamples,), as `median` and
-    `lambda errors, weights: accuracy(errors, 30, weights)` do. Weights are those of `object_draws`; by default of
+    It maps errors (n,) and weights (resamples, n) to (resamples,). Weights are those of `object_draws`; by default of
     `pair_draws(n)`, which treats pairs as independent.
     """
     errors = np.asarray(errors, np.float64)
@@ -80,24 +114,21 @@ def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.n
     categories (n,) are given, the paper's average of medians.
     """
     errors = np.asarray(errors, np.float64)
+
+    def mean_category_median(errors: np.ndarray, weights: Draws | None = None) -> np.ndarray | float:
+        members = [categories == category for category in np.unique(categories)]
+        medians = [median(errors[one], None if weights is None else weights[:, one]) for one in members]
+        return np.mean(medians, axis=0)
+
     figures = {
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
-    }
-    if categories is not None:
-        figures["mean_category_median"] = partial(mean_category_median, categories)
+    } | ({} if categories is None else {"mean_category_median": mean_category_median})
     found = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
     found |= {f"{name}_ci": list(bootstrap_ci(errors, figure, weights)) for name, figure in figures.items()}
     above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
     return found | {"above150": float(above150), "auc30": float(auc30)}
-
-
-def mean_category_median(categories: np.ndarray, errors: np.ndarray, weights: Draws | None = None) -> np.ndarray:
-    """Compute the mean of the categories' medians of errors (n,)."""
-    members = [categories == category for category in np.unique(categories)]
-    medians = [median(errors[one], None if weights is None else weights[:, one]) for one in members]
-    return np.asarray(np.mean(medians, axis=0))
 
 
 def paired_difference(
@@ -114,15 +145,13 @@ def paired_difference(
 
 
 def paired_test(
-    first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None, seed: int = 0
+    first: ArrayLike, second: ArrayLike, threshold: float = 30.0, weights: Draws | None = None
 ) -> dict[str, float]:
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
-    The sign test and the permutation test treat pairs as independent. Where pairs share objects, their p values are too
-    small; the interval and the p value of `paired_difference` with `object_draws` are the ones to report.
-
-    Errors are in degrees, (n,), of the same pairs in the same order; a pair is solved below the threshold. The
-    permutation test is exact for up to 13 pairs.
+    Errors (n,) are in degrees, of the same pairs in the same order; a pair is solved below the threshold. The sign test
+    and the permutation test, which is exact for up to 13 pairs, treat pairs as independent. Where pairs share objects,
+    their p values are too small: report the interval and the p value of `paired_difference` with `object_draws`.
 
     Returns:
         {"accuracy_gain": second - first in percentage points, "accuracy_gain_ci": its 95 % bootstrap interval,
@@ -139,7 +168,7 @@ def paired_test(
     p = 1.0  # of one pair: both signs give the same absolute difference, and scipy refuses one pair
     if len(first) > 1:
         how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
-        p = permutation_test((first - second,), np.mean, rng=seed, **how).pvalue
+        p = permutation_test((first - second,), np.mean, rng=0, **how).pvalue
     tests = {"sign_test_p": sign, "permutation_test_p": float(p)}
     return paired_difference(first, second, threshold, weights) | tests
 

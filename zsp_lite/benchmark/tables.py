@@ -51,7 +51,6 @@ class Table:
     title: str
     cells: pd.DataFrame  # of `Cell`, or None
     note: str = ""  # how to read it
-    compact: Sequence[str] = ()  # at most three columns that a LaTeX table shows
     data: str = ""  # what was evaluated
     across: bool = False  # the columns are methods, not the rows
 
@@ -63,30 +62,28 @@ class Table:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    shown = [all_rows(summary, metrics), all_rows(summary, metrics, with_others=True), *paper_tables(summary)]
-    return [table for table in (*shown, *(by_category(summary, one) for one in PAPER)) if len(table.cells)]
+    first = all_rows(summary, metrics), all_rows(summary, metrics, with_others=True), *paper_tables(summary)
+    return [table for table in (*first, *(by_category(summary, one) for one in PAPER)) if len(table.cells)]
 
 
 def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, with_others: bool = False) -> Table:
-    """Return every row of the run: its figures, failed pairs, and its difference to "ours".
-
-    Rows that see other objects than the two of the pair are in a table of their own, that `with_others`.
-    """
+    """Return every row that sees the pair only, or each `with_others`: figures, failed pairs, difference to "ours"."""
     rows = {}
     for name, row in summary["methods"].items():
         if (library_row(name) in WITH_OTHERS) != with_others:
             continue
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
-        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, None, None]
+        difference = p = None
         if test := summary.get("against", {}).get(name):
             difference = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
-            rows[name][-2:] = [difference, Cell(test["accuracy_gain_p"], decimals=3)]
+            p = Cell(test["accuracy_gain_p"], decimals=3)
+        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, difference, p]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    name, title = "all_rows", "All rows"
-    if with_others:
-        name, title = "with_others", "With other unlabelled objects of the category"
-    return Table(name, title, _frame(rows, titles), _note(summary, metrics, gain), titles[1:4], _data(summary))
+    named = (
+        ("with_others", "With other unlabelled objects of the category") if with_others else ("all_rows", "All rows")
+    )
+    return _table(summary, *named, rows, titles, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -110,9 +107,9 @@ def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
         cells = [_cell(row, metric) for metric in PAPER]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
-    note = _note(summary, PAPER, _PUBLISHED_NOTE if kept else "", spec.get("note", ""))
-    frame = _frame(rows, [*titles, *(f"{PUBLISHED}: {spec['published'][k]}" for k in kept)])
-    return Table(spec["name"], spec["title"], frame, note, titles[:3], _data(summary))
+    titles += [f"{PUBLISHED}: {spec['published'][k]}" for k in kept]
+    notes = _PUBLISHED_NOTE if kept else "", spec.get("note", "")
+    return _table(summary, spec["name"], spec["title"], rows, titles, PAPER, *notes)
 
 
 def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | None = None) -> Table:
@@ -124,8 +121,7 @@ def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | N
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
     name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
-    note, names = _note(summary, [metric]), list(methods)
-    return Table(name, title, _frame(rows, names), note, names[:3], _data(summary), across=True)
+    return _table(summary, name, title, rows, list(methods), [metric], across=True)
 
 
 def comparison_table(differences: dict[str, dict[str, Any]], first: str, second: str) -> Table:
@@ -139,11 +135,9 @@ def comparison_table(differences: dict[str, dict[str, Any]], first: str, second:
         ]
         for name, one in differences.items()
     }  # fmt: skip
-    note = (
-        "On the common pairs. Intervals (95 %) and p: bootstrap over objects. Of twenty rows without a difference, one "
-        "has p < 0.05 by chance."
-    )
-    return Table("compare", f"A = {first}, B = {second}", _frame(rows, titles), note, titles[1:4])
+    note = "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
+    note += "Of twenty rows without a difference, one has p < 0.05 by chance."
+    return Table("compare", f"A = {first}, B = {second}", pd.DataFrame.from_dict(rows, "index", object, titles), note)
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -178,25 +172,21 @@ def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
     return Cell(row[metric], *row.get(f"{metric}_ci", (None, None)), decimals, metric)
 
 
-def _frame(rows: Mapping[str, Sequence[Cell | None]], titles: Sequence[str]) -> pd.DataFrame:
-    return pd.DataFrame(list(rows.values()), list(rows), titles, dtype=object)
-
-
-def _note(summary: Mapping[str, Any], metrics: Sequence[str], *more: str) -> str:
-    """How to read the figures of a run."""
-    parts = [summary.get("note", "")]
+def _table(
+    summary: Mapping[str, Any], name: str, title: str, rows: Mapping[str, Sequence[Cell | None]],
+    titles: Sequence[str], metrics: Sequence[str], *more: str, across: bool = False,
+) -> Table:  # fmt: skip
+    """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
+    data, notes = summary["data"], [summary.get("note", "")]
     if "mean_category_median" in metrics:
-        parts.append("Med. err.: mean of the categories' medians.")
+        notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
-        parts.append("Translation and scale: medians of the pairs for which a row has them.")
-    return " ".join(filter(None, [*parts, "Intervals: 95 %, bootstrap over objects.", *more]))
-
-
-def _data(summary: Mapping[str, Any]) -> str:
-    """What a run has evaluated."""
-    data, unfinished = summary["data"], " of an unfinished run" if "Not finished" in summary.get("note", "") else ""
-    name = Path(data["root"]).name
-    return f"{name}, {data['pairs']} pairs{unfinished}, {data['targets']} target views, backbone {summary['backbone']}"
+        notes.append("Translation and scale: medians of the pairs for which a row has them.")
+    notes += ["Intervals: 95 %, bootstrap over objects.", *more]
+    pairs = f"{data['pairs']} pairs" + (" of an unfinished run" if "Not finished" in notes[0] else "")
+    what = f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone {summary['backbone']}"
+    cells = pd.DataFrame.from_dict(rows, "index", object, titles)
+    return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
 
 
 def as_csv(table: Table) -> str:
@@ -217,38 +207,33 @@ def as_markdown(table: Table) -> str:
 
 
 def as_latex(table: Table) -> str:
-    """Format the compact columns as a booktabs table: no intervals, the best value of a metric in bold.
+    """Format three columns as a booktabs table: no intervals, the best value of a metric in bold.
 
     The paper's figures of these columns follow below a line.
     """
-    shown = table.cells[list(table.compact)].dropna(how="all")
-    best = {name: _best(cells) for name, cells in (shown.iterrows() if table.across else shown.items())}
-    lines = [["", *map(_tex, shown)], []]
-    for label, cells in shown.iterrows():
-        wins = [title in best[label] if table.across else label in best[title] for title in shown]
-        texts = zip(map(_number, cells), wins)
-        lines.append([_tex(label), *(rf"\textbf{{{text}}}" if one else text for text, one in texts)])
+    shown = table.cells[[title for title in table.cells if title != "pairs"][:3]].dropna(how="all")
+    texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
+    texts = texts.mask(best, texts.map(lambda text: rf"\textbf{{{text}}}"))
+    lines = [["", *map(_tex, shown)], [], *([_tex(label), *cells] for label, *cells in texts.itertuples())]
     published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in shown]).dropna(how="all")
     if len(published):
         lines += [[], [rf"\multicolumn{{{len(lines[0])}}}{{l}}{{{PUBLISHED}}}"]]
-        lines += [[_tex(label), *map(_number, cells)] for label, cells in published.iterrows()]
+        lines += [[_tex(label), *cells] for label, *cells in published.map(_number).itertuples()]
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
     return "\n".join([
         r"\begin{table}[tb]", rf"\caption{{{_tex('. '.join(filter(None, (title, table.data))))}}}",
-        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * len(table.compact)}}}", r"\toprule",
+        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * shown.shape[1]}}}", r"\toprule",
         *(rf"{' & '.join(line)} \\" if line else r"\midrule" for line in lines),
         r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     ])  # fmt: skip
 
 
-def _best(cells: pd.Series) -> list[str]:
-    """Names of the best of cells of one metric, if there are rivals; a row that is told the true view is none."""
+def _are_best(cells: pd.Series) -> pd.Series:
+    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true view is none."""
     rivals = {name: cell for name, cell in cells.items() if cell and cell.metric and "oracle-view" not in name}
-    if len(rivals) < 2:
-        return []
-    values = {name: round(cell.value, cell.decimals) for name, cell in rivals.items()}
-    lowest = next(iter(rivals.values())).metric in _LOWEST_IS_BEST
-    return [name for name in values if values[name] == (min if lowest else max)(values.values())]
+    values = pd.Series({name: round(cell.value, cell.decimals) for name, cell in rivals.items()}, cells.index, float)
+    lowest = any(cell.metric in _LOWEST_IS_BEST for cell in rivals.values())
+    return (values == (values.min() if lowest else values.max())) & (len(rivals) > 1)
 
 
 def _number(cell: Any) -> str:

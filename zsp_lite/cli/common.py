@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from zsp_lite.backbones.facets import FACETS
+from zsp_lite.choices import FACETS
 
 
 class Parsed(click.ParamType):

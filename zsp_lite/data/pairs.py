@@ -82,7 +82,7 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
 
 
 def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
-    """List a category's evaluation sets, ROOT/determ_eval/*/CATEGORY.pt."""
+    """List a category's evaluation sets, ROOT/determ_eval/SET/CATEGORY.pt."""
     return sorted(dataset.root.glob(f"determ_eval/{folders}/{plain_name(category, 'category')}.pt"))
 
 

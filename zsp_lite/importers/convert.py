@@ -79,8 +79,7 @@ def import_capture(
             "of masks that are named like the pictures (--masks DIR)"
         )
     frames = [frame.load() for frame in capture]
-    if box is not None:
-        frames = masks_from_box(frames, box)
+    frames = frames if box is None else masks_from_box(frames, box)
     seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
     if not seen:
         raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
@@ -140,7 +139,7 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 def _spread(frames: Sequence[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
     points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
-    if len(points) < 4:
+    if not len(points):
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))
     return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise

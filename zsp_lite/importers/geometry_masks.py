@@ -35,7 +35,7 @@ _MIN_PIXELS = 100
 # unknown depth inside the first box may be on the object, and the colours of the background are those in the second.
 _UNKNOWN_PADDING, _CONTEXT_PADDING = 0.1, 0.8
 # A mask is flagged beyond these values, which were chosen on renderings.
-_BORDERS = 2  # of the image that a mask may not touch at once
+_BORDERS = 2  # number of the image's borders that a mask may not touch at once
 _MOST = 0.5  # share of the image
 _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.4  # least overlap with the mask that GrabCut finds in the padded bounding box

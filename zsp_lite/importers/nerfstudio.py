@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from zsp_lite.data.cameras import MOST_PIXELS
 from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import CaptureFrame, camera_from_pose
 from zsp_lite.io.files import decode_json, path_inside, read_json
@@ -17,10 +16,8 @@ from zsp_lite.io.files import decode_json, path_inside, read_json
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
-_FocalLength = Annotated[float, msgspec.Meta(ge=1e-3, le=MAX_LENGTH)]  # pixels
-_Position = Annotated[float, msgspec.Meta(ge=-MAX_LENGTH, le=MAX_LENGTH)]  # pixels
-_Side = Annotated[float, msgspec.Meta(ge=1, le=MOST_PIXELS, multiple_of=1)]  # pixels; exporters write 640 or 640.0
-_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]
+_Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
+_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]  # of the distortion
 
 
 class _Frame(msgspec.Struct):
@@ -28,14 +25,14 @@ class _Frame(msgspec.Struct):
 
     file_path: str
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
-    fl_x: _FocalLength
-    cx: _Position
-    cy: _Position
+    fl_x: float
+    cx: float
+    cy: float
     w: _Side
     h: _Side
     depth_file_path: str | None = None
     mask_path: str | None = None
-    fl_y: _FocalLength | None = None
+    fl_y: float | None = None
     k1: _Coefficient = 0.0
     k2: _Coefficient = 0.0
     p1: _Coefficient = 0.0

@@ -10,9 +10,9 @@ from matplotlib.artist import Artist
 from torch import Tensor
 
 from zsp_lite.backbones.backbone import Backbone, normalize, prepare_images
-from zsp_lite.backbones.facets import FACETS
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
+from zsp_lite.choices import FACETS
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic.ground_truth import correct_matches
 from zsp_lite.views import View, patch_mask
