@@ -12,11 +12,9 @@ from zsp_lite.data.frames import (
     crop_to_object,
     mask_to_bbox,
     read_depth,
-    read_image,
     read_mask,
     resize_frame,
     write_depth,
-    write_image,
     write_mask,
 )
 from zsp_lite.errors import InputError
@@ -104,13 +102,6 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     write_mask(tmp_path / "known.png", depth > 0)
     np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
     assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header: a mask of booleans
-
-
-def test_a_smooth_picture_survives_jpeg_with_its_channels_in_order(tmp_path):
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    rgb = np.stack([200 + 0 * x, 3 * x, 2 * y], axis=-1).astype(np.uint8)
-    write_image(tmp_path / "image.jpg", rgb, quality=95)
-    assert np.abs(read_image(tmp_path / "image.jpg").astype(int) - rgb).max() < 12
 
 
 def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):

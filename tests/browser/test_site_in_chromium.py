@@ -29,16 +29,6 @@ def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
     assert not wide
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_an_answer_can_be_read_while_it_is_typed(browser, site, scheme):
-    page = browser.new_page(color_scheme=scheme)
-    page.goto((site / "notebooks" / "04_umeyama_ransac.html").as_uri())
-    field = page.locator("input.Input-text").first
-    field.fill("0.008")
-    colours = field.evaluate("field => [getComputedStyle(field).color, getComputedStyle(field).backgroundColor]")
-    assert colours == ["rgb(34, 34, 34)", "rgb(255, 255, 255)"]
-
-
 def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
     page = browser.new_page()
     page.goto((site / "docs" / "slides" / "lab_2.html").as_uri())

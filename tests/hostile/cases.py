@@ -99,18 +99,3 @@ for argv in (
     ("data", "import", "lists", "ROOT/capture", "--root", "ROOT/data", "--category", "c", "--sequence", "..", "--box", "2,2,20,20"),
 ):  # fmt: skip
     command("options", " ".join(argv).replace(" ".join(ON_DATA), "benchmark")[:60], *argv)
-
-# names that mean something to a terminal, to TeX, to HTML or to Markdown, or are not UTF-8
-NAMES = ("[red]x[", "$\\frac{$", "<script>alert(1)<", "| a | b |", "\udcff\udcfe", "a\nb", "\x1b[31mred", "x" * 200)
-for name in NAMES:
-
-    def renamed(folder, name=name):
-        for parent in ("data", "data/class_labels"):
-            (folder / parent / "cup").rename(folder / parent / name)
-        for file in ("frame_annotations.jgz", "sequence_annotations.jgz"):
-            path = folder / "data" / name / file
-            text = gzip.decompress(path.read_bytes()).replace(b'"cup/', json.dumps(f"{name}/").encode()[:-1])
-            path.write_bytes(gzip.compress(text.replace(b'"cup"', json.dumps(name).encode())))
-
-    codes = (1, 2) if "\\" in name or "\udcff" in name else (0,)  # a backslash, or what JSON cannot hold
-    command("text", f"benchmark of a category {name[:20]!r}", *ON_DATA, change=renamed, codes=codes)
