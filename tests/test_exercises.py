@@ -21,82 +21,53 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unchecked_annotations")
 EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
-# For each assignment and task: the name of a mistake, the part of the solution to replace, and its replacement.
+# For each assignment: a task, the name of a mistake, the part of the solution to replace, and its replacement.
 MISTAKES = {
-    "01_features": {
-        "patches": {
-            "column by column": ("transpose(0, 1, 3, 4, 2)", "transpose(1, 0, 3, 4, 2)"),
-            "stride forgotten": ("[::stride, ::stride]", "[::p, ::p]"),
-        },
-        "attention_head": {
-            "scale forgotten": (" / np.sqrt(query.shape[1])", ""),
-            "softmax over the columns": ("axis=1", "axis=0"),
-            "overflow": (" - logits.max(axis=1, keepdims=True)", ""),
-        },
-        "turn_parts": {
-            "the other way round": ("reshape(3, 3))", "reshape(3, 3), -1)"),
-        },
-    },
-    "02_cyclical_maps": {
-        "ratio_test": {
-            "similarities for distances": ("np.sqrt(np.maximum(2 - 2 * sim, 0))", "1 - sim"),
-            "cosine above one": ("np.maximum(2 - 2 * sim, 0)", "(2 - 2 * sim)"),
-        },
-        "two_way": {
-            "columns of the other grid": ("v_end, fg2.shape[1]", "v_end, fg1.shape[1]"),
-            "return not checked": (" & on1[u_end]", ""),
-        },
-        "spread": {
-            "far from the last one only": ("free &= np", "free = ~np.isin(scores, scores[chosen]) & np"),
-            "what is no match": ("np.isfinite(scores)", "np.ones(len(scores), bool)"),
-        },
-    },
-    "03_best_view": {
-        "score": {
-            "missing matches cost nothing": (" - penalty * (k - len(distances)) / k", ""),
-            "cosine above one": ("np.maximum(2 - 2 * np.asarray(cosines, dtype=float), 0)", "2 - 2 * cosines"),
-        },
-        "regret": {
-            "angle, not regret": (" - angles.min(axis=1)", ""),
-            "nearest of all pairs": ("angles.min(axis=1)", "angles.min()"),
-            "a pair without a view": ("regrets[allowed.any(axis=1)]", "regrets"),
-        },
-        "self_fit": {
-            "turned about the origin": ("points - points.mean(axis=0)", "points"),
-            "one way only": ("max(there, back)", "there"),
-        },
-    },
-    "04_umeyama_ransac": {
-        "umeyama": {
-            "forgotten reflection": ("np.sign(np.linalg.det(left @ right))", "1"),
-            "sign forgotten in the scale": ("(sign * singular).sum()", "singular.sum()"),
-            "means without weights": ("share @ x, share @ y", "x.mean(axis=0), y.mean(axis=0)"),
-            "rotation transposed": ("left @ np.diag(sign) @ right", "(left @ np.diag(sign) @ right).T"),
-        },
-        "trials": {
-            "the same match twice": ("(right - i) / (k - i)", "right / k"),
-            "fewer right matches than a sample": ("if right >= size else 0", "+ 1e-30"),
-        },
-        "consensus": {
-            "no fit to all inliers": ("fit(x[best], y[best])", "fit(x[sample], y[sample])"),
-            "never stops early": (" and done < needed(best.sum())", ""),
-        },
-    },
-    "05_metrics": {
-        "symmetric_error": {
-            "turned in the wrong frame": ("R @ turn(axis, 360 * i / n)", "turn(axis, 360 * i / n) @ R"),
-            "either end of the axis": ("a @ b", "abs(a @ b)"),
-        },
-        "new_label": {
-            "wrong order": ("np.linalg.inv(camera_b) @ estimate", "estimate @ np.linalg.inv(camera_b)"),
-            "scale removed": ("@ estimate", "@ (estimate / np.cbrt(np.linalg.det(estimate[:3, :3])))"),
-        },
-        "accuracy": {
-            "pairs drawn": ("np.unique(objects", "np.unique(np.arange(len(errors))"),
-            "30 degrees count as below 30": ("< threshold", "<= threshold"),
-        },
-    },
+    "01_features": [
+        ("patches", "column by column", "transpose(0, 1, 3, 4, 2)", "transpose(1, 0, 3, 4, 2)"),
+        ("patches", "stride forgotten", "[::stride, ::stride]", "[::p, ::p]"),
+        ("attention_head", "scale forgotten", " / np.sqrt(query.shape[1])", ""),
+        ("attention_head", "softmax over the columns", "axis=1", "axis=0"),
+        ("attention_head", "overflow", " - logits.max(axis=1, keepdims=True)", ""),
+        ("turn_parts", "the other way round", "reshape(3, 3))", "reshape(3, 3), -1)"),
+    ],
+    "02_cyclical_maps": [
+        ("ratio_test", "similarities for distances", "np.sqrt(np.maximum(2 - 2 * sim, 0))", "1 - sim"),
+        ("ratio_test", "cosine above one", "np.maximum(2 - 2 * sim, 0)", "(2 - 2 * sim)"),
+        ("two_way", "columns of the other grid", "v_end, fg2.shape[1]", "v_end, fg1.shape[1]"),
+        ("two_way", "return not checked", " & on1[u_end]", ""),
+        ("spread", "far from the last one only", "free &= np", "free = ~np.isin(scores, scores[chosen]) & np"),
+        ("spread", "what is no match", "np.isfinite(scores)", "np.ones(len(scores), bool)"),
+    ],
+    "03_best_view": [
+        ("score", "missing matches cost nothing", " - penalty * (k - len(distances)) / k", ""),
+        ("score", "cosine above one", "np.maximum(2 - 2 * np.asarray(cosines, dtype=float), 0)", "2 - 2 * cosines"),
+        ("regret", "angle, not regret", " - angles.min(axis=1)", ""),
+        ("regret", "nearest of all pairs", "angles.min(axis=1)", "angles.min()"),
+        ("regret", "a pair without a view", "regrets[allowed.any(axis=1)]", "regrets"),
+        ("self_fit", "turned about the origin", "points - points.mean(axis=0)", "points"),
+        ("self_fit", "one way only", "max(there, back)", "there"),
+    ],
+    "04_umeyama_ransac": [
+        ("umeyama", "forgotten reflection", "np.sign(np.linalg.det(left @ right))", "1"),
+        ("umeyama", "sign forgotten in the scale", "(sign * singular).sum()", "singular.sum()"),
+        ("umeyama", "means without weights", "share @ x, share @ y", "x.mean(axis=0), y.mean(axis=0)"),
+        ("umeyama", "rotation transposed", "left @ np.diag(sign) @ right", "(left @ np.diag(sign) @ right).T"),
+        ("trials", "the same match twice", "(right - i) / (k - i)", "right / k"),
+        ("trials", "fewer right matches than a sample", "if right >= size else 0", "+ 1e-30"),
+        ("consensus", "no fit to all inliers", "fit(x[best], y[best])", "fit(x[sample], y[sample])"),
+        ("consensus", "never stops early", " and done < needed(best.sum())", ""),
+    ],
+    "05_metrics": [
+        ("symmetric_error", "turned in the wrong frame", "R @ turn(axis, 360 * i / n)", "turn(axis, 360 * i / n) @ R"),
+        ("symmetric_error", "either end of the axis", "a @ b", "abs(a @ b)"),
+        ("new_label", "wrong order", "np.linalg.inv(camera_b) @ estimate", "estimate @ np.linalg.inv(camera_b)"),
+        ("new_label", "scale removed", "@ estimate", "@ (estimate / np.cbrt(np.linalg.det(estimate[:3, :3])))"),
+        ("accuracy", "pairs drawn", "np.unique(objects", "np.unique(np.arange(len(errors))"),
+        ("accuracy", "30 degrees count as below 30", "< threshold", "<= threshold"),
+    ],
 }
+TASKS = {assignment: list(dict.fromkeys(task for task, *_ in rows)) for assignment, rows in MISTAKES.items()}
 
 
 # A statement of a marking guide, and a check of it on what the given cells computed.
@@ -239,12 +210,12 @@ def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, c
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
 @pytest.mark.parametrize(
-    ("assignment", "task", "mistake"),
-    [(a, task, mistake) for a, tasks in MISTAKES.items() for task, mistakes in tasks.items() for mistake in mistakes],
+    ("assignment", "task", "mistake", "right", "wrong"),
+    [(assignment, *row) for assignment, rows in MISTAKES.items() for row in rows],
 )
-def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake):
+def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake, right, wrong):
     notebook = source(assignment)
-    cell, (right, wrong) = graded(notebook, solution=True)[task], MISTAKES[assignment][task][mistake]
+    cell = graded(notebook, solution=True)[task]
     assert right in cell.source, f"the solution does not contain {right!r}"
     cell.source = cell.source.replace(right, wrong)
     failing = failing_tests(prepared(assignment), notebook, notebook)
@@ -262,7 +233,7 @@ def {0}(*arguments):
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_functions_that_call_the_library_fail_all_tests(prepared, assignment):
     notebook = source(assignment)
-    for task in MISTAKES[assignment]:
+    for task in TASKS[assignment]:
         graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
     assert failing_tests(prepared(assignment), notebook, notebook) == set(graded(notebook, grade=True, locked=True))
 
@@ -301,7 +272,7 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     nbgrader("generate_assignment")
     handed_in = nbformat.read(folder / "release" / name / f"{name}.ipynb", as_version=4)
     solutions, answers = graded(source(name), solution=True), graded(handed_in, solution=True)
-    first, second, _ = MISTAKES[name]
+    first, second, _ = TASKS[name]
     answers[first].source = solutions[first].source
     answers[second].source = solutions[second].source + CALLS_THE_LIBRARY.format(second)
     answers["better"].source = "See my remark: [Comment](#mine), $\\lambda R$ and $\\broken{$"
@@ -327,7 +298,7 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
             if grade.needs_manual_grade:
                 grade.manual_score, grade.needs_manual_grade = 1.5, False
         gradebook.db.commit()
-    assert points == {f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)}
+    assert points == {f"test_{task}_{i}": 2 * (task == first) for task in TASKS[name] for i in (1, 2)}
     nbgrader("export", "generate_feedback")
     grades = [line.split(",") for line in (folder / "grades.csv").read_text().splitlines()]
     assert grades[1:] == [[name, "123", "5.5", "20", "graded"], [name, "124", "", "20", "not graded"]]
@@ -359,5 +330,5 @@ def test_nbgrader_recognises_the_files_of_learning_platforms(config):
 def test_an_exercise_has_20_points_and_no_test_decides_more_than_two(assignment):
     points = {name: cell.metadata.nbgrader.points for name, cell in graded(source(assignment), grade=True).items()}
     tests = [name for name in points if name.startswith("test_")]
-    assert tests == [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
+    assert tests == [f"test_{task}_{i}" for task in TASKS[assignment] for i in (1, 2)]
     assert [*points.values()] == [2] * 6 + [4] * 2
