@@ -133,17 +133,12 @@ def test_the_single_sequence_subset_has_its_own_archives_and_folder(server, sour
     assert contents(tmp_path / "mine") == contents(source)
 
 
-def test_the_labels_and_pairs_of_the_paper_come_with_version_1(server, source, tmp_path, capsys):
-    assert download(tmp_path / "v1", "--labels", str(source), dataset="co3d-v1") == 0
-    assert "2 labels, 1 files of pairs" in capsys.readouterr().out
-    assert list(read_labels(tmp_path / "v1", "toaster")) == list(SEQUENCES)
-
-
 def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(server, source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(archives, "_PART", 4_096)
     root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")
     assert download(root, *options, dataset="co3d-v1") == 0
     text = capsys.readouterr().out
+    assert "2 labels, 1 files of pairs" in text and list(read_labels(root, "toaster")) == list(SEQUENCES)
     assert "2 sequences of toaster.zip" in text and "1 of 3 annotated sequences are not downloaded" in text
     expected = {name: data for name, data in contents(source / "toaster").items() if UNLABELLED not in name}
     assert contents(root / "toaster") == expected

@@ -1,10 +1,13 @@
-"""The direction of imports: no module imports from a layer above its own."""
+"""The structure of the code: no module imports from a layer above its own, and no room is above its limit of lines."""
 
 import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import zsp_lite
+from tools import size
 from zsp_lite import _HOME_OF
 
 PACKAGE = Path(zsp_lite.__file__).parent
@@ -78,3 +81,14 @@ def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own()
             other = imported.partition(".")[0]
             allowed = other == own or LAYER_OF[other] < LAYER_OF[own]
             assert allowed, f"zsp_lite.{module}, line {line}, imports zsp_lite.{imported}: {other} is not below {own}"
+
+
+@pytest.mark.parametrize("room", size.rooms(), ids=lambda room: room.name)
+def test_the_room_is_within_its_limit(room):
+    assert 0 < room.size <= room.limit, f"{room.name}: {room.size} {room.unit}, at most {room.limit}; take away first"
+
+
+def test_every_file_of_the_library_is_in_one_room():
+    code = [room for room in size.rooms() if room.name.startswith("zsp_lite")]
+    parts, whole = [room.size for room in code if room.name != "zsp_lite in all"], code[-1]
+    assert whole.name == "zsp_lite in all" and sum(parts) == whole.size

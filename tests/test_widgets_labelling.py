@@ -105,6 +105,9 @@ def test_a_large_residual_is_accepted_by_a_second_press_only(labelling):
     box.buttons["accept"].click()
     assert re.fullmatch("Not done: residual of .* above 15 %.* press accept again .*", message(box))
     assert "a" not in read_labels(labelling.root, "chair")
+    labelling.put("a", [picks[2] + 0.01, *labelling.picks("a")[1:]])  # other picks are asked about anew
+    box.buttons["accept"].click()
+    assert "Not done: residual" in message(box)
     box.buttons["accept"].click()
     assert message(box) == "Written: class_labels/chair/a.json. Now b." and "a" in read_labels(labelling.root, "chair")
 

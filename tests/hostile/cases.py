@@ -24,8 +24,6 @@ COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
     "results": (RESULTS, ("tables", "ROOT/out")),
     "packed results": (f"{RESULTS}.gz", ("tables", "ROOT/out")),
-    "settings of results": ("out/run.json", ("tables", "ROOT/out")),
-    "compared results": (RESULTS, ("compare", "ROOT/out", "ROOT/out")),
     "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "settings of a run": ("out/run.json", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "checked annotations": (FRAMES, ("data", "check", "ROOT/data")),
