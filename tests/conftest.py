@@ -91,3 +91,12 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium, for the tests in browser/."""
+    from lab_in_browser import running_chromium
+
+    with running_chromium() as running:
+        yield running

@@ -125,6 +125,11 @@ def test_the_scene_has_every_pose_in_one_frame(results, text):
     names = re.findall(r'<option value="\d">([^<]+)</option>', text)
     assert names[:3] == ["paper solver", "verified solver", "verified solver, hypothesis 2"]
     assert len(names) == len(content["poses"])
+    estimate = result.estimates["verified"]
+    for rotation, one in zip(np.array(content["poses"])[2:, :, :3], estimate.alternatives, strict=True):
+        own = estimate.target_views[one.view].frame.camera
+        expected = result.estimate.target_camera.R @ own.R.T @ one.sim3.R
+        np.testing.assert_allclose(rotation / np.cbrt(np.linalg.det(rotation)), expected, atol=1e-4)
     np.testing.assert_allclose(content["poses"][0], result.estimate.sim3.matrix[:3], atol=1e-5)
     moved = result.estimates["verified"].propagate([result.estimate.target_camera])[0]
     np.testing.assert_allclose(content["poses"][1], moved.matrix[:3], atol=1e-5)

