@@ -28,14 +28,26 @@ _raises = pytest.raises
 
 
 @contextlib.contextmanager
-def _unchecked(expectation):
+def _unchecked():
     before = config.jaxtyping_disable
     config.update("jaxtyping_disable", True)
     try:
-        with expectation as caught:
-            yield caught
+        yield
     finally:
         config.update("jaxtyping_disable", before)
+
+
+@contextlib.contextmanager
+def _unchecked_raises(expectation):
+    with _unchecked(), expectation as caught:
+        yield caught
+
+
+@pytest.fixture
+def unchecked_annotations():
+    """For tests of whole programs, whose single calls other tests check."""
+    with _unchecked():
+        yield
 
 
 @wraps(_raises)
@@ -46,7 +58,7 @@ def raises(expected, *args, **kwargs):
     """
     expectation = _raises(expected, *args, **kwargs)
     if expected is InputError and not args:
-        return _unchecked(expectation)
+        return _unchecked_raises(expectation)
     return expectation
 
 
@@ -79,3 +91,12 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium, for the tests in browser/."""
+    from lab_in_browser import running_chromium
+
+    with running_chromium() as running:
+        yield running

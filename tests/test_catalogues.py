@@ -112,9 +112,8 @@ def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs()
 def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under_their_class(tmp_path, monkeypatch):
     listed = json.loads(CATALOGUE.read_text())
     assert listed.keys() == {"training", "validation"}
-    for side, path in (("training", TRAINED), ("validation", CHOSEN_BY)):
-        models = read_catalogue(path).models
-        known = {f"{category}/{name}" for category, entries in models.items() for name in entries}
+    for side in listed:
+        known = {f"{category}/{name}" for category, entries in CATALOGUES[side].items() for name in entries}
         names = [name for some in listed[side].values() for name in some]
         assert len(set(names)) == len(names) and set(names) <= known
     (tmp_path / "list.json").write_text('{"training": {"stool": ["chair_kind/oak"]}}')
@@ -166,8 +165,7 @@ def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
 def test_the_weights_name_every_model_that_they_were_trained_on():
     page = ATTRIBUTION.read_text(encoding="utf-8")
     text = " ".join(page.split())
-    models = [(name, entry) for models in read_catalogue(TRAINED).models.values() for name, entry in models.items()]
-    for name, work in models:
+    for name, work in [one for models in CATALOGUES["training"].values() for one in models.items()]:
         assert f"**{work.author}**: " in text and " ".join((work.title or name.replace("_", " ")).split()) in text
         assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
     assert f"]({ATTRIBUTION.name})" in (ATTRIBUTION.parent / "MODEL_CARD.md").read_text(encoding="utf-8")
@@ -199,7 +197,6 @@ def test_every_category_is_listed_on_its_side():
 
 def test_no_model_for_training_has_the_name_of_an_evaluation_category():
     reserved = {name for name, side in SIDE_OF.items() if side == "evaluation"}
-    fittings = {"toilet_brush", "toilet_paper_dispenser"}  # of a bathroom; no toilet
     models = [model for side in ("training", "validation") for names in CATALOGUES[side].values() for model in names]
-    found = {model for model in models if reserved & {*model.split("_")}}
-    assert found == fittings
+    # Two fittings of a bathroom are no toilet.
+    assert {one for one in models if reserved & {*one.split("_")}} == {"toilet_brush", "toilet_paper_dispenser"}

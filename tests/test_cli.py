@@ -1,6 +1,7 @@
 """The command line: help with examples for every command, one line for bad input, no tracebacks."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -8,19 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import pytest
+from co3d_folders import convert_to_v2, sequence_data
 from synthetic_views import CoordinateBackbone
+from test_importers import hairdryer_views, write_lists
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
-from zsp_lite.cli import main as cli
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.cli.main import cli, main
+from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.frames import write_mask
+from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.importers import READERS
+from zsp_lite.importers.convert import ImportResult
 
 IMPORT = ("data", "import", "--root=x", "--category=c", "--sequence=s")
 
 
-def commands(group: click.Group = cli.cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def commands(group: click.Group = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """Every command, nested ones included, as the words that call it."""
     for name, command in group.commands.items():
         yield (*path, name)
@@ -31,20 +39,20 @@ def commands(group: click.Group = cli.cli, path: tuple[str, ...] = ()) -> Iterat
 @pytest.mark.parametrize("command", list(commands()), ids=" ".join)
 def test_help_of_every_command_has_an_example_and_an_unknown_option_is_one_line(command, capsys):
     name = " ".join(("zsp-lite", *command))
-    assert cli.main([*command, "--help"]) == 0
+    assert main([*command, "--help"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(f"Usage: {name}") and "Examples:" in text and f"    {name}" in text
-    assert cli.main([*command, "--unknown"]) == 2
+    assert main([*command, "--unknown"]) == 2
     line = assert_one_line(capsys)
     assert "--unknown" in line and line.endswith(f"(see: {name} --help)\n")
 
 
 def test_the_help_lists_every_command_and_the_version_is_told(capsys):
-    assert cli.main(["--help"]) == 0
+    assert main(["--help"]) == 0
     text = capsys.readouterr().out
     names = "demo estimate align benchmark tables compare synth weights data doctor".split()
-    assert set(names) == set(cli.cli.commands) and all(f"\n  {name} " in text for name in names)
-    assert cli.main(["--version"]) == 0
+    assert set(names) == set(cli.commands) and all(f"\n  {name} " in text for name in names)
+    assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"zsp-lite, version {__version__}\n"
 
 
@@ -58,56 +66,42 @@ def test_help_imports_no_large_library():
     assert finished.stderr.strip() == "set()"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "Missing command"),
-        (["fly"], "No such command 'fly'"),
-        (["benchmark", "--pairs", "0"], "'--pairs': 0 is not in the range 1<=x<=1000000"),
-        (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
-        (["benchmark", "--methods", ","], "expected names separated by commas"),
-        (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed', expected mean_category_median, acc30"),
-        (["synth", "--preset", "demo"], "Missing option '--out'"),
-        (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
-        (["synth", "--preset", "demo", "--frames", "3", "--out", "x"], "--frames does not go with --preset"),
-        (["synth", "--category", "mouse", "--up", "+z", "--out", "x"], "--up does not go with --category"),
-        (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
-        (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
-        (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
-    ],
-)
-def test_wrong_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
-    assert cli.main(arguments) == 2
-    line = assert_one_line(capsys)
-    assert message in line and "(see: zsp-lite" in line
+WRONG = [
+    ([], "Missing command"),
+    (["fly"], "No such command 'fly'"),
+    (["benchmark", "--pairs", "0"], "0 is not in the range"),
+    (["demo", "--out", "a\0b"], "'--out': got 'a\\x00b', expected a path"),
+    (["benchmark", "--methods", ","], "expected names separated by commas"),
+    (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed'"),
+    (["synth", "--preset", "demo"], "Missing option '--out'"),
+    (["synth", "--preset", "a", "--category", "b", "--out", "x"], "expected either --preset or --category"),
+    (["synth", "--preset", "demo", "--frames", "3", "--out", "x"], "--frames does not go with --preset"),
+    (["synth", "--category", "mouse", "--up", "+z", "--out", "x"], "--up does not go with --category"),
+    (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
+    (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
+    (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
+    (["demo", "--data", "no/such/folder"], "no/such/folder"),
+    (["demo", "--backbone", "resnet"], "resnet"),
+    (["demo", "--layer", "block12"], "'block0' to 'block11'"),
+    (["benchmark", "--methods", "magic"], "magic"),
+    (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
+    (["tables", "."], "run.json"),
+    (["synth", "--category", "sofa", "--out", "x"], "sofa"),
+    (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
+    (["data", "check", "/nowhere"], "does not exist"),
+    ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
+    ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
+    ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
+]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "names"),
-    [
-        (["demo", "--data", "no/such/folder"], "no/such/folder"),
-        (["demo", "--backbone", "resnet"], "resnet"),
-        (["demo", "--layer", "block12"], "'block0' to 'block11'"),
-        (["benchmark", "--methods", "magic"], "magic"),
-        (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
-        (["tables", "."], "is not the folder of a benchmark run: it has no run.json"),
-        (["synth", "--preset", "imagenet", "--out", "x"], "imagenet"),
-        (["synth", "--category", "sofa", "--out", "x"], "sofa"),
-        (["weights", "fetch", "resnet"], "resnet"),
-        (["weights", "verify", "no/such/file.pth"], "no/such/file.pth"),
-        (["data", "check", "/nowhere"], "does not exist"),
-        (["data", "transfer", "/nowhere", "/nowhere", "chair"], "/nowhere"),
-        ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
-        ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
-        ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
-    ],
-)
-def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, names, capsys, ellipsoids, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("arguments", "part"), WRONG)
+def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, part, capsys, ellipsoids, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if arguments[0] in ("demo", "benchmark") and "--data" not in arguments:
+    if arguments and arguments[0] in ("demo", "benchmark") and "--data" not in arguments:
         arguments = [*arguments, "--data", str(ellipsoids.root)]
-    assert cli.main(arguments) == 2
-    assert names in assert_one_line(capsys)
+    assert main(arguments) == 2
+    assert part in assert_one_line(capsys)
     assert not list(tmp_path.iterdir())
 
 
@@ -124,7 +118,7 @@ def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys)
         raise error
 
     monkeypatch.setattr(doctor, "run_checks", fail)
-    assert cli.main(["doctor"]) == code
+    assert main(["doctor"]) == code
     assert_one_line(capsys)
 
 
@@ -139,7 +133,7 @@ def loaded(monkeypatch) -> list[Any]:
 
 @pytest.mark.slow
 def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loaded, capsys):
-    assert cli.main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
+    assert main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "ellipsoid" in text and " of 5" in text and "°" in text and demo.USER_NOTE in text
     assert "paper" in text and "verified" in text
@@ -153,7 +147,7 @@ def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
     (tmp_path / "file").write_text("mine")
     folder = ellipsoids.root
     words = ["--data", str(folder)] if command == "demo" else [str(folder / "ellipsoid/a"), str(folder / "ellipsoid/b")]
-    assert cli.main([command, *words, "--out", str(tmp_path / "file" / inside)]) == 2
+    assert main([command, *words, "--out", str(tmp_path / "file" / inside)]) == 2
     assert "expected a folder" in assert_one_line(capsys)
     assert (tmp_path / "file").read_text() == "mine" and not loaded
 
@@ -163,23 +157,23 @@ def test_options_of_the_demo_reach_the_library(ellipsoids, tmp_path, monkeypatch
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     words = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
-    assert cli.main([*words, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
-    assert cli.main([*words, "--backbone", "dino_vits8", "--solver", "paper"]) == 0
+    assert main([*words, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
+    assert main([*words, "--backbone", "dino_vits8", "--solver", "paper"]) == 0
     config = BackboneConfig("zsp-tiny", "block3", "value", 96)
     assert loaded == [config, ("paper", "verified"), "dino_vits8", ("paper",)]
 
 
 def test_synth_writes_a_co3d_folder(tmp_path):
     words = "synth --category mouse --sequences 1 --frames 2 --seed 3 --out".split()
-    assert cli.main([*words, str(tmp_path)]) == 0
+    assert main([*words, str(tmp_path)]) == 0
     assert [key.frame_number for key in Co3D(tmp_path).frame_list("mouse")] == [0, 1]
 
 
 def test_weights_list_has_every_backbone(capsys):
-    assert cli.main(["weights", "list"]) == 0
+    assert main(["weights", "list"]) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
-    assert cli.main(["weights", "verify", "zsp-tiny"]) == 0 and "zsp-tiny: complete, loads" in capsys.readouterr().out
+    assert main(["weights", "verify", "zsp-tiny"]) == 0 and "zsp-tiny: complete, loads" in capsys.readouterr().out
 
 
 def assert_one_line(capsys) -> str:
@@ -192,14 +186,14 @@ def assert_one_line(capsys) -> str:
 def test_benchmark_list_has_every_method_and_group_in_100_columns(capsys):
     from zsp_lite.benchmark.methods import GROUPS, METHODS
 
-    assert cli.main(["benchmark", "--list"]) == 0
+    assert main(["benchmark", "--list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert {*METHODS, *(f"{name}:" for name in GROUPS)} <= {line.split()[0] for line in lines if line.strip()}
     assert max(map(len, lines)) <= 100
 
 
 def test_a_reader_that_ends_early_ends_the_output_without_an_error():
-    for command, reader in (("benchmark --list", "head -1"), ("weights list", "true"), ("--help", "true")):
+    for command, reader in (("benchmark --list", "head -1"), ("--help", "true")):
         pipe = f"{sys.executable} -u -m zsp_lite {command} | {reader}; exit ${{PIPESTATUS[0]}}"
         done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, ""), command
@@ -211,22 +205,22 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, caps
     monkeypatch.setenv("COLUMNS", "200")
     rows = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "2", "--targets", "3", "--methods", "table3"]
     for name, options in (("a", []), ("b", ["--quiet"])):
-        assert cli.main([*rows, "--out", str(tmp_path / name), *options]) == 0
+        assert main([*rows, "--out", str(tmp_path / name), *options]) == 0
         assert ("ours-globalsim" in capsys.readouterr().out) == (name == "a")
     methods = json.loads((tmp_path / "a/summary.json").read_text())["methods"]
     assert methods["ours"]["n"] == methods["ours-globalsim"]["n"] == 2
-    assert cli.main(["tables", str(tmp_path / "a"), "--out", str(tmp_path / "c")]) == 0
+    assert main(["tables", str(tmp_path / "a"), "--out", str(tmp_path / "c")]) == 0
     assert "GlobalSim" in capsys.readouterr().out
     for made in ("tables/table_3.md", "summary.json"):
         assert len({(tmp_path / name / made).read_bytes() for name in "ac"}) == 1
     assert len({(tmp_path / name / "tables/table_3.md").read_bytes() for name in "ab"}) == 1
     assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
-    assert cli.main(["tables", str(tmp_path / "b"), "--metrics", "scale"]) == 0
+    assert main(["tables", str(tmp_path / "b"), "--metrics", "scale"]) == 0
     headings = [(tmp_path / name / "tables/all_rows.md").read_text().splitlines()[2] for name in "ab"]
     assert ["scale ratio" in text for text in headings] == ["Acc15" not in text for text in headings] == [False, True]
-    assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
     assert "ours:ours-globalsim" in capsys.readouterr().out
-    assert cli.main(["compare", *(str(tmp_path / name) for name in "ab"), "--out", str(tmp_path / "d")]) == 0
+    assert main(["compare", *(str(tmp_path / name) for name in "ab"), "--out", str(tmp_path / "d")]) == 0
     assert {path.name for path in (tmp_path / "d").iterdir()} == {f"compare.{kind}" for kind in ("csv", "md", "tex")}
 
 
@@ -244,5 +238,61 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
     common = (tmp_path, config, ["ours", "x=a:b"], numbers, 3, Path("there"))
     for more, last in ((["--workers", "5"], (5, False)), (["--executor", "dask://h:1"], ("dask://h:1", False)),
                        (["--allow-other-version"], (1, True))):  # fmt: skip
-        assert cli.main([*words, *more]) == 2
+        assert main([*words, *more]) == 2
         assert given.pop() == common + last and not given
+
+
+# Data
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_co3d(tmp_path / "data", "chair", [sequence_data("a"), sequence_data("b")])
+    return tmp_path / "data"
+
+
+def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
+    for name in "ab":
+        write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
+    assert main(["data", "labels", str(tmp_path / "clone"), "--root", str(root)]) == 0
+    assert "2 labels, 0 files of pairs" in capsys.readouterr().out
+    shutil.copytree(root / "chair", tmp_path / "v2/chair")
+    convert_to_v2(tmp_path / "v2/chair")
+    write_label(tmp_path / "v2", "chair", PoseLabel(np.diag([-1.0, -1, 1, 1]), "b", "a"))
+    transfer = ["data", "transfer", str(root), str(tmp_path / "v2"), "chair"]
+    assert main(transfer) == 2 and "expected --replace" in capsys.readouterr().err
+    assert main([*transfer, "--replace"]) == 0
+    assert "camera centres differ by 0.00 %" in capsys.readouterr().out
+    assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]
+
+
+def test_a_capture_is_imported(tmp_path, capsys):
+    source = tmp_path / "scan"
+    source.mkdir()
+    frames = hairdryer_views()
+    for frame in frames:
+        write_mask(tmp_path / f"masks/{frame.name}.png", frame.mask)
+    write_lists(source, frames)
+    arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
+    assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
+    assert "8 frames" in capsys.readouterr().out
+    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 8
+
+
+def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
+    given = []
+
+    def import_capture(*arguments):
+        given.append(arguments)
+        return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
+
+    for layout in READERS:
+        monkeypatch.setitem(READERS, layout, lambda folder, **options: (folder, options))
+    monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
+    words = "--root mine --category cup --sequence one --frames 7".split()
+    assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
+    assert given.pop() == ((Path("scan"), {}), Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert "flag: the masks may be wrong: why\n" in capsys.readouterr().out
+    assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
+    capture = (Path("scan"), {"depth_unit": 0.5})
+    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)

@@ -32,11 +32,9 @@ def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_not
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
     monkeypatch.setattr("zsp_lite.backbones.load.available_backbones", lambda: {"zsp-tiny": None})
     assert main(["doctor"]) == 1
-    python, torch, tiny, reinstall, cache, choose, last = capsys.readouterr().out.splitlines()
-    assert python.startswith("ok    Python ") and torch.startswith("ok    torch ")
-    assert tiny.startswith("bad   weights zsp-tiny ") and "-> missing: reinstall" in reinstall
-    assert cache.startswith("note  cache ") and "-> set ZSP_LITE_CACHE" in choose
-    assert last == "Missing or broken: weights zsp-tiny."
+    python, torch, tiny, _, cache, cure, last = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in (python, torch, tiny, cache)] == ["ok", "ok", "bad", "note"]
+    assert "-> set ZSP_LITE_CACHE" in cure and last == "Missing or broken: weights zsp-tiny."
 
 
 def test_the_doctor_passes_here(capsys):

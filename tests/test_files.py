@@ -57,7 +57,7 @@ BAD_FILES = [
       for name, read in (("x.jpg", read_image), ("mask.png", read_mask), ("depth.png", read_depth))
       for damage, data in {
           "empty": b"", "text": b"text", "GIF": b"GIF89a" + bytes(20), "JPEG cut": JPEG[: len(JPEG) // 2],
-          "JPEG without a frame": b"\xff\xd8\xff\xd9", "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
+          "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
           "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
       }.items()),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
@@ -76,11 +76,9 @@ BAD_FILES = [
     ("x.ply", read_ply, "10^12 points", _ply(10**12, bytes(36)), "is not a complete PLY file"),
     ("x.ply", read_ply, "no points", _ply(0, b""), "is not a complete PLY file"),
     ("x.ply", read_ply, "not finite", _ply(1, np.float32([0, np.nan, 0]).tobytes()), "expected finite numbers"),
-    ("x.pth", read_checkpoint, "empty", b"", "damaged, or contains more than tensors"),
     ("x.pth", read_checkpoint, "cut", _torch({"a": torch.zeros(99)})[:-200], "damaged, or contains more than tensors"),
     ("x.pth", read_checkpoint, "code", _torch({"a": Code()}), "damaged, or contains more than tensors"),
     ("x.pth", read_checkpoint, "a number", _torch(5), "expected a state dict of tensors, got int"),
-    ("x.safetensors", read_checkpoint, "empty", b"", "damaged, or contains more than tensors"),
     ("x.safetensors", read_checkpoint, "cut", save({"a": torch.zeros(9)})[:-1], "damaged, or contains"),
     ("x.safetensors", read_checkpoint, "giant header", struct.pack("<Q", 2**63) + b"{}", "damaged, or contains"),
     ("cup.pt", read_pair_file, "code", _torch([Code()]), "damaged, or contains more than tensors"),

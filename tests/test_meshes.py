@@ -40,21 +40,15 @@ def test_the_linear_colour_factor_of_gltf_becomes_srgb(tmp_path):
     assert srgb_to_linear(read.colour[:3]) == pytest.approx(linear, abs=1e-4)
 
 
-@pytest.mark.parametrize("extension", ["obj", "glb", "gltf", "ply", "stl"])
+@pytest.mark.parametrize("extension", ["obj", "glb", "ply", "stl"])
 def test_every_format_gives_the_same_canonical_shape(tmp_path, extension):
     shape = wedge()
     # From front +x, up +z to the axes that the format has by default.
-    if extension == "stl":
-        vertices = np.stack([shape.vertices[:, 1], -shape.vertices[:, 0], shape.vertices[:, 2]], 1)
-    else:
-        vertices = shape.vertices[:, [1, 2, 0]]
+    turned = shape.vertices[:, [1, 0, 2]] * (1, -1, 1)
+    vertices = turned if extension == "stl" else shape.vertices[:, [1, 2, 0]]
     path = tmp_path / f"wedge.{extension}"
     exported = trimesh.Trimesh(vertices, shape.faces, process=False)
-    if extension == "gltf":
-        for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(exported)).items():
-            (tmp_path / name.replace("model.gltf", "wedge.gltf")).write_bytes(data)
-    else:
-        exported.export(path)
+    exported.export(path)
     mesh = canonical_mesh(read_mesh(path), ModelInfo().axes(path.suffix))
     expected = shape.vertices - (shape.vertices.max(0) + shape.vertices.min(0)) / 2
     expected /= surface_spread(expected, shape.faces)

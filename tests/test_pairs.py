@@ -72,11 +72,8 @@ def test_sampling_depends_on_seed_and_category_alone(dataset):
     assert pairs == sample_pairs(Co3D(dataset.root), "chair", 20, 5, seed=1)
     assert pairs[:7] == sample_pairs(dataset, "chair", 7, 5, seed=1)
     assert pairs != sample_pairs(dataset, "chair", 20, 5, seed=2)
-    choices = {
-        category: [pair.target_sequence for pair in sample_pairs(dataset, category, 50, 5, seed=1)]
-        for category in ("chair", "lamp")
-    }
-    assert choices["chair"] != choices["lamp"]
+    other = sample_pairs(dataset, "lamp", 20, 5, seed=1)
+    assert [pair.target_sequence for pair in pairs] != [pair.target_sequence for pair in other]
 
 
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
@@ -132,7 +129,6 @@ def test_a_folders_own_pairs_are_found(tmp_path):
     ("changes", "message"),
     [
         ({"reference_frame_id": 48}, "frame id 48 is not of s1, expected a position in the list of 48 frames"),
-        ({"reference_frame_id": "3"}, "Expected `int`, got `str` - at `..0..reference_frame_id`"),
         ({"all_target_id": []}, "all_target_id"),
         ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
         ({"target_seq_name": "s3"}, "is not of s3"),

@@ -17,7 +17,6 @@ from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.pose_picture import coverage
 from zsp_lite.viz.report import (
-    _notebook_link,
     _two_poses_figure,
     overview,
     table_rows,
@@ -62,12 +61,6 @@ def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
     assert results[0].estimate.inliers.sum() > 20
 
 
-def test_notebooks_are_linked_in_the_clone_or_only_named(monkeypatch, tmp_path):
-    assert 'href="../notebooks/01_features.ipynb"' in _notebook_link("01_features", REPOSITORY / "outputs")
-    monkeypatch.setattr("zsp_lite.viz.report.REPOSITORY", tmp_path)
-    assert _notebook_link("01_features", REPOSITORY) == "notebook 01"
-
-
 def test_shipped_evaluation_pairs_are_preferred(ellipsoids):
     from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 
@@ -99,13 +92,13 @@ def test_the_page_loads_nothing_and_its_links_lead_to_notebooks(page, text):
     assert len(text) < 12_000_000
 
 
-def test_the_page_and_the_table_have_the_numbers_of_both_solvers_and_the_hypotheses(results, text):
+def test_the_table_has_the_numbers_of_both_solvers_and_the_page_those_of_the_hypotheses(results, text):
     (result,) = results
     for solver, row in zip(("paper", "verified"), table_rows(result), strict=True):
         estimate = result.estimates[solver]
-        assert row[:3] == ("ellipsoid", solver, f"{estimate.view + 1} of 5") and row[6].endswith(" s")
+        assert row[:3] == ("ellipsoid", solver, f"{estimate.view + 1} of 5")
         assert row[3] == f"{estimate.inliers.sum()} of {len(estimate.inliers)}"
-        assert row[4] == f"{result.errors[solver]:.1f}°" and f"rotation error {row[4]}</h3>" in text
+        assert row[4] == f"{result.errors[solver]:.1f}°"
         assert row[5] == ("–" if solver == "paper" else f"{estimate.confidence:.2f}")
     for one in estimate.alternatives:
         deficit = estimate.hypotheses[0].score - one.score
@@ -121,8 +114,6 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(res
     page = write_report(tmp_path / "report.html", [two], "name").read_text()
     assert f"turned by {estimate.angle_to(other):.0f} degrees" in page and "One of two" in page
     _, best, second = _two_poses_figure(estimate).axes
-    assert best.get_title() == f"probability {estimate.confidence:.2f}"
-    assert second.get_title() == f"turned by {estimate.angle_to(other):.0f}°, probability {other.confidence:.2f}"
     np.testing.assert_array_equal(best.images[0].get_array(), second.images[0].get_array())
     camera, own = estimate.target_camera, estimate.target_views[other.view].frame.camera
     cloud = object_cloud(estimate.reference_view, most=1500)
@@ -134,17 +125,21 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(res
         np.testing.assert_allclose(axis.collections[0].get_offsets(), pixels[np.argsort(-depth)], atol=1e-6)
 
 
-def test_the_scene_has_every_pose_in_one_frame_and_leaves_the_wheel_to_the_page(results, text):
+def test_the_scene_has_every_pose_in_one_frame(results, text):
     (result,) = results
     (content,) = re.findall(r'<script type="application/json">(.*?)</script>', text)
     content = json.loads(content)
     names = re.findall(r'<option value="\d">([^<]+)</option>', text)
     assert names[:3] == ["paper solver", "verified solver", "verified solver, hypothesis 2"]
     assert len(names) == len(content["poses"])
+    estimate = result.estimates["verified"]
+    for rotation, one in zip(np.array(content["poses"])[2:, :, :3], estimate.alternatives, strict=True):
+        own = estimate.target_views[one.view].frame.camera
+        expected = result.estimate.target_camera.R @ own.R.T @ one.sim3.R
+        np.testing.assert_allclose(rotation / np.cbrt(np.linalg.det(rotation)), expected, atol=1e-4)
     np.testing.assert_allclose(content["poses"][0], result.estimate.sim3.matrix[:3], atol=1e-5)
     moved = result.estimates["verified"].propagate([result.estimate.target_camera])[0]
     np.testing.assert_allclose(content["poses"][1], moved.matrix[:3], atol=1e-5)
-    assert '"scrollZoom": false' in text
 
 
 def test_all_text_is_escaped(results, text, tmp_path):

@@ -13,7 +13,6 @@ from zsp_lite.widgets import self_check
 from zsp_lite.widgets.quiz import QUESTIONS, read_questions
 
 FILES = sorted(QUESTIONS.glob("*.json"))
-TAGS = r"</?(?:i|b|sub|sup|code|br)>"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -26,12 +25,7 @@ def test_every_question_has_right_and_wrong_answers_with_feedback_to_each(path):
         assert 0 < right < len(answers) and (kind != "multiple_choice" or right == 1)
         assert (kind == "numeric") == (answers[-1].get("type") == "default")  # for what no value and no range covers
         assert all(low < high for low, high in (answer["range"] for answer in answers if "range" in answer))
-        feedback = [answer["feedback"] for answer in answers]
-        assert len(set(feedback)) == len(answers)
-        # Texts are HTML, without formulas in LaTeX and without addresses.
-        for text in (question["question"], *feedback, *(answer.get("answer", "-") for answer in answers)):
-            assert text.strip() == text != "" and not re.search(r"\$|://|]\(|&(?!\w+;|#\d+;)", text), text
-            assert "<" not in re.sub(TAGS, "", text), text
+        assert len({answer["feedback"] for answer in answers}) == len(answers)
 
 
 @pytest.mark.parametrize("number", [1, 2])

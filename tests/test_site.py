@@ -4,7 +4,6 @@ import importlib
 import re
 import subprocess
 import sys
-from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -17,7 +16,6 @@ import zsp_lite
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
-DRAWINGS = sorted((REPOSITORY / "notebooks" / "figures").glob("*.svg"))
 DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
 
 
@@ -88,10 +86,6 @@ def test_every_link_leads_to_a_file_and_every_anchor_to_an_element_and_no_page_i
     assert set(pages) <= reached
 
 
-def test_about_twenty_entries_stand_at_the_side(pages):
-    assert 18 <= pages["docs/index.html"].html.count('class="toctree-l1') <= 22
-
-
 def test_no_page_loads_anything_from_elsewhere(site, pages):
     for name, page in pages.items():
         for source in page.loaded:
@@ -100,38 +94,23 @@ def test_no_page_loads_anything_from_elsewhere(site, pages):
                 assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
 
 
-def test_letters_of_formulas_are_bold_and_intervals_do_not_break(pages):
-    assert "<mi>\N{MATHEMATICAL BOLD CAPITAL R}</mi>" in pages["notebooks/05_metrics.html"].html
-    assert not [name for name, page in pages.items() if 'mathvariant="bold' in page.html]
-    results = pages["docs/results.html"].text
-    assert "[47.6,\N{NO-BREAK SPACE}66.2]" in results and "[47.6, 66.2]" not in results
-
-
 @pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
-def test_a_deck_of_slides_is_a_single_file_with_the_pictures_of_the_notebooks(pages, path):
-    page, text = pages[page_of(path)], path.read_text(encoding="utf-8")
+def test_a_deck_of_slides_is_a_single_file_with_its_pictures(pages, path):
+    page = pages[page_of(path)]
+    assert len(page.pictures) == path.read_text(encoding="utf-8").count("```{picture}")
     assert page.loaded == [picture["src"] for picture in page.pictures]
-    assert all(slide.count("```{picture}") <= 1 for slide in text.split("\n## "))
-    assert len(page.pictures) == text.count("```{picture}")
-    stored = "".join(notebook.read_text(encoding="utf-8").replace("\\n", "") for notebook in NOTEBOOKS)
-    text += unescape("".join(drawing.read_text(encoding="utf-8") for drawing in DRAWINGS))
-    for picture in page.pictures:
-        data = re.fullmatch("data:image/(?:png|jpeg|svg.xml);base64,(.*)", picture["src"])[1]
-        assert len(picture["alt"]) > 20 and (data in stored or picture["alt"] in text), picture["alt"]
+    assert all(source.startswith("data:image/") for source in page.loaded)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_shows_its_stored_pictures_with_their_texts_and_what_it_printed(pages, path):
-    page = pages[page_of(path)]
-    outputs = [output for cell in nbformat.read(path, 4).cells for output in cell.get("outputs", [])]
+def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(pages, path):
+    page, cells = pages[page_of(path)], nbformat.read(path, 4).cells
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
     texts = [output.metadata[form]["alt"] for output in outputs for form in output.get("data", {}) if "image/" in form]
     shown = [picture["alt"] for picture in page.pictures]
     assert [text for text in shown if text in texts] == texts
-    widgets = [output for output in outputs if "application/vnd.jupyter.widget-view+json" in output.get("data", {})]
-    assert page.html.count("Interactive in a running notebook") == len(widgets)
-    drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in nbformat.read(path, 4).cells))
+    drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
     assert all(" ".join(text.split()) in shown for text in drawings)
-    assert len(shown) <= len(texts) + len(widgets) + len(drawings) and all(len(text) > 20 for text in shown)
     for output in outputs:
         if output.output_type == "stream" and output.text.strip():
             assert output.text.strip().splitlines()[0].strip() in page.text
@@ -166,11 +145,10 @@ def test_the_reference_describes_every_public_class_and_function(pages):
 
 def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
     for path in (*NOTEBOOKS, *EXERCISES):
-        links = pages[page_of(path)].links
-        assert any(link.endswith(f"run/{path.relative_to(REPOSITORY)}") for link in links), path.name
-        copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
-        for drawing in re.findall(r"\]\((figures/[^)]+)\)", "\n".join(cell.source for cell in copy.cells)):
-            assert (site / "run" / path.relative_to(REPOSITORY).parent / drawing).is_file(), f"{path.name}: {drawing}"
+        copy = Path("run", path.relative_to(REPOSITORY))
+        assert any(link.endswith(str(copy)) for link in pages[page_of(path)].links), path.name
+        for drawing in re.findall(r"\]\((figures/[^)]+)\)", (site / copy).read_text(encoding="utf-8")):
+            assert (site / copy.parent / drawing).is_file(), f"{path.name}: {drawing}"
 
 
 def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monkeypatch):
@@ -180,7 +158,6 @@ def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monk
     links = course.run_links("notebooks/00_quickstart", address)
     branch = f"https://colab.research.google.com/github/someone/zsp/blob/{course.BRANCH}"
     assert f'href="{branch}/run/notebooks/00_quickstart.ipynb"' in links
-    assert 'href="https://codespaces.new/someone/zsp"' in links
     stored = nbformat.read(NOTEBOOKS[0], 4)
     first, *others = course.runnable(stored, address).cells
     assert others == stored.cells

@@ -154,7 +154,7 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
 
 def test_variants_keep_the_parts_and_change_the_proportions():
     """Vertex i of a variant is the same point of the same part, so that correspondences are known."""
-    for seed in range(30):
+    for seed in range(10):
         first = make_shape(rendering.build_random_object, seed)
         other = make_shape(rendering.build_random_object, seed, variation=np.random.default_rng(1))
         np.testing.assert_array_equal(first.faces, other.faces)
@@ -292,24 +292,6 @@ def test_centre_and_teacher_are_running_averages(pictures, backbone):
     for slow, fast, after in triples:
         torch.testing.assert_close(after, momentum * slow + (1 - momentum) * fast.detach())
     assert any(not torch.equal(a, b) for a, b in zip(before.parameters(), run.teacher.parameters(), strict=True))
-
-
-def test_it_collapses_without_centring_and_without_sharpening(pictures, backbone, monkeypatch):
-    """DINO, section 5.3: without centring one output for all images, without sharpening a uniform distribution."""
-    monkeypatch.setattr(distillation, "HIDDEN", 64)
-    monkeypatch.setattr(distillation, "TEACHER_MOMENTUM", (0.97, 1.0))
-    last = {}
-    settings = {"both": {}, "no centring": dict(centring=False), "no sharpening": dict(sharpening=False)}
-    for name, changes in settings.items():
-        run = Distillation(replace(TINY, **changes), backbone, pictures)
-        rows = [run.step() for _ in range(TINY.steps)]
-        last[name] = {key: np.mean([row[key] for row in rows[-8:]]) for key in rows[0]}
-    top = math.log(TINY.outputs)
-    assert last["no centring"]["teacher_entropy"] < 0.15 * top
-    assert last["no sharpening"]["teacher_entropy"] > 0.97 * top
-    assert 0.3 * top < last["both"]["teacher_entropy"] < 0.95 * top
-    assert last["both"]["information"] > 3 * last["no centring"]["information"]
-    assert last["both"]["information"] > 3 * last["no sharpening"]["information"]
 
 
 def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures, backbone):

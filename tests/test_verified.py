@@ -138,9 +138,8 @@ def test_one_target_view_is_enough(method, views, frames):
     assert alone.view == 0 and rotation_error(alone.sim3.R, truth(alone, frames).R) < 10
 
 
-@pytest.mark.parametrize("sides", [[(-1, -0.2, -0.1)], [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]])
-def test_views_that_share_no_side_of_the_object_are_flagged(method, sides):
-    cameras = [turned(look_at(side, distance=4.5), ELSEWHERE.R) for side in sides]
+def test_views_that_share_no_side_of_the_object_are_flagged(method):
+    cameras = [turned(look_at(side, distance=4.5), ELSEWHERE.R) for side in [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]]
     frames = [render(look_at((1, 0.2, 0.1)), AT_HOME, "reference")]
     frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])

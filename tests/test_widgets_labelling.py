@@ -176,30 +176,19 @@ def test_errors_are_one_line_in_the_widget(labelling):
     assert message(box) == "Not done: the reference has 3 keypoints, expected 4 first"
     box.controls["sequence"].value = "best"
     click(box, "reference", corners(labelling, "best")[3])
-    box.buttons["next"].click()
-    click(box, "sequence", corners(labelling, "a")[0])
-    click(box, "sequence", corners(labelling, "a")[0])
-    assert message(box) == "Not done: keypoint 1, keypoint 1, is at this point already"
     labelling.put("a", np.outer(np.arange(4), (1, 2, 3)))
+    box.buttons["next"].click()
     box.controls["overlay"].value = True
     assert "collinear" in message(box) and not box.controls["overlay"].value
-    assert table(box, "progress")[1][4] == "see above"
     box.buttons["accept"].click()
     assert "collinear" in message(box) and read_labels(labelling.root, "chair") == {}
-    box.controls["sequence"].value = "best"
-    click(box, "reference", corners(labelling, "best")[4])
-    assert "in use on a; clear those first" in message(box) and len(labelling.names) == 4
 
 
-@pytest.mark.parametrize("content", ["broken", "one point"])
-def test_a_cloud_that_cannot_be_shown_is_an_error_and_others_still_work(root, content):
+def test_a_cloud_that_cannot_be_shown_is_an_error_and_others_still_work(root):
     labelling = Labelling(root, "chair")
     box = label_poses(labelling)
     click_all(box, labelling, "reference", "best", 4)
-    if content == "broken":
-        (labelling.dataset.root / labelling.dataset.sequences("chair")[1].point_cloud.path).write_bytes(b"ply\n")
-    else:
-        labelling._clouds["a"] = np.ones((9, 3)), np.zeros((9, 3), np.uint8)
+    (labelling.dataset.root / labelling.dataset.sequences("chair")[1].point_cloud.path).write_bytes(b"ply\n")
     box.buttons["next"].click()
     assert message(box).startswith("Not done: ") and box.controls["sequence"].value == "a"
     assert box.views["sequence"].widget.points == b""

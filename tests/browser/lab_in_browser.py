@@ -34,21 +34,16 @@ def chromium(playwright) -> str | None:
     return found or (own if Path(own).exists() else None)
 
 
-def without_chromium() -> None:
-    """Skip the test, or let it fail on a machine for continuous integration, where it must not pass unseen."""
-    refuse = pytest.fail if os.environ.get("CI") else pytest.skip
-    refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
-
-
 @contextmanager
 def running_chromium():
-    """Chromium, as a browser of Playwright; without one see `without_chromium`."""
+    """Chromium, as a browser of Playwright. Without one the tests are skipped, but fail in continuous integration."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         program = chromium(playwright)
         if program is None:
-            without_chromium()
+            refuse = pytest.fail if os.environ.get("CI") else pytest.skip
+            refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
         options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
         options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
         running = playwright.chromium.launch(executable_path=program, args=options)

@@ -15,12 +15,10 @@ from lab_in_browser import (
     open_notebook,
     photograph,
     run_all,
-    running_chromium,
     saved,
     serve,
     slider_moves_picture,
     slider_outputs,
-    without_chromium,
 )
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
@@ -31,12 +29,6 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with running_chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +44,6 @@ def lab(browser, tmp_path_factory):
                 cell.outputs, cell.execution_count = [], None
         nbformat.write(notebook, path)
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
-    broken = new_notebook(cells=[new_code_cell("1 / 0"), new_code_cell("2")], metadata=python)
-    nbformat.write(broken, folder / "notebooks" / "broken.ipynb")
     check = new_code_cell('from zsp_lite.widgets import self_check\nself_check("00", 1)')
     asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
     nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
@@ -68,22 +58,6 @@ def page(browser, lab):
     yield context.new_page()
     context.close()
     lab.stop_kernels()
-
-
-@pytest.mark.parametrize(("ci", "outcome"), [("true", pytest.fail.Exception), ("", pytest.skip.Exception)])
-def test_without_chromium_tests_fail_in_continuous_integration_and_are_skipped_elsewhere(monkeypatch, ci, outcome):
-    monkeypatch.setenv("CI", ci)
-    with pytest.raises(outcome, match="no Chromium here"):
-        without_chromium()
-
-
-def test_errors_of_a_broken_notebook_are_found(page, lab):
-    open_notebook(page, lab, "broken.ipynb")
-    run_all(page, patience=300)
-    assert errors(page, saved(page, lab, "broken.ipynb")) == [
-        "cell 0: ZeroDivisionError: division by zero",
-        "cell 1 did not run",
-    ]
 
 
 def test_a_self_check_gives_feedback_without_a_network(page, lab):
