@@ -82,7 +82,7 @@ def same(one, other):
 
 
 def keep_hand_ins(notebooks, **_):
-    """Copy each hand-in that was graded, so that a later one can be compared with it."""
+    """Copy each hand-in that was graded, to compare a later one with it."""
     for path in map(Path, notebooks):
         *_, student, name = path.parent.parts
         shutil.copy(path, HERE / "autograded" / student / name / COPY)
