@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from datetime import datetime
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -13,6 +14,8 @@ import nbformat
 import numpy as np
 import pytest
 from nbgrader.api import Gradebook
+from nbgrader.apps import ZipCollectApp
+from nbgrader.coursedir import CourseDirectory
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from traitlets.config import PyFileConfigLoader
 
@@ -371,7 +374,7 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     assert points == {f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)}
     run("export")
     grades = [line.split(",") for line in (folder / "grades.csv").read_text().splitlines()]
-    assert grades[1:] == [[name, "123", "5.5", "20", "graded"], [name, "124", "", "20", "not graded"]]
+    assert grades[1:] == [[name, "123", "5.5", "20", "graded"], [name, "124", "", "20", "not graded: damaged file"]]
     filled = (downloads / "worksheet_filled.csv").read_text().splitlines()
     assert filled[1:] == ["Participant 123,5.5", "Participant 124,", "Participant 125,", "Participant 126,"]
 
@@ -384,6 +387,30 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     assert "<math" in page and "<code>\\broken{</code>" in page
     assert "<script" not in page and not re.search(r"""(src|href)=["'](?!#|data:)|url\(["']?http""", page)
     assert run("git", "ls-files", "--others", "--exclude-standard", str(tmp_path)).stdout == ""
+
+
+def test_a_second_collection_renews_only_files_that_changed(config, tmp_path, monkeypatch):
+    """`nbgrader autograde` grades again what has a newer time, and then asks for new points by hand."""
+    plugin = config.ZipCollectApp.collector_plugin
+    monkeypatch.setitem(plugin.collect.__globals__, "HERE", tmp_path)
+    app = ZipCollectApp(config=config)
+    app.coursedir = CourseDirectory(root=str(tmp_path), assignment_id="05_metrics")
+    kept, extracted = datetime(2026, 1, 2), tmp_path / "extracted"
+    for student in ("123", "124", "125"):
+        submitted, downloaded = (
+            tmp_path / "submitted" / student / "05_metrics",
+            extracted / f"A_{student}_12_05_metrics",
+        )
+        submitted.mkdir(parents=True), downloaded.parent.mkdir(exist_ok=True)
+        (submitted / "05_metrics.ipynb").write_text("answers")
+        (submitted / "timestamp.txt").write_text(f"{kept}")
+        downloaded.with_suffix(".ipynb").write_text("answers" if student != "124" else "other answers")
+    (tmp_path / "submitted" / "125" / "05_metrics" / "timestamp.txt").unlink()  # copied by hand
+    collector = plugin(parent=app)
+    times = [collector.collect(str(file))["timestamp"] for file in sorted(extracted.iterdir())]
+    assert [time == kept for time in times] == [True, False, False] and min(times) == kept
+    with pytest.raises(SystemExit):  # a second file of the same student
+        collector.collect(str(extracted / "A_123_12_05_metrics (1).ipynb"))
 
 
 def test_nbgrader_recognises_the_files_of_learning_platforms(config):

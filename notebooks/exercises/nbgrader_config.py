@@ -185,11 +185,11 @@ class Marks(ExportPlugin):
         handed_in = self.root / "submitted" / student / assignment.name
         graded = self.root / "autograded" / student / assignment.name
         if not (handed_in / name).is_file():
-            return "", f"not graded, no file {name}"
+            return "", f"not graded: no file {name}"
         try:
             nbformat.read(handed_in / name, as_version=4)
         except Exception:  # whatever a damaged file raises
-            return "", "not graded, damaged file"
+            return "", "not graded: damaged file"
         if not (graded / name).is_file():
             return "", "not graded"
         if not same(handed_in / name, graded / COPY):
