@@ -2,15 +2,20 @@
 
 import csv
 import re
+import shutil
+import zipfile
+from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
+import nbformat
 from jinja2 import pass_context
 from latex2mathml.converter import convert
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from nbgrader.api import MissingEntry
-from nbgrader.plugins import ExportPlugin
+from nbgrader.plugins import ExportPlugin, FileNameCollectorPlugin
+from traitlets import Dict
 
 c = get_config()  # noqa: F821, nbgrader defines it
 HERE = Path(__file__).parent
@@ -33,8 +38,64 @@ HANDED_IN = (
     rf"(?P<file_id>{EXERCISES})[^/]*\.ipynb$"
 )
 c.FileNameCollectorPlugin.named_regexp = HANDED_IN
-# A second download replaces the first.
+# A second collection replaces the files of the first.
 c.ZipCollectApp.force = c.ExtractorPlugin.force = True
+
+
+class Collector(FileNameCollectorPlugin):
+    """Files whose names match HANDED_IN, one for each student.
+
+    `nbgrader autograde` grades what is newer than what it has graded. So a file keeps
+    the time of its first collection, until the student hands in another one.
+    """
+
+    found = Dict()  # file by student and exercise
+
+    def collect(self, submitted_file):
+        info = super().collect(submitted_file)
+        if info:
+            student, name = info["student_id"], info["file_id"]
+            other = self.found.setdefault((student, name), submitted_file)
+            if other != submitted_file:
+                self.parent.fail(
+                    f"Nothing was collected. {student} has two files, {other} and"
+                    f" {submitted_file}: remove one in archive/, or the older zip file."
+                )
+            folder = HERE / "submitted" / student / self.parent.coursedir.assignment_id
+            time = self.parent.coursedir.get_existing_timestamp(str(folder))
+            if not time or not same(folder / f"{name}.ipynb", Path(submitted_file)):
+                time = datetime.now(UTC).replace(tzinfo=None)
+            info["timestamp"] = time
+        return info
+
+
+c.ZipCollectApp.collector_plugin = Collector
+
+# A copy of the hand-in, beside what `nbgrader autograde` made of it.
+COPY = "handed_in.copy"
+c.CourseDirectory.ignore = [".ipynb_checkpoints", "*.pyc", "__pycache__", COPY]
+
+
+def same(one, other):
+    """Whether two files exist and have the same contents."""
+    return one.is_file() and other.is_file() and one.read_bytes() == other.read_bytes()
+
+
+def keep_hand_ins(notebooks, **_):
+    """Copy each hand-in that was graded, to compare a later one with it."""
+    for path in map(Path, notebooks):
+        *_, student, name = path.parent.parts
+        shutil.copy(path, HERE / "autograded" / student / name / COPY)
+
+
+c.Autograde.post_convert_hook = keep_hand_ins
+
+# A cell that a student deleted is put back: its test fails, its answer is empty.
+c.OverwriteCells.add_missing_cells = True
+
+# JupyterLab, started with this file: no offer to build it, no question about news.
+c.ServerApp.tornado_settings = {"page_config_data": {"buildCheck": False}}
+c.LabApp.news_url = None
 
 # Seconds for one cell. The first import of torch takes most of them on a slow machine.
 c.Execute.timeout = 120
@@ -111,21 +172,28 @@ class Marks(ExportPlugin):
                 for student, (score, state) in found.items()
             ]
             self.list_open(assignment.name, found)
-            self.fill_worksheet(assignment.name, found)
+            if (self.root / "downloaded" / assignment.name).is_dir():
+                self.fill_worksheet(assignment.name, found)
+                self.pack_feedback(assignment.name, found)
         with open(self.to or self.root / "grades.csv", "w", newline="") as file:
             names = ["assignment", "student_id", "score", "max_score", "state"]
             csv.writer(file).writerows([names, *rows])
 
     def score(self, gradebook, assignment, student):
         """The score as text, empty if there is none, and the state of a hand-in."""
+        name = f"{assignment.name}.ipynb"
         handed_in = self.root / "submitted" / student / assignment.name
         graded = self.root / "autograded" / student / assignment.name
-        for notebook in assignment.notebooks:
-            ends = [one / f"{notebook.name}.ipynb" for one in (handed_in, graded)]
-            if not all(one.is_file() for one in ends):
-                return "", "not graded"
-            if ends[0].stat().st_mtime > ends[1].stat().st_mtime:
-                return "", "handed in again, not graded"
+        if not (handed_in / name).is_file():
+            return "", f"not graded: no file {name}"
+        try:
+            nbformat.read(handed_in / name, as_version=4)
+        except Exception:  # whatever a damaged file raises
+            return "", "not graded: damaged file"
+        if not (graded / name).is_file():
+            return "", "not graded"
+        if not same(handed_in / name, graded / COPY):
+            return "", "handed in again, not graded"
         try:
             submission = gradebook.find_submission(assignment.name, student)
         except MissingEntry:
@@ -138,9 +206,11 @@ class Marks(ExportPlugin):
         for student, (_, state) in found.items():
             if state != "graded":
                 self.log.warning("%s of %s: %s", name, student, state)
-        for file in sorted((self.root / "downloaded" / name / "extracted").rglob("*")):
+        extracted = self.root / "downloaded" / name / "extracted"
+        for file in sorted(extracted.rglob("*")):
             if file.is_file() and not re.match(HANDED_IN, file.as_posix()):
-                self.log.warning("%s: %s was not collected", name, file.name)
+                path = file.relative_to(extracted)
+                self.log.warning("%s: %s was not collected", name, path)
 
     def fill_worksheet(self, name, found):
         """Fill in downloaded/EXERCISE/worksheet.csv; its lines are "Participant N"."""
@@ -151,11 +221,22 @@ class Marks(ExportPlugin):
             head, *lines = csv.reader(file)
         for line in lines:
             number = re.sub(r"\D", "", line[0])
-            line[head.index(GRADE)] = found.get(number, ("", ""))[0]
+            score, _ = found.get(number, ("", ""))
+            line[head.index(GRADE)] = score or line[head.index(GRADE)]
         filled = path.with_name("worksheet_filled.csv")
         with filled.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([head, *lines])
         self.log.info("%s: upload %s in Moodle", name, filled)
+
+    def pack_feedback(self, name, found):
+        """Zip the pages of feedback/; Moodle finds the student by the file's name."""
+        path = self.root / "downloaded" / name / "feedback_files.zip"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for student, (_, state) in found.items():
+                page = self.root / "feedback" / student / name / f"{name}.html"
+                if state == "graded" and page.is_file():
+                    moodle = f"Participant_{student}_assignfeedback_file_{name}.html"
+                    archive.write(page, moodle)
 
 
 c.ExportApp.plugin_class = Marks
