@@ -3,6 +3,7 @@
 import math
 import numbers
 import reprlib
+import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -28,6 +29,12 @@ class InputError(ValueError):
 
 class FatalError(InputError):
     """An InputError of the backbone or a row's code, which ends a benchmark run; others count the pair as failed."""
+
+
+def describe_failure(error: BaseException) -> str:
+    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:
@@ -65,7 +72,7 @@ def real_array(name: str, values: object, shape: tuple[int | None, ...] | None =
     """
     import numpy as np
 
-    found, expected = f"is {reprlib.repr(values)}", "real numbers"
+    found, expected = None, "real numbers"
     with suppress(TypeError, ValueError, RuntimeError):  # of NumPy, for instance for rows of different lengths
         array = np.asarray(values)
         if array.dtype.kind in "biuf":
@@ -74,4 +81,4 @@ def real_array(name: str, values: object, shape: tuple[int | None, ...] | None =
             found = f"has shape {array.shape}"
     if shape is not None:
         expected += f" of shape {shape}".replace("None", "n")
-    raise InputError(f"{name} {found}, expected {expected}")
+    raise InputError(f"{name} {found or f'is {reprlib.repr(values)}'}, expected {expected}")
