@@ -10,14 +10,13 @@ from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
-from torch import get_num_threads
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneConfig, load_backbone
+from zsp_lite.backbones.load import BackboneConfig, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
@@ -42,6 +41,7 @@ logger = logging.getLogger(__name__)
 class _Line(msgspec.Struct):
     """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
 
+    results: ClassVar[tuple[str]] = ("alignment",)  # the rows of a line, as in `ResultLine`
     pair: str
     centre: list[float] = []
     matrices: list[list[list[float]]] = []
@@ -52,8 +52,7 @@ class PairSolver:
     """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
 
     def __init__(self, root: str, category: str, backbone: FeatureExtractor | str | BackboneConfig, threads: int):
-        loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
-        self._store = FrameStore(Co3D(root), category, {"backbone": loaded}, threads)
+        self._store = FrameStore(Co3D(root), category, {"backbone": as_backbone(backbone)}, threads)
 
     def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Find the hypotheses of the pairs of a chunk."""
@@ -97,7 +96,7 @@ def align_category(
             of them, or OUT holds another run.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
-    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+    loaded = as_backbone(backbone)
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
         open_workers(executor) as (pool, workers),
@@ -109,11 +108,8 @@ def align_category(
             calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
         )  # fmt: skip
         with open_run(folder, settings, allow_other_version):
-            known = {line.pair for line in read_lines(folder, _Line)}
-            todo = {pair: ["alignment"] for key, pair in chosen.items() if key not in known}
-            root, threads = str(dataset.root.resolve()), max(1, get_num_threads() // workers)
-            make = partial(PairSolver, root, category, backbone if pool else loaded, threads)
-            evaluate_pairs(folder, make, todo, len(chosen), pool, workers, _Line)
+            make = partial(PairSolver, str(dataset.root.resolve()), category, backbone if pool else loaded)
+            evaluate_pairs(folder, make, dict.fromkeys(chosen.values(), ["alignment"]), pool, workers, _Line)
         known = read_hypotheses(folder)
     found = [known[key] for key in chosen if key in known]
     if not found:
@@ -137,12 +133,9 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames, for `synchronise`."""
     found = {}
     for line in (line for line in read_lines(out, _Line) if line.matrices):
-        sim3s = []
-        for matrix in np.array(line.matrices):
-            scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-            sim3s.append(Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3]))
         names = [part.rpartition(":")[0] for part in line.pair.split("/")[1:]]
-        found[line.pair] = PairHypotheses(*names, tuple(sim3s), np.array(line.probabilities), np.array(line.centre))
+        sim3s = tuple(map(Sim3.from_matrix, np.array(line.matrices)))
+        found[line.pair] = PairHypotheses(*names, sim3s, np.array(line.probabilities), np.array(line.centre))
     return found
 
 
@@ -217,7 +210,7 @@ class _Remembering:
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
-    """Write the poses of all objects in the common frame to OUT/alignment.json."""
+    """Write the poses of all objects in the common frame, and the disagreements, to OUT/alignment.json."""
     objects = {
         name: {
             "world_to_frame": one.sim3.matrix.tolist(),
@@ -227,10 +220,10 @@ def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
         }
         for name, one in found.objects.items()
     }
+    path = Path(out) / "alignment.json"
     pairs = [{"pair": pair, "degrees": round(angle, 2)} for pair, angle in found.disagreements.items()]
-    text = json.dumps({"objects": objects, "disagreements": pairs}, indent=1)
-    write_atomic(Path(out) / "alignment.json", text.encode())
-    return Path(out) / "alignment.json"
+    write_atomic(path, json.dumps({"objects": objects, "disagreements": pairs}, indent=1).encode())
+    return path
 
 
 def write_labels(
@@ -241,8 +234,7 @@ def write_labels(
     The first object is the reference. Without `replace`, InputError if one exists with other content.
     """
     reference, folder = next(iter(found.objects)), Path(root) / kind / category
-    centre, labels = found.objects[reference].centre, {}
-    for name in found.objects:
-        labels[name] = rigid_label(found.between(reference, name), centre, name, reference)
+    centre = found.objects[reference].centre
+    labels = {name: rigid_label(found.between(reference, name), centre, name, reference) for name in found.objects}
     write_all({folder / f"{name}.json": label_bytes(label) for name, label in labels.items()}, replace)
     return folder

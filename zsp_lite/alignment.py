@@ -49,6 +49,12 @@ class Sim3:
         """Return the identity transform."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
+    @classmethod
+    def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Sim3":
+        """Return the transform with this `matrix`."""
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """Homogeneous matrix for column vectors; its upper left block is `scale * R`."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import DEFAULT, BackboneConfig, load_backbone
+from zsp_lite.backbones.load import DEFAULT, BackboneConfig, as_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
@@ -120,7 +120,7 @@ def estimate_pose(
     """Estimate the pose between two objects of one category, each named by a path; no label is needed.
 
     `open_source` explains the paths, and takes the settings that only one of the two has, such as a box around the
-    object. Implausible lengths, doubtful masks, and target views that show one side of the object, are flags.
+    object. Flags name implausible lengths, doubtful masks, target views of one side only, and two categories.
 
     Args:
         reference: The reference object.
@@ -145,7 +145,7 @@ def estimate_pose(
         position, frame = first.reference(reference_frame)
         positions = second.spread(targets)
         frames = second.load(positions)
-        model = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+        model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
         method = ZeroShotPose(model, foreground=foreground, upright=upright)
         clouds = world_cloud([frame])[0], world_cloud(frames)[0]
@@ -154,6 +154,9 @@ def estimate_pose(
         scales = [1.0 if done else 1 / (axis_deviation(cloud) or 1) for done, cloud in zip(unscaled, clouds)]
         scaled = [scale_frame(one, scales[1]) for one in frames]
         flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
+        kinds = sorted({one.path.resolve().parent.name for one in sources if one.format == "sequence"})
+        if len(kinds) > 1:
+            flags = f"the objects are of different categories: {', '.join(kinds)}", *flags
         solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
         estimates = {name: _in_units(one, *scales, flags) for name, one in solved.items()}
         result = PairResult(

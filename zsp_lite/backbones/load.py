@@ -15,6 +15,7 @@ from zsp_lite.backbones.checkpoints import build_vit, metadata_integers, read_ch
 from zsp_lite.backbones.huggingface import PREFIX, load_huggingface, model_folder
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_choice
+from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
@@ -110,6 +111,11 @@ def load_backbone(
     if parts:
         backbone.name = f"{backbone.name} ({', '.join(parts)})"
     return backbone
+
+
+def as_backbone(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
+    """Return a backbone as it is, and load one that is given by name or by its config."""
+    return load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
 
 
 def available_backbones() -> dict[str, Path | None]:

@@ -33,8 +33,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
     determinant = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
     if not determinant > 1e-12:
         raise InputError("icp: the result is not a similarity, because the scale converged to 0")
-    scale = float(np.cbrt(determinant))
-    return Sim3(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    return Sim3.from_matrix(matrix)
 
 
 def align(reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int) -> Sim3:

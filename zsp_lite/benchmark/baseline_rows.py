@@ -1,7 +1,6 @@
-"""The paper's baselines (sec. 5.2 and supplement), and a solver of whole categories, as rows of the benchmark."""
+"""The paper's baselines (sec. 5.2 and supplement), and the alignment of a category, as rows of the benchmark."""
 
 from contextlib import suppress
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -55,22 +54,23 @@ def posecontrast(problem: Problem) -> Answer:
 
 
 def category(problem: Problem) -> Answer:
-    """Run "category": the pose from the alignment of all objects of the category, which needs no label of any."""
+    """Run "category": the pose by the alignment of all objects of the category, which needs no label of any."""
     own = hypotheses(problem)
     alignment = synchronise([*_of_all_objects(problem.store, len(problem.pair.target_frames)), own])
-    first, second = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
-    sim3 = second @ alignment.between(own.reference, own.target) @ first.inverse()
+    reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
+    sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
 
 
-@lru_cache(1)  # for all pairs of a category
 def _of_all_objects(store: FrameStore, views: int) -> list[PairHypotheses]:
-    """Find the hypotheses between all objects of a category."""
-    found = []
-    for pair in object_pairs(store.dataset, store.category, None, None, views):
-        with suppress(InputError):  # the views determine no pose
-            found.append(hypotheses(Problem(pair, store)))
-    return found
+    """Find the hypotheses between all objects of a category, once for all pairs of so many views."""
+    if ("category", views) not in store.kept:
+        found = []
+        for pair in object_pairs(store.dataset, store.category, None, None, views):
+            with suppress(InputError):  # the views determine no pose
+                found.append(hypotheses(Problem(pair, store)))
+        store.kept["category", views] = found
+    return store.kept["category", views]
 
 
 def hypotheses(problem: Problem) -> PairHypotheses:

@@ -22,9 +22,8 @@ from zsp_lite.errors import InputError, check_integer
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
-_MOST_WORKERS = 4096
-_UNKNOWN_WORKERS = 256  # of an executor that does not tell
 _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
+_UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
@@ -40,7 +39,7 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 def evaluate_chunks(
     make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that the method `lines` of what `make` makes, such as an `evaluation.Evaluator`, finds."""
+    """Yield the lines that the method `lines` of what `make` makes, such as a `run.Evaluator`, finds."""
     if executor is None:
         evaluator = make()
         with one_thread():
@@ -103,7 +102,7 @@ def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor 
             # A chunk depends on files: equal arguments need not give equal results.
             yield client.get_executor(pure=False), sum(client.nthreads().values())
         return
-    check_integer("workers", executor, 1, _MOST_WORKERS)
+    check_integer("workers", executor, 1, 4096)
     if executor == 1:
         yield None, 1
         return

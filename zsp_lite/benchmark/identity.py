@@ -1,8 +1,7 @@
-"""What a run remembers of its library, machine, rows, extractors and labels: names, versions and hashes."""
+"""What a run remembers of its library, machine, rows and extractors: names, versions and hashes."""
 
 import dataclasses
 import functools
-import hashlib
 import platform
 import subprocess
 import sys
@@ -18,21 +17,9 @@ import torch
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.io.files import digest
 
 _PACKAGE = Path(__file__).parents[1]
-
-
-def digest(*parts: str | bytes | np.ndarray | torch.Tensor) -> str:
-    """Return a hash of texts and arrays, 16 hexadecimal digits that are the same on every machine."""
-    found = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, torch.Tensor):
-            part = part.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
-        elif isinstance(part, np.ndarray):
-            found.update(f"{part.dtype}{part.shape}".encode())
-            part = np.ascontiguousarray(part)
-        found.update(part.encode() if isinstance(part, str) else part)
-    return found.hexdigest()[:16]
 
 
 def described(value: Any) -> str:
@@ -49,16 +36,15 @@ def described(value: Any) -> str:
 
 def fingerprint(extractor: Any) -> str:
     """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict` and settings."""
-    if extractor is None:
-        return "None"
     name, settings = getattr(extractor, "name", None) or described(extractor), ""
     state_dict = getattr(extractor, "state_dict", None)
     if isinstance(extractor, Backbone):
         state_dict, image = extractor.model.state_dict, (extractor.image_size, extractor.mean, extractor.std)
         settings = repr((extractor.layer, extractor.facet, extractor.saliency_heads, *image))
-    weights = state_dict() if callable(state_dict) else {}
-    parts = (part for key, weight in sorted(weights.items()) for part in (key, weight))
-    return f"{name} {digest(settings, *parts)}" if weights else name
+    parts: list[str | bytes] = []
+    for key, weight in sorted(state_dict().items()) if callable(state_dict) else ():
+        parts += [key, weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()]
+    return f"{name} {digest(settings, *parts)}" if parts else name
 
 
 @functools.cache

@@ -12,7 +12,8 @@ from zsp_lite.baselines.networks import PoseContrast, Swav
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
-from zsp_lite.benchmark.own import Estimator, KeypointMatcher, import_object, kind_of, read_poses
+from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, import_object, kind_of
+from zsp_lite.data.exchange import read_poses
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureExtractor
 
@@ -77,7 +78,7 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
-    # Sees all other objects of the category, too, without labels.
+    # Sees the other objects of the category, too, without labels: a table of its own.
     "category": Method(solve=baseline_rows.category),
 }
 
@@ -88,8 +89,8 @@ def read_paper_tables() -> list[dict[str, Any]]:
     return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 
 
-# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. The checkpoints of
-# the rows that are in no group have to be downloaded.
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. In no group are
+# "category", and the rows whose checkpoints have to be downloaded.
 GROUPS: dict[str, list[str]] = {
     "default": ["ours", "ours-bv", "rootsift"],
     **{
@@ -131,7 +132,7 @@ def _method(name: str, meant: Any) -> Method:
         if row in METHODS:
             return replace(METHODS[row], targets=int(views)) if views else METHODS[row]
         if meant.endswith(".csv"):
-            return Method("none", solve=read_poses(meant))
+            return Method("none", solve=StoredPoses(meant, *read_poses(meant)))
         if ":" not in meant:
             raise InputError(
                 f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, NAME=module:thing and "
@@ -143,7 +144,8 @@ def _method(name: str, meant: Any) -> Method:
     kind = kind_of(name, meant)
     if kind == "matcher":
         return Method(settings={"matcher": meant})
-    return Method(solve={"estimator": Estimator, "keypoints": KeypointMatcher, "problem": lambda own: own}[kind](meant))
+    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
+    return Method(solve=wrap(meant) if wrap else meant)
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:

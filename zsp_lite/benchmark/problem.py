@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -78,15 +78,18 @@ def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
 class FrameStore:
     """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage.
 
-    `frame`, `describe` and `view` compute once what they return, and keep it while it is among the last used.
+    `frame`, `describe` and `view` compute once what they return, and keep it while it is among the last used; `kept` is
+    what a row keeps for all pairs. `threads` are those of feature extraction, None leaves them as they are.
     """
 
     def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
-        """Make an empty store; `threads` are those of feature extraction, None leaves them as they are."""
         self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
         self.timings: dict[str, list[float]] = {}
-        self.frame, self.extent = lru_cache(CAPACITY)(self._frame), cache(self._extent)
-        self.describe, self.view = (lru_cache(CAPACITY * len(extractors))(one) for one in (self._describe, self._view))
+        self.kept: dict[Any, Any] = {}
+        self.frame = lru_cache(CAPACITY)(self._frame)
+        self.describe = lru_cache(CAPACITY * len(extractors))(self._describe)
+        self.view = lru_cache(CAPACITY * len(extractors))(self._view)
+        self.extent = cache(partial(dataset.extent, category))
 
     def _frame(self, key: FrameKey) -> Frame:
         """Return a frame's object crop, resized to the backbone's input."""
@@ -105,18 +108,6 @@ class FrameStore:
     def _view(self, features: str, key: FrameKey, foreground: str) -> View:
         """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
         return frame_view(self.frame(key), self.describe(features, key), foreground)
-
-    def _extent(self, sequence: str) -> tuple[Float[np.ndarray, "3"], float] | None:
-        """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
-
-        They are those of the box of the cloud's points, without the outermost 2 % on each side.
-        """
-        try:
-            points, _ = self.dataset.point_cloud(self.category, sequence)
-        except InputError:
-            return None
-        low, high = np.quantile(points, (0.02, 0.98), axis=0)
-        return (low + high) / 2, float(np.linalg.norm(high - low))
 
     def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function, and add the time that it takes to the `timings` of a stage."""
@@ -159,9 +150,9 @@ class Problem:
             raise InputError(f"no depth map: {', '.join(missing)}")
         return frames
 
-    def views(self, features: str = "backbone", foreground: str = "saliency") -> list[View]:
-        """Return the crops with their features and foregrounds (see `views.frame_view`)."""
-        return [self.store.view(features, key, foreground) for key in self.keys]
+    def views(self) -> list[View]:
+        """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
+        return [self.store.view("backbone", key, "saliency") for key in self.keys]
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None

@@ -2,34 +2,40 @@
 
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from torch import get_num_threads
 from tqdm import tqdm
 
-from zsp_lite.backbones.load import BackboneConfig, load_backbone
+from zsp_lite.backbones.load import BackboneConfig, as_backbone
+from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
-from zsp_lite.benchmark.evaluation import Evaluator
-from zsp_lite.benchmark.figures import write_figures
-from zsp_lite.benchmark.identity import digest, environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, Method, description, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.identity import environment, fingerprint, library_version
+from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
 from zsp_lite.benchmark.own import StoredPoses
+from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
-from zsp_lite.benchmark.tables import every_table, write_tables
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
-from zsp_lite.errors import InputError, check_choice, check_integer
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
+from zsp_lite.data.pairs import category_pairs, labelled_categories, shipped_pairs
+from zsp_lite.errors import FatalError, InputError, check_integer, describe_failure
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.io.files import write_atomic
-from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.io.files import digest, write_atomic
+from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose, view_alignment
+from zsp_lite.synthetic.ground_truth import common_turns
 
+Poses = Float[np.ndarray, "n 4 4"]
 logger = logging.getLogger(__name__)
 
 
@@ -68,7 +74,7 @@ def evaluate(
     rows, dataset = resolve(methods), Co3D(data)
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
-    loaded = load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+    loaded = as_backbone(backbone)
     extractors = make_extractors(loaded, rows)
     for row in rows.values():
         if row.solve is None:
@@ -88,12 +94,8 @@ def evaluate(
             calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
         )  # fmt: skip
         with open_run(out, settings, allow_other_version):
-            sent, threads = backbone if pool else loaded, max(1, get_num_threads() // workers)
-            make = partial(Evaluator, str(Path(data).resolve()), rows, sent, threads)
-            known = {(row, line.pair) for line in read_lines(out) for row in line.results}
-            new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
-            todo = {pair: names for pair, names in new.items() if names}
-            evaluate_pairs(out, make, todo, len(work), pool, workers)
+            make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
+            evaluate_pairs(out, make, work, pool, workers)
     return _write_summary(read_run(out), out)
 
 
@@ -102,8 +104,10 @@ def write_reports(run: str | Path, out: str | Path | None = None, metrics: Seque
 
     `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
     """
+    from zsp_lite.benchmark.tables import every_table, write_figures, write_tables  # workers need no matplotlib
+
     found, out = read_run(run), Path(out or run)
-    for name in ("with_others", *(spec["name"] for spec in read_paper_tables())):
+    for name in ("all_rows", "with_others", *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
     write_tables(every_table(found.summary, metrics), out / "tables")
@@ -117,15 +121,22 @@ def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
 
 
 def evaluate_pairs(
-    out: str | Path, make: Callable[[], Any], todo: Mapping[Pair, list[str]], total: int, pool: Any, workers: int,
+    out: str | Path, make: Callable[[int], Any], work: Mapping[Pair, list[str]], pool: Any, workers: int,
     kind: type = ResultLine,
 ) -> None:  # fmt: skip
-    """Evaluate pairs, and add what is found, lines of a `kind`, to a run at once; a progress bar counts to `total`."""
+    """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it at once.
+
+    `make` makes what evaluates chunks, such as an `Evaluator`, from a number of threads.
+    """
+    known = {(row, line.pair) for line in read_lines(out, kind) for row in line.results}
+    new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
+    todo = {pair: names for pair, names in new.items() if names}
     chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
-    # Hidden outside a terminal, and where the user wants to hear warnings only.
-    hidden = None if logger.isEnabledFor(logging.INFO) else True
+    make = partial(make, max(1, get_num_threads() // workers))
+    quiet = not logger.isEnabledFor(logging.INFO)
+    look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
     with (
-        tqdm(total=total, initial=total - len(todo), unit="pair", delay=1, disable=hidden) as bar,
+        tqdm(total=len(work), initial=len(work) - len(todo), **look) as bar,
         closing(execution.evaluate_chunks(make, chunks, pool)) as found,
     ):
         for lines in found:
@@ -138,7 +149,6 @@ def pairs_of_rows(
 ) -> dict[Pair, list[str]]:
     """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as many target views."""
     for category, number in numbers.items():
-        check_choice("category", category, dataset.categories())
         check_integer(f"pairs of {category}", number, 1)
     work: dict[Pair, list[str]] = {}
     for n_targets in {row.targets or targets for row in rows.values()}:
@@ -148,13 +158,99 @@ def pairs_of_rows(
     return work
 
 
-def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:
-    """Return n pairs: the first of the folder's own evaluation set if it has so many, else sampled ones."""
-    shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
-    return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
-
-
 def _labels(dataset: Co3D, category: str) -> str:
     """Hash of the pose labels of a category."""
     labels = read_labels(dataset.root, category).items()
-    return digest(*(part for name, label in labels for part in (name, label.trans, label.reference_seq)))
+    return digest(*(part for name, label in labels for part in (name, label.trans.tobytes(), label.reference_seq)))
+
+
+class Evaluator:
+    """Evaluates chunks in one process; frames, and features by some `threads`, are kept from chunk to chunk."""
+
+    def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int):
+        self._dataset, self._methods, self._threads = Co3D(root), methods, threads
+        self._extractors, self._store = make_extractors(as_backbone(backbone), methods), None
+
+    def lines(self, chunk: Sequence[tuple[Pair, list[str]]]) -> Iterator[dict[str, Any]]:
+        """Evaluate the pairs of a chunk, all of one category (see `evaluate_pair`)."""
+        category = chunk[0][0].category
+        if self._store is None or self._store.category != category:
+            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
+            self._labels = read_labels(self._dataset.root, category)
+        for pair, names in chunk:
+            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
+
+
+def evaluate_pair(
+    pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
+) -> dict[str, Any]:
+    """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
+    store.timings.clear()
+    problem = Problem(pair, store)
+    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
+    reference, *targets = problem.frames()
+    # Ground truth from the reference's camera to each target's.
+    truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
+    results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
+    timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
+    return {"pair": pair.key, "results": results, "timings": timings}
+
+
+def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dict[str, Any]:
+    start = time.perf_counter()
+    try:
+        answer = as_answer(method.solve(problem)) if method.solve else _answer(method, problem, truths)
+        if not 0 <= answer.view < len(truths):
+            raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
+    except FatalError:
+        raise
+    except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
+        return {"error": 180.0, "failed": str(error)}
+    except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
+        if replace(method, targets=None) in METHODS.values():
+            raise
+        raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
+    result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
+
+
+def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """Measure an answer: "error" in degrees, and what is known of the others.
+
+    "symmetric_error" is up to turns after which both objects look the same, "translation" the error of the object's
+    centre in diameters of the target, "scale" estimated over labelled, which is 1.
+    """
+    known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known["error"] = rotation_error(answer.rotation, truth[:3, :3])
+    reference, *targets = (frame.camera for frame in problem.frames())
+    names = problem.pair.reference_sequence, problem.pair.target_sequence
+    if (turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)) is not None:
+        to_camera = targets[answer.view].R
+        turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
+        known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
+    ends = [problem.store.extent(name) for name in names]
+    if answer.translation is not None and None not in ends:
+        (first, _), (_, diameter) = ends
+        centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
+        found = scale * answer.rotation @ centre + answer.translation
+        known["translation"] = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in known.items()}
+    return {name: value for name, value in plain.items() if value is not None}
+
+
+def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
+    """Answer of a row that is the paper's method with other settings."""
+    if method.answer == "true view":
+        nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
+        return replace(as_answer(problem.estimate(method.features, method.settings, nearest)), view=nearest)
+    estimate = problem.estimate(method.features, method.settings)
+    answer = as_answer(estimate)
+    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
+    if method.answer == "best view":
+        sim3 = view_alignment(reference, target)
+        return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
+    if method.answer == "essential matrix":
+        frames, grid = (reference.frame, target.frame), reference.features.grid
+        rotation, inliers, note = essential_rotation(*frames, estimate.matches, grid)
+        return Answer(rotation, answer.view, note=note, inliers=inliers)
+    return answer

@@ -14,11 +14,10 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from zsp_lite.benchmark.statistics import draws_of, paired_difference, summarise
+from zsp_lite.benchmark.statistics import summarise
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
 from zsp_lite.io.locks import writing
-from zsp_lite.metrics import accuracy, median
 
 SETTINGS, LINES = "run.json", "run.jsonl"
 _KEY = r"^(?P<problem>(?P<reference>(?P<category>[^/]+)/[^/]+):\d+/(?P<target>[^/]+)):\d+(?:,\d+)*$"
@@ -178,13 +177,11 @@ def read_run(out: str | Path) -> Run:
     Shown are the pairs that all rows of the last call have finished, and all rows of the folder that have these pairs.
     Pairs of different numbers of target views are the same if they are the same "problem".
     """
-    if not (Path(out) / SETTINGS).is_file():
-        raise InputError(f"{out} is not the folder of a benchmark run: it has no {SETTINGS}")
     settings, lines = read_json(Path(out) / SETTINGS, Settings, "settings of a run"), read_lines(out)
     table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
-    timings = {str(stage): float(one) for stage, one in pd.DataFrame([line.timings for line in lines]).median().items()}
+    timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
     notes, rows = [], table["row"].unique()
     if not last.finished:
         notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
@@ -224,28 +221,3 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
         if wanted <= set(found[column]):
             kept.append(found)
     return pd.concat(kept, ignore_index=True)
-
-
-def compare(first: Run, second: Run, rows: Sequence[str] | None = None) -> dict[str, dict[str, Any]]:
-    """Compare rows of two runs, by default every row that both have, on the pairs that both have evaluated.
-
-    Rows are texts "A:B", for row A of the first and B of the second run, or "A". By row, the number of pairs "n",
-    "acc30" and "median" of both, and `statistics.paired_difference`. InputError if a row or a common pair is missing.
-    """
-    of_first, of_second = (run.table["row"].unique() for run in (first, second))
-    if rows is None:
-        rows = [name for name in of_first if name in of_second]
-    if not len(rows):
-        raise InputError(f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}")
-    found = {}
-    for text in rows:
-        one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        both = first.row(one).join(second.row(other)["error"].rename("other"), how="inner").sort_index()
-        if both.empty:
-            raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
-        errors = both[["error", "other"]].to_numpy().T
-        found[text] = {
-            "n": len(both), "acc30": accuracy(errors, 30).tolist(), "median": median(errors).tolist(),
-            **paired_difference(*errors, weights=draws_of(both)),
-        }  # fmt: skip
-    return found

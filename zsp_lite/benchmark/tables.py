@@ -1,4 +1,5 @@
-"""The paper's tables from the summary of a run, with intervals, and the published results in columns of their own.
+"""The paper's tables from the summary of a run, with intervals, and the published results in columns of their own;
+the comparison of two runs; and the figures of a run.
 
 Medians are means of the categories' medians, as in the paper; accuracies are over all pairs. `paper_tables.json` has
 the rows of each table, and what the paper published for CO3D (20 categories with 100 pairs each) with DINO ViT-S/8.
@@ -10,20 +11,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from zsp_lite.benchmark.methods import METHODS, read_paper_tables
+from zsp_lite.benchmark.runs import Run
+from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
+from zsp_lite.metrics import accuracy, median
+from zsp_lite.viz.plots import COLOURS, show_dots, show_panels
 
 PAPER = METRICS_SHOWN[:3]
-PUBLISHED = "published on CO3D (other data)"
+PUBLISHED = "paper, CO3D"
+_PUBLISHED_NOTE = "Figures of the paper: other data (CO3D) and another backbone (DINO ViT-S/8)."
 WITH_OTHERS = ("category",)  # rows that see other objects than the two of the pair
-_PUBLISHED_NOTE = "Published figures are the paper's, of DINO ViT-S/8 on CO3D."
 _LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
-_FEATURED = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster")  # with their Acc30 in Table 1
-_TEX = {one: f"\\{one}" for one in "%_&#${}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
-_TEX |= {"^": r"\textasciicircum{}", "°": r"$^\circ$", "−": "$-$", "<": "$<$", ">": "$>$", "|": "$|$"}
+_SYMBOLS = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_SYMBOLS |= {"°": r"$^\circ$", "−": "$-$"}
+_TEX = str.maketrans(_SYMBOLS | {one: f"\\{one}" for one in "%_&#${}"} | {one: f"${one}$" for one in "<>|"})
 
 
 @dataclass(frozen=True)
@@ -62,28 +71,24 @@ class Table:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    first = all_rows(summary, metrics), all_rows(summary, metrics, with_others=True), *paper_tables(summary)
-    return [table for table in (*first, *(by_category(summary, one) for one in PAPER)) if len(table.cells)]
+    first = all_rows(summary, metrics), all_rows(summary, metrics, with_others=True)
+    tables = *first, *paper_tables(summary), *(by_category(summary, one) for one in PAPER)
+    return [table for table in tables if table.cells.size]
 
 
 def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, with_others: bool = False) -> Table:
-    """Return every row that sees the pair only, or each `with_others`: figures, failed pairs, difference to "ours"."""
+    """Return every row that sees the pair only, or `with_others`: figures, failed pairs, difference to "ours"."""
+    what = ("with_others", "With other unlabelled objects of the category") if with_others else ("all_rows", "All rows")
     rows = {}
     for name, row in summary["methods"].items():
-        if (library_row(name) in WITH_OTHERS) != with_others:
+        if (_plain(name) in WITH_OTHERS) != with_others:
             continue
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
-        difference = p = None
-        if test := summary.get("against", {}).get(name):
-            difference = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
-            p = Cell(test["accuracy_gain_p"], decimals=3)
-        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, difference, p]
+        difference = _difference(summary.get("against", {}).get(name))
+        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    named = (
-        ("with_others", "With other unlabelled objects of the category") if with_others else ("all_rows", "All rows")
-    )
-    return _table(summary, *named, rows, titles, metrics, gain)
+    return _table(summary, *what, rows, titles, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -94,16 +99,18 @@ def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
     """A table with the run's rows, the published figures, and in Table 1, rows of one's own below the paper's."""
-    lines, featured, categories = list(spec["rows"]), [], summary["data"]["categories"]
+    lines, categories, methods = list(spec["rows"]), summary["data"]["categories"], summary["methods"]
     if spec["name"] == "table_1":
         lines += [{"label": name, "row": name, "published": []} for name in own_rows(summary)]
-        featured = [name for name in _FEATURED if name in categories]
+    # Of the single categories with a published Acc30, those of the run are shown.
+    names = [title.removesuffix(" Acc30") for title in spec["published"]]
+    kept = [k for k, (name, title) in enumerate(zip(names, spec["published"])) if name in (title, *categories)]
+    featured = [names[k] for k in kept if names[k] in categories]
     titles = [*(METRICS[metric] for metric in PAPER), *(f"{category} Acc30" for category in featured)]
-    # Of single categories, those of the run are shown.
-    kept = [k for k, title in enumerate(spec["published"]) if title.removesuffix(" Acc30") in (title, *categories)]
     rows = {}
     for line in lines:
-        row = summary["methods"].get(row_name(line["row"], summary))
+        plain = line["row"].removesuffix(f"-n{summary['data']['targets']}")  # of as many views as the run has
+        row = methods.get(line["row"], methods.get(plain))
         cells = [_cell(row, metric) for metric in PAPER]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
@@ -124,42 +131,55 @@ def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | N
     return _table(summary, name, title, rows, list(methods), [metric], across=True)
 
 
-def comparison_table(differences: dict[str, dict[str, Any]], first: str, second: str) -> Table:
-    """Tabulate differences; `first` and `second` name the runs."""
+def compare(first: Run, second: Run, rows: Sequence[str] | None = None, names: Sequence[str] = "AB") -> Table:
+    """Compare rows of two runs, by default every row that both have, on the pairs that both have evaluated.
+
+    Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those of the runs.
+    InputError if a row or a common pair is missing.
+    """
+    of_first, of_second = (run.table["row"].unique() for run in (first, second))
+    rows, cells = [name for name in of_first if name in of_second] if rows is None else rows, {}
+    if not len(rows):
+        raise InputError(f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}")
+    for text in rows:
+        one, _, other = (text, "", text) if text in of_first else text.partition(":")
+        both = first.row(one).join(second.row(other)["error"].rename("other"), how="inner").sort_index()
+        if both.empty:
+            raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
+        errors = both[["error", "other"]].to_numpy().T
+        figures = [Cell(len(both), decimals=0), *map(Cell, accuracy(errors, 30))]
+        difference = _difference(paired_difference(*errors, weights=draws_of(both)))
+        cells[text] = [*figures, *difference, *map(Cell, median(errors))]
     medians = (f"{run}: {METRICS['median']}" for run in "AB")
     titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p", *medians]
-    rows = {
-        name: [
-            Cell(one["n"], decimals=0), *map(Cell, one["acc30"]), Cell(one["accuracy_gain"], *one["accuracy_gain_ci"]),
-            Cell(one["accuracy_gain_p"], decimals=3), *map(Cell, one["median"]),
-        ]
-        for name, one in differences.items()
-    }  # fmt: skip
     note = "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
     note += "Of twenty rows without a difference, one has p < 0.05 by chance."
-    return Table("compare", f"A = {first}, B = {second}", pd.DataFrame.from_dict(rows, "index", object, titles), note)
+    title = "A = {}, B = {}".format(*names)
+    return Table("compare", title, pd.DataFrame.from_dict(cells, "index", object, titles), note)
+
+
+def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | None]:
+    """The gain and the p value of a `paired_difference`."""
+    if test is None:
+        return None, None
+    return Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), Cell(test["accuracy_gain_p"], decimals=3)
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that are not the library's."""
-    return [name for name in summary["methods"] if library_row(name) not in METHODS]
+    """List the rows of a run that are not the library's, with any number of target views."""
+    return [name for name in summary["methods"] if _plain(name) not in METHODS]
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that see the pair only, "ours" and one's own first."""
+    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own first."""
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
-    names = [name for name in summary["methods"] if library_row(name) not in WITH_OTHERS]
-    return sorted(names, key=lambda name: first.index(name) if name in first else len(first))
+    names = [name for name in summary["methods"] if _plain(name) not in WITH_OTHERS]
+    return sorted(names or summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
 
 
-def library_row(name: str) -> str:
+def _plain(name: str) -> str:
     """ROW of "ROW-nN"."""
     return re.sub(r"-n\d+$", "", name)
-
-
-def row_name(name: str, summary: Mapping[str, Any]) -> str:
-    """The name in the run of "ROW-nN": ROW, if N is the run's number of target views and no row has this name."""
-    return name if name in summary["methods"] else name.removesuffix(f"-n{summary['data']['targets']}")
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
@@ -214,14 +234,16 @@ def as_latex(table: Table) -> str:
     shown = table.cells[[title for title in table.cells if title != "pairs"][:3]].dropna(how="all")
     texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
     texts = texts.mask(best, texts.map(lambda text: rf"\textbf{{{text}}}"))
-    lines = [["", *map(_tex, shown)], [], *([_tex(label), *cells] for label, *cells in texts.itertuples())]
+    texts.index, texts.columns = texts.index.str.translate(_TEX), texts.columns.str.translate(_TEX)
+    lines = [["", *texts], [], *map(list, texts.itertuples())]
     published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in shown]).dropna(how="all")
     if len(published):
         lines += [[], [rf"\multicolumn{{{len(lines[0])}}}{{l}}{{{PUBLISHED}}}"]]
-        lines += [[_tex(label), *cells] for label, *cells in published.map(_number).itertuples()]
+        lines += [[label.translate(_TEX), *cells] for label, *cells in published.map(_number).itertuples()]
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
+    caption = ". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else "")))
     return "\n".join([
-        r"\begin{table}[tb]", rf"\caption{{{_tex('. '.join(filter(None, (title, table.data))))}}}",
+        r"\begin{table}[tb]", rf"\caption{{{caption.translate(_TEX)}}}",
         rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * shown.shape[1]}}}", r"\toprule",
         *(rf"{' & '.join(line)} \\" if line else r"\midrule" for line in lines),
         r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
@@ -240,13 +262,42 @@ def _number(cell: Any) -> str:
     return f"{cell.value:.{cell.decimals}f}".replace("-", "$-$") if isinstance(cell, Cell) else "--"
 
 
-def _tex(text: str) -> str:
-    """Escape a text for LaTeX."""
-    return "".join(_TEX.get(one, one) for one in text)
-
-
 def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
     """Write each table as NAME.csv, NAME.md and NAME.tex."""
     for table in tables:
         for suffix, render in ((".csv", as_csv), (".md", as_markdown), (".tex", as_latex)):
             write_atomic(Path(folder) / f"{table.name}{suffix}", render(table).encode())
+
+
+def error_distribution(run: Run, row: str = "ours") -> Figure:
+    """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the supplement).
+
+    A second cluster near 180 degrees consists of confusions of front and back.
+    """
+    groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
+    labels = {"xlabel": "rotation error (degrees)", "xlim": (-3, 183), "xticks": range(0, 181, 30)}
+    return show_dots({row: groups}, title=f'Errors of "{row}" by category; the bar is the median', **labels)
+
+
+def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
+    """Draw the cumulative distribution of the errors, one line per row; by default of the most important rows."""
+    curves = {}
+    for name in rows or important_rows(run.summary)[: len(COLOURS)]:
+        errors = np.sort(run.row(name)["error"])
+        shares = 100 * np.arange(len(errors) + 1) / len(errors)
+        curves[name] = np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1]  # a step at every error
+    labels = {"xlabel": "rotation error (degrees)", "ylabel": "pairs with at most this error (%)"}
+    labels |= {"xlim": (0, 180), "ylim": (0, 100), "xticks": (0, 15, 30, 60, 90, 120, 150, 180)}
+    return show_panels({"": curves}, size=(6.5, 4), **labels)
+
+
+def write_figures(run: Run, folder: str | Path) -> None:
+    """Write the errors of the first row by category, and the error curves, as PDF and PNG files."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    first = [*own_rows(run.summary), *important_rows(run.summary)][0]
+    with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
+        figures = {"error_distribution": error_distribution(run, first), "error_curves": error_curves(run)}
+        for name, figure in figures.items():
+            figure.savefig(Path(folder) / f"{name}.pdf", metadata={"CreationDate": None})
+            figure.savefig(Path(folder) / f"{name}.png", dpi=150)
+            plt.close(figure)

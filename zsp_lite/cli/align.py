@@ -4,16 +4,7 @@ from pathlib import Path
 
 import click
 
-from zsp_lite.cli.common import (
-    COUNT,
-    NAMES,
-    PATH,
-    backbone_options,
-    examples,
-    replace_option,
-    version_option,
-    workers_options,
-)
+from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, run_options
 
 
 @click.command(
@@ -32,11 +23,10 @@ from zsp_lite.cli.common import (
 @click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
 @replace_option
-@workers_options
-@version_option
+@run_options
 @backbone_options
 def align(
-    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor, **again
+    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor, allow_other_version
 ) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
@@ -54,8 +44,8 @@ def align(
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
-    dataset, out = Co3D(data), out or Path("outputs/align") / category
-    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor or workers, **again)
+    dataset, out, executor = Co3D(data), out or Path("outputs/align") / category, executor or workers
+    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor, allow_other_version)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     written.append(write_category_report(out / "report.html", found, dataset, category))
     if propose:

@@ -6,7 +6,7 @@ import textwrap
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, version_option, workers_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, run_options
 
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
@@ -38,9 +38,8 @@ metrics_option = click.option(
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
-@workers_options
+@run_options
 @metrics_option
-@version_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
@@ -50,9 +49,9 @@ def benchmark(
     if list_only:
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
-    from zsp_lite.benchmark.own import write_questions
     from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
     from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.exchange import write_questions
     from zsp_lite.data.pairs import labelled_categories
     from zsp_lite.samples import sample_data
 
@@ -116,12 +115,11 @@ def compare(run_a, run_b, rows, out) -> None:
 
     RUN_A and RUN_B are folders of runs.
     """
-    from zsp_lite.benchmark import runs
-    from zsp_lite.benchmark.tables import comparison_table, write_tables
+    from zsp_lite.benchmark import tables
+    from zsp_lite.benchmark.runs import read_run
     from zsp_lite.cli.terminal import print_table
 
-    found = runs.compare(runs.read_run(run_a), runs.read_run(run_b), rows)
-    table = comparison_table(found, str(run_a), str(run_b))
+    table = tables.compare(read_run(run_a), read_run(run_b), rows, (str(run_a), str(run_b)))
     print_table(table)
     if out:
-        write_tables([table], out)
+        tables.write_tables([table], out)

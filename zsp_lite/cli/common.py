@@ -54,9 +54,6 @@ def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) ->
 
 
 replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
-version_option = click.option(
-    "--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."
-)
 
 
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -76,7 +73,15 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_backbone
 
 
-def workers_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --workers and --executor."""
-    cluster = click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes.")
-    return click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine.")(cluster(command))
+_RUN_OPTIONS = (
+    click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine."),
+    click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes."),
+    click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."),
+)
+
+
+def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --workers, --executor and --allow-other-version."""
+    for option in reversed(_RUN_OPTIONS):
+        command = option(command)
+    return command

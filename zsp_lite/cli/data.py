@@ -27,7 +27,7 @@ def data() -> None:
 @click.option("--deep", is_flag=True, help="Also decode every file; slow on large folders.")
 @click.option("--partial", is_flag=True, help="A sequence without any file is not a problem: it was not downloaded.")
 def check(root, deep, partial) -> int:
-    """Report missing or broken files, the number of pairs that can be evaluated, and the size on disk.
+    """Report missing or broken files, the number of files of evaluation pairs, and the size on disk.
 
     The exit code is 1 if there is any problem.
     """
@@ -198,8 +198,7 @@ def import_(layout, folder, root, category, sequence, box, masks, frames, depth_
     given = {} if depth_unit is None else {"depth_unit": depth_unit}
     refuse_options({"masks": box and masks}, (), "--box")
     refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
-    capture = READERS[layout](folder, **given)
-    done = import_capture(capture, root, category, sequence, box, masks, frames)
+    done = import_capture(READERS[layout](folder, **given), root, category, sequence, box, masks, frames)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")

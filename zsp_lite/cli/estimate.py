@@ -13,7 +13,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
         "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
         "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",
-        "estimate data_samples/car/suv data_samples/car/seat_leon --helpers data_samples/car/peugeot_308",
+        "estimate path/to/scan path/to/other_scan --helpers path/to/third_scan path/to/fourth_scan",
     )
 )
 @click.argument("reference", type=PATH)
@@ -97,9 +97,8 @@ def _print_tables(found: Any) -> None:
 
     print(f"Reference: {found.sources[0]} (mask: {found.masks[0]})")
     print(f"Target: {found.sources[1]} (masks: {found.masks[1]})")
-    print_rows(
-        f"Pose from {found.title}, backbone {found.backbone}", COLUMNS[1:], [row[1:] for row in table_rows(found)]
-    )
+    rows = [row[1:] for row in table_rows(found)]
+    print_rows(f"Pose from {found.title}, backbone {found.backbone}", COLUMNS[1:], rows)
     print(legend([name for name in COLUMNS[1:] if name != "error" or found.errors]))
     for solver, one in found.estimates.items():
         view = f"view {one.view + 1} ({found.targets[one.view].name})"

@@ -20,13 +20,15 @@ def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 
 def print_table(table: Any) -> None:
     """Print a `Table` of a benchmark run: intervals below their figures, published figures dim."""
+    from zsp_lite.benchmark.tables import PUBLISHED
+
     look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
     made = RichTable(title=table.title, caption=table.note or None, **look)
     longest = max(map(len, table.text.index), default=0)
     made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
     for title in table.text.columns:
-        style = "dim" if title.startswith("published") else None
-        title = title.replace(": ", "\n").replace(" on ", "\non ").replace(" (", "\n(").replace(" Acc30", "\nAcc30")
+        style = "dim" if title.startswith(PUBLISHED) else None
+        title = title.replace(": ", "\n").replace(" (", "\n(").replace(" Acc30", "\nAcc30")
         made.add_column(title, justify="right", style=style, header_style=style)
     for label, *cells in table.text.itertuples():
         made.add_row(label, *(cell.replace(" [", "\n[") for cell in cells))

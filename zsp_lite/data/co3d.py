@@ -138,6 +138,18 @@ class Co3D:
             raise InputError(f"sequence {category}/{sequence} has no point cloud")
         return read_ply(path_inside(self.root, cloud.path))
 
+    def extent(self, category: str, sequence: str) -> tuple[Float64[np.ndarray, "3"], float] | None:
+        """Return the centre and the diameter of a sequence's object in its world; None without a point cloud.
+
+        They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        """
+        try:
+            points, _ = self.point_cloud(category, sequence)
+        except InputError:
+            return None
+        low, high = np.quantile(points, (0.02, 0.98), axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
+
     def _read(self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options) -> np.ndarray:
         path = path_inside(self.root, relative)
         image = reader(path, *options)

@@ -79,6 +79,12 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
     return []
 
 
+def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:
+    """Return n pairs: the first of the folder's own evaluation set if it has so many, else sampled ones."""
+    shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
+    return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
+
+
 def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
     """List a category's evaluation sets, ROOT/determ_eval/SET/CATEGORY.pt."""
     return sorted(dataset.root.glob(f"determ_eval/{folders}/{plain_name(category, 'category')}.pt"))

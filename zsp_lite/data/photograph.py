@@ -9,12 +9,12 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.frames import Frame, largest_region
 
-PHOTOGRAPH_CATEGORY, PHOTOGRAPH_TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
+CATEGORY, TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
 # judged by eye from the rear wheel, since the front wheel is turned, and may be wrong by 10 degrees. Up is the normal
 # of the floor; the motorcycle leans on its side stand by a few degrees.
-PHOTOGRAPH_FRONT = (0.97, 0.06, -0.24)
-PHOTOGRAPH_UP = (0.01, -0.97, -0.26)
+FRONT = (0.97, 0.06, -0.24)
+UP = (0.01, -0.97, -0.26)
 
 # Calibration at the size in scikit-image, from its documentation: focal length, principal point and difference of the
 # two principal points in pixels, baseline in metres. The values are those of the original photograph divided by 4.
@@ -26,7 +26,7 @@ _CLEARANCE = 0.02  # metres; smallest height of an object point above the floor
 _FARTHEST = 2.75  # metres; the motorcycle is nearer, the bench and the shelf behind it are not
 
 
-def motorcycle_photograph() -> Frame:
+def load_photograph() -> Frame:
     """Load a photograph of a motorcycle with dense depth and an object mask.
 
     The photograph and its disparities, measured with structured light, come with scikit-image

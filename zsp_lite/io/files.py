@@ -88,6 +88,14 @@ def sha256(path: str | Path, what: str) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def digest(*parts: str | bytes) -> str:
+    """Return a hash of texts and bytes, 16 hexadecimal digits."""
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part.encode() if isinstance(part, str) else part)
+    return found.hexdigest()[:16]
+
+
 def stable_hash(text: str) -> int:
     """Hash text to 64 bits; unlike Python's `hash`, the result is the same in every process."""
     return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big")

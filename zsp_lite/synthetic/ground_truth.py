@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 from sklearn.neighbors import NearestNeighbors
 
 from zsp_lite.data.co3d import Co3D, Pair
@@ -67,6 +68,19 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     """Return the object pose of every sequence of a category; none without the file."""
     path = out / category / POSES_FILE
     return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
+
+
+def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
+    """Return the turns in the world of the second object after which both look the same; None where nothing is known.
+
+    The first is the identity.
+    """
+    poses = read_poses(out, category)
+    if not {first, second} <= poses.keys():
+        return None
+    angles = [[0.0], *([turn] for turn in poses[first].turns if turn in poses[second].turns)]
+    world = poses[second].R
+    return world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ world.T
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:

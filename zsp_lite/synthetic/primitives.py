@@ -103,14 +103,14 @@ def rod(start, end, radius: float, end_radius: float | None = None, sides: int =
     return mesh.pointing(along).translated(np.add(start, end) / 2)
 
 
-def capsule(start, end, radius: float, end_radius: float | None = None, sides: int = 14) -> Mesh:
+def capsule(start, end, radius: float, end_radius: float | None = None) -> Mesh:
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     along = np.subtract(end, start)
     half = np.linalg.norm(along) / 2
     t = np.linspace(0, np.pi / 2, 5)
     round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
     tail, head = round_end[::-1] * [radius, -radius], round_end * (end_radius or radius)
-    mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides)
+    mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides=14)
     return mesh.pointing(along).translated(np.add(start, end) / 2)
 
 
