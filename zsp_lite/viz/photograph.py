@@ -9,15 +9,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsp_lite.data import photograph as motorcycle
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.photograph import (
-    PHOTOGRAPH_CATEGORY,
-    PHOTOGRAPH_FRONT,
-    PHOTOGRAPH_TARGET,
-    PHOTOGRAPH_UP,
-    motorcycle_photograph,
-)
 from zsp_lite.demo import N_TARGETS
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
@@ -35,7 +29,7 @@ _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard 
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """Pose of the motorcycle of `motorcycle_photograph` in its camera, estimated from views of a synthetic one."""
+    """Pose of the motorcycle of `load_photograph` in its camera, estimated from views of a synthetic one."""
 
     photograph: Frame
     sequence: str  # sequence of the synthetic motorcycle
@@ -53,16 +47,16 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
     """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
 
     There is one result for each foreground and solver, and none without a category of synthetic motorcycles. The
-    sequence is `PHOTOGRAPH_TARGET`, or the first of other data; both are independent of the results.
+    sequence is `TARGET` of `data.photograph`, or the first of other data; both are independent of the results.
     """
-    if not (dataset.root / PHOTOGRAPH_CATEGORY / POSES_FILE).is_file():
+    if not (dataset.root / motorcycle.CATEGORY / POSES_FILE).is_file():
         return
-    poses = object_poses(dataset, PHOTOGRAPH_CATEGORY)
-    sequence = PHOTOGRAPH_TARGET if PHOTOGRAPH_TARGET in poses else min(poses)
-    frames = dataset.frames(PHOTOGRAPH_CATEGORY, sequence)
+    poses = object_poses(dataset, motorcycle.CATEGORY)
+    sequence = motorcycle.TARGET if motorcycle.TARGET in poses else min(poses)
+    frames = dataset.frames(motorcycle.CATEGORY, sequence)
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
-    photograph, pose = motorcycle_photograph(), poses[sequence]
-    points, _ = dataset.point_cloud(PHOTOGRAPH_CATEGORY, sequence)
+    photograph, pose = motorcycle.load_photograph(), poses[sequence]
+    points, _ = dataset.point_cloud(motorcycle.CATEGORY, sequence)
     for foreground in _FOREGROUNDS:
         method = ZeroShotPose(backbone, foreground=foreground)
         reference, *views = method.views([photograph, *targets])
@@ -71,7 +65,7 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
             camera, to_photograph = estimate.target_camera, estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R
             cloud, along = to_photograph.apply(camera.to_camera(points)), pose.to_box(points)[:, 0]
-            errors = _angle(axes[:, 0], PHOTOGRAPH_FRONT), _angle(axes[:, 2], PHOTOGRAPH_UP)
+            errors = _angle(axes[:, 0], motorcycle.FRONT), _angle(axes[:, 2], motorcycle.UP)
             yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors)
 
 
@@ -103,7 +97,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
     images = [view, *[photograph.rgb] * (len(titles) - 1)]
     figure, (_, *axes) = plots.show_images(images, titles, columns=1 + len(_SOLVERS), size=3.6)
-    up, front = np.array(PHOTOGRAPH_UP), np.array(PHOTOGRAPH_FRONT)
+    up, front = np.array(motorcycle.UP), np.array(motorcycle.FRONT)
     centre, directions = np.median(object_points(photograph), axis=0), np.stack([front, np.cross(up, front), up])
     _draw_directions(axes.pop(len(_SOLVERS)), photograph, centre, directions)
     for axis, result in zip(axes, results):

@@ -198,7 +198,7 @@ def show_matches(
 def draw_matches(
     axes: Sequence[Axes], pixels: Sequence[Real[np.ndarray, "n 2"]], inliers: Bool[np.ndarray, " n"] | None = None
 ) -> list[Artist]:
-    """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others dashed, red.
+    """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others dashed, orange.
 
     Of more than 15 matches, 15 have a line, with the same share of inliers.
     """
@@ -438,7 +438,7 @@ def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4, colum
     """Show the reference under its own points, and for each estimate its target view under the moved points."""
     views = chosen_views(estimates.values())
     titles = ["reference, its own points", *estimates]
-    figure, axes = show_images([view.frame.rgb for view in views], titles, columns, size)
+    figure, axes = show_images([pale(view.frame.rgb) for view in views], titles, columns, size)
     draw_estimates(axes, estimates.values(), most=1500, size=5)
     return figure
 

@@ -19,7 +19,12 @@ _COLOURS = {
     "--jq-incorrect-color": "#C24E00",
     "--jq-numeric-input-label": "currentColor",
 }
-_FIELDS = "input.Input-text, input.Input-text:focus { border: 1px solid #555; background: white; color: #222; }"
+_STYLE = """
+input.Input-text, input.Input-text:focus { border: 1px solid #555; background: white; color: #222; }
+.Quiz .Answer { grid-template-columns: 1fr; }
+.Quiz .MCButton { justify-content: flex-start; gap: 0.7em; text-align: left; }
+.Quiz .MCButton input { flex: none; margin: 0; color-scheme: light; }
+"""
 
 
 def read_questions(notebook: str) -> list[list[dict]]:
@@ -40,7 +45,7 @@ def self_check(notebook: str, number: int) -> None:
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
     form, script = (output.data for output in captured.outputs)  # the form is a <div> that jupyterquiz leaves open
-    ipython.display.display(ipython.display.HTML(form["text/html"] + f"<style>{_FIELDS}</style></div>"))
+    ipython.display.display(ipython.display.HTML(form["text/html"] + f"<style>{_STYLE}</style></div>"))
     # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from the script.
     hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
     ipython.display.display(ipython.display.Javascript(hidden))
