@@ -51,7 +51,7 @@ test: lint
 
 # Quick: without the checks of annotations, which slow every call.
 check: $(STAMP)
-	OMP_NUM_THREADS=1 ZSP_LITE_CHECK_ANNOTATIONS=0 $(RUN) -m pytest -n 2 --dist loadfile -p no:nbval -m "not slow and not browser" tests
+	OMP_NUM_THREADS=1 ZSP_LITE_CHECK_ANNOTATIONS=0 $(RUN) -m pytest -n 2 --dist loadfile -p no:nbval -m "not slow" tests
 
 lint: $(STAMP)
 	$(RUN) -m ruff format --check .
@@ -73,7 +73,7 @@ lab: $(STAMP)
 	  --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/$(LAB)
 
 notebooks: $(STAMP)
-	$(RUN) -m jupyter nbconvert --to notebook --execute --inplace $(NOTEBOOKS)
+	$(RUN) -m jupyter nbconvert --to notebook --execute --ExecutePreprocessor.record_timing=False --inplace $(NOTEBOOKS)
 
 # From the stored outputs of the notebooks. A warning, such as a broken link, is an error. What the playground loads is
 # written meanwhile, on the other core.
@@ -85,7 +85,7 @@ site: $(STAMP)
 
 # Skipped where there is no Chromium.
 browser: $(STAMP)
-	$(RUN) -m pytest -v -m browser tests/browser
+	$(RUN) -m pytest -v tests/browser
 
 hostile: $(STAMP)
 	$(RUN) -m tests.hostile

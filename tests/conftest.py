@@ -5,7 +5,6 @@ import os
 from functools import wraps
 
 import pytest
-from beartype import BeartypeConf, beartype
 from hypothesis import settings
 from jaxtyping import config, install_import_hook
 
@@ -15,12 +14,10 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # without windows
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# Accept an int for a float.
-typechecker = beartype(conf=BeartypeConf(is_pep484_tower=True))
 # Must precede the first import of zsp_lite. Outside the tests, and in `make check`, which is to be quick, nothing is
 # checked.
 if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
-    install_import_hook("zsp_lite", f"{__name__}.typechecker")
+    install_import_hook("zsp_lite", "typechecking.typechecker")
 
 from zsp_lite.errors import InputError  # noqa: E402
 
@@ -28,26 +25,14 @@ _raises = pytest.raises
 
 
 @contextlib.contextmanager
-def _unchecked():
+def _unchecked_raises(expectation):
     before = config.jaxtyping_disable
     config.update("jaxtyping_disable", True)
     try:
-        yield
+        with expectation as caught:
+            yield caught
     finally:
         config.update("jaxtyping_disable", before)
-
-
-@contextlib.contextmanager
-def _unchecked_raises(expectation):
-    with _unchecked(), expectation as caught:
-        yield caught
-
-
-@pytest.fixture
-def unchecked_annotations():
-    """For tests of whole programs, whose single calls other tests check."""
-    with _unchecked():
-        yield
 
 
 @wraps(_raises)
@@ -91,12 +76,3 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
-
-
-@pytest.fixture(scope="session")
-def browser():
-    """Chromium, for the tests in browser/."""
-    from lab_in_browser import running_chromium
-
-    with running_chromium() as running:
-        yield running

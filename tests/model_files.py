@@ -58,11 +58,12 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
     return path
 
 
-def painted(mesh: Mesh, colour=(0.7, 0.4, 0.3, 1.0)) -> TexturedMesh:
+def painted(mesh: Mesh) -> TexturedMesh:
     """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
     n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
     uv, white, material = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32), np.zeros(n, int)
-    return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (Material(np.array(colour)),))
+    colour = Material(np.array((0.7, 0.4, 0.3, 1.0)))
+    return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (colour,))
 
 
 def view(vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size: int = 64) -> Camera:

@@ -64,32 +64,35 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
-    to_object = placement.inverse()
-    in_object = lambda depth: to_object.apply(camera.to_world(rays * depth[..., None]))  # noqa: E731
+    middle, reach = camera.to_camera(placement.t), REACH * placement.scale  # of a ball that holds the object
+    near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
+    start, *ends = placement.inverse().apply(camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]])))
+    along = ends - start  # per unit of depth, in object coordinates
     # From far to near, so that the last crossing found is the nearest one.
-    far, behind = np.full((height, width), np.inf), np.zeros((height, width), dtype=bool)
-    steps = np.linspace(7.0, 1.5, 56)
-    for depth in steps:
-        now = inside(in_object(np.full((height, width), depth))) <= 0
-        far[behind & ~now] = depth + steps[0] - steps[1]
+    far, behind = np.full(len(along), np.inf), np.zeros(len(along), dtype=bool)
+    steps, step = np.linspace(7.0, 1.5, 56, retstep=True)
+    for depth in steps[np.abs(steps - middle[2]) < reach - step]:
+        now = inside(start + depth * along) <= 0
+        far[behind & ~now] = depth - step
         behind = now
     hit = np.isfinite(far)
     high = np.where(hit, far, 1.0)
-    low = high - (steps[0] - steps[1])
+    low = high + step
     for _ in range(14):
         middle = (low + high) / 2
-        outside = inside(in_object(middle)) > 0
+        outside = inside(start + middle[:, None] * along) > 0
         low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    colour = np.rint((in_object(high) / REACH + 1) * 127).clip(1, 254)
-    rgb = np.where(hit[..., None], colour, 0).astype(np.uint8)
-    return Frame(rgb, np.where(hit, high, 0).astype(np.float32), hit.astype(np.float32), camera, name)
+    colour = np.rint(((start + high[:, None] * along) / REACH + 1) * 127).clip(1, 254)
+    rgb, depth = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+    rgb[near], depth[near] = np.where(hit[:, None], colour, 0), np.where(hit, high, 0)
+    return Frame(rgb, depth, (depth > 0).astype(np.float32), camera, name)
 
 
-def around(placement: Sim3, count: int = 7, arc: float = 360, name: str = "{:04d}") -> list[Frame]:
+def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
     """Render views of the object, evenly spaced in an arc of degrees about the vertical through it."""
     angles = np.radians(np.arange(count) * arc / count)
     cameras = [look_at(placement.R @ (np.cos(a), np.sin(a), 0.3)) for a in angles]
-    return [render(camera, placement, name.format(k)) for k, camera in enumerate(cameras)]
+    return [render(camera, placement, f"{k:04d}") for k, camera in enumerate(cameras)]
 
 
 @dataclass(frozen=True)

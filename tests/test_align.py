@@ -1,6 +1,7 @@
 """A category in one frame, from a folder to labels: the run, what is written, one's own pair with helpers."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import permutations
 
@@ -30,9 +31,9 @@ def run(tmp_path_factory):
     return out, align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=out)
 
 
-def turns(root, names=SEQUENCES):
+def turns(root):
     labels = read_labels(root, "lump")
-    return {(a, b): labels[b].trans[:3, :3] @ labels[a].trans[:3, :3].T for a, b in permutations(names, 2)}
+    return {(a, b): labels[b].trans[:3, :3] @ labels[a].trans[:3, :3].T for a, b in permutations(SEQUENCES, 2)}
 
 
 def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written_say_the_same(run, tmp_path):
@@ -51,13 +52,14 @@ def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objec
     assert found["category"]["n"] == 2 and found["category"]["median"] < 20
 
 
-def test_a_killed_run_is_continued_where_it_was_and_in_other_processes(run, tmp_path, monkeypatch):
+def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_path, monkeypatch):
     out, whole = run
     lines = (out / "run.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == 3 * 6
     (tmp_path / "run.json").write_text((out / "run.json").read_text())
     (tmp_path / "run.jsonl").write_text("".join(lines[:14]) + lines[14][:30])
-    found = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=2)
+    with ThreadPoolExecutor(2) as executor:
+        found = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=executor)
     assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
     monkeypatch.setattr(align, "hypotheses", None)  # nothing is left to compute
     again = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path)
@@ -88,13 +90,16 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(run, tmp_path, monkeypatch, capsys):
     root, out = tmp_path / "data", tmp_path / "out"
     root.symlink_to(small_folder(), target_is_directory=True)
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: run[1])
+    found = replace(run[1], disagreements={(A, C): 179.96})
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: found)
     assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
     text = capsys.readouterr().out
     assert "lump: 3 objects in one frame" in text and "100.0% of 6 ordered pairs are within 30°" in text
+    assert f"{A} to {C}: the best pose of the pair alone is 180° away" in text
     assert (out / "report.html").read_text().count("<img") == 1 and (out / "objects.jpg").stat().st_size > 1000
-    objects = json.loads((out / "alignment.json").read_text())["objects"]
-    np.testing.assert_allclose(objects[B]["world_to_frame"], run[1].objects[B].sim3.matrix)
+    alignment = json.loads((out / "alignment.json").read_text())
+    assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
+    np.testing.assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
     labelling = Labelling(root, "lump", SEQUENCES, reference=A)
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
 

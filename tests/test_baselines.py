@@ -15,13 +15,8 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import geometry
 from zsp_lite.baselines.geometry import align, essential_rotation, icp
-from zsp_lite.baselines.networks import (
-    PoseContrast,
-    Swav,
-    euler_to_rotation,
-    square_crop,
-)
-from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches, unproject_pixels
+from zsp_lite.baselines.networks import PoseContrast, Swav, euler_to_rotation, square_crop
+from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
@@ -205,16 +200,6 @@ def test_sift_matches_an_image_with_its_rotated_copy(picture):
     assert len(mutual_matches(one, empty)[0]) == 0
     blank = Frame(np.zeros((224, 224, 3), np.uint8), None, mask, camera)
     assert len(Sift().describe([blank])[0].pixels) == 0
-
-
-def test_keypoints_are_unprojected_onto_the_surface():
-    frame = render(look_at((1, 0.2, 0.4)), Sim3.identity())
-    pixels = np.argwhere(frame.mask > 0)[::50, ::-1] + 0.5
-    points = unproject_pixels(frame, pixels)
-    back, depth = frame.camera.project(frame.camera.to_world(points))
-    assert back == pytest.approx(pixels, abs=1e-6)
-    rows, columns = np.floor(pixels).astype(int).T[::-1]
-    assert depth == pytest.approx(frame.depth[rows, columns], rel=1e-6)
 
 
 def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():

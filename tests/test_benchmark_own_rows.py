@@ -16,16 +16,17 @@ from synthetic_views import CoordinateBackbone, true_pose
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import identity
-from zsp_lite.benchmark.evaluation import evaluate_pair
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, description, resolve
-from zsp_lite.benchmark.own import kind_of, write_questions
+from zsp_lite.benchmark.own import kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
-from zsp_lite.benchmark.run import category_pairs
+from zsp_lite.benchmark.run import evaluate_pair
 from zsp_lite.benchmark.runs import read_lines, read_run
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.pipeline import ZeroShotPose
 
@@ -160,11 +161,11 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
     [
         ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
         ("category,target_frame", "no column reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
-        (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation is .*, expected 9"),
-        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',nan 0')}", "line 2: rotation is 'nan"),
+        (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
+        (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
         (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "),
         (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,first,')}", "line 2: .*first"),
-        (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation is '0 0', expected 3"),
+        (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
         (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
     ],
 )  # fmt: skip
@@ -173,7 +174,7 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=f"poses {path}.*{told}"):
         resolve([f"theirs={path}"])
-    path.write_text(f"{COLUMNS}\n{RIGHT}\n")
+    path.write_text(f"{COLUMNS}\n{RIGHT},surplus\n")
     assert resolve([f"theirs={path}"])["theirs"].features == "none"
 
 

@@ -10,10 +10,10 @@ from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import problem
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
-from zsp_lite.benchmark.run import category_pairs
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose

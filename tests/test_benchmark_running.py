@@ -21,14 +21,13 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.evaluation import Evaluator
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
-from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
-from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, compare, read_lines, read_run
-from zsp_lite.benchmark.tables import every_table
+from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
+from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
+from zsp_lite.benchmark.tables import compare, every_table
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
@@ -41,8 +40,11 @@ QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
 TESTS = Path(__file__).parent
 PATHS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
-# `again(OUT)` is the run of `benchmark_folder`'s main, in this process.
-again = functools.partial(evaluate, small_folder(), QUICK, ROWS, 6, 3)
+
+
+def again(out, executor=1):
+    """The run of `benchmark_folder`'s main, in this process."""
+    return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,8 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
     assert main(["tables", str(tmp_path)]) == 0
     assert read_run(tmp_path).summary["methods"]["ours"]["n"] == stored
     assert (tmp_path / "tables" / "all_rows.csv").is_file() and (tmp_path / "figures" / "error_curves.pdf").is_file()
-    assert {one["n"] for one in compare(read_run(tmp_path), read_run(undisturbed[0])).values()} == {stored}
+    compared = compare(read_run(tmp_path), read_run(undisturbed[0])).cells
+    assert {one.value for one in compared["pairs"]} == {stored}
     assert again(tmp_path)["methods"] == undisturbed[1]["methods"]
     assert sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0])) and len(set(pairs_in(tmp_path))) == 12
 
@@ -106,7 +109,7 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table) and read_run(tmp_path).summary == summary
     with monkeypatch.context() as context:
-        context.setattr("zsp_lite.benchmark.evaluation.evaluate_pair", None)  # nothing is left to compute
+        context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
     assert not packed.exists() and (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
 
@@ -128,10 +131,10 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
 
 
-def test_a_dask_cluster_that_loses_a_worker_finds_the_same(undisturbed, tmp_path, monkeypatch):
+def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
         killed = []
 
         def kill_once() -> None:
@@ -219,7 +222,7 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(InputError, match=f"{folder} is not the folder of a benchmark run: it has no run.json"):
+        with pytest.raises(InputError, match=f"settings of a run {folder}/run.json cannot be read: no such file"):
             read_run(folder)
     (tmp_path / LINES).symlink_to("/dev/full")
     with pytest.raises(InputError, match="run.jsonl cannot be written: .*No space left"):
@@ -295,3 +298,6 @@ def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
     # Tables that the last call has no rows for are removed, and nothing else.
     assert not list((tmp_path / "tables").glob("table_a_depth*")) and (tmp_path / "tables" / "mine.csv").exists()
     assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()
+    run_rows({"category": lambda problem: np.eye(3)}, tmp_path, 4)
+    write_reports(tmp_path)
+    assert not list((tmp_path / "tables").glob("all_rows*")) and (tmp_path / "tables" / "with_others.md").exists()

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from benchmark_folder import CATEGORIES, made_up_run, write_run
 
-from zsp_lite.benchmark import figures, tables
+from zsp_lite.benchmark import tables
 from zsp_lite.benchmark.methods import read_paper_tables, resolve
-from zsp_lite.benchmark.runs import LINES, SETTINGS, compare, read_run
+from zsp_lite.benchmark.runs import LINES, SETTINGS, read_run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.benchmark.tables import PUBLISHED, Cell, all_rows, as_latex, as_markdown, every_table, paper_tables
 from zsp_lite.choices import METRICS, METRICS_SHOWN
@@ -69,10 +69,15 @@ def test_a_run_of_three_rows_has_the_tables_of_these_with_chosen_metrics_and_dif
     assert every_table(made.summary, ["acc30"])[0].cells.shape[1] == 5
 
 
-def test_a_row_that_sees_other_objects_has_a_table_of_its_own(tmp_path):
-    made = made_up_run(tmp_path, ["ours", "verified", "category"])
-    found = {table.name: list(table.cells.index) for table in every_table(made.summary)}
-    assert found["with_others"] == ["category"] and found["all_rows"] == tables.important_rows(made.summary)
+def test_rows_that_see_other_objects_stand_apart_from_those_that_see_the_pair_only(tmp_path):
+    made = made_up_run(tmp_path, ["ours", "category", "verified", "category-n3"])
+    found = {table.name: table for table in every_table(made.summary)}
+    assert found["with_others"].title == "With other unlabelled objects of the category"
+    assert list(found["with_others"].cells.index) == ["category", "category-n3"]
+    rows = [list(found["all_rows"].cells.index), list(found["categories_acc30"].cells)]
+    assert rows == [["ours", "verified"]] * 2 == [tables.important_rows(made.summary)] * 2
+    names = [table.name for table in every_table(made_up_run(tmp_path / "alone", ["category"]).summary)]
+    assert names[0] == "with_others" and "all_rows" not in names and len(names) == 4
 
 
 def test_figures_by_category_are_those_of_the_summary(run):
@@ -100,10 +105,7 @@ def test_rows_of_ones_own_stand_below_the_papers_and_in_every_figure(run, tmp_pa
     assert cell(table, "mine", "Acc30 (%)").value == mine["acc30"]
     assert cell(table, "mine", "hydrant Acc30").value == mine["per_category"]["hydrant"]["acc30"]
     assert cell(table, "mine", "Acc30 (%)", PUBLISHED) is None
-    left, _ = figures.accuracy_against_views(made).axes
-    line = next(line for line in left.get_lines() if line.get_label() == "mine")
-    assert list(line.get_xdata()) == [3, 5] and line.get_ydata()[1] == mine["acc30"]
-    curves = figures.error_curves(made).axes[0].get_lines()
+    curves = tables.error_curves(made).axes[0].get_lines()
     assert [line.get_label() for line in curves][:5] == ["ours", *names[3:], "verified"]
 
 
@@ -153,7 +155,9 @@ def test_latex_has_the_best_method_of_a_category_in_bold_and_the_published_figur
     for category, *texts in lines[:-1]:
         values = [run.summary["methods"][name]["per_category"][category]["median"] for name in heading[1:]]
         assert [text.startswith(r"\textbf") for text in texts] == [value == min(values) for value in values]
-    assert r"\multicolumn{4}{l}{published on CO3D (other data)} \\" in as_latex(found["table_1"])
+    assert r"\multicolumn{4}{l}{paper, CO3D} \\" in as_latex(found["table_1"])
+    assert "other data (CO3D) and another backbone (DINO ViT-S/8).}" in as_latex(found["table_1"])
+    assert "other data" not in as_latex(found["categories_median"]) and "other data" in found["table_1"].note
     assert body_of(found["table_1"])[-1] == ["Ours (K=50)", "53.8", "46.3", "31.1"]
 
 
@@ -226,39 +230,37 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
     halves = {name: (run.row(name)[["error"]] / 2).to_dict(orient="index") for name in ("ours", "icp")}
     halves["ours"].popitem()
     other = write_run(tmp_path / "b", halves)
-    found = compare(run, other)
-    assert list(found) == ["icp", "ours"] and (found["ours"]["n"], found["icp"]["n"]) == (47, 47)
+    found = tables.compare(run, other)
+    assert list(found.cells.index) == ["icp", "ours"] and found.title == "A = A, B = B"
     b = other.row("icp").sort_index()
     a = run.row("icp").loc[b.index]
-    icp = found["icp"]
-    assert icp.items() >= paired_difference(a["error"], b["error"], weights=draws_of(a)).items()
-    assert icp["acc30"][1] - icp["acc30"][0] == pytest.approx(icp["accuracy_gain"]) and icp["accuracy_gain"] > 0
-    assert icp["median"] == [np.median(a["error"]), np.median(b["error"])]
-    table = tables.comparison_table(compare(run, run, ["icp", "ours:icp"]), "x", "y")
+    pairs, first, second, gain, p, *medians = found.cells.loc["icp"]
+    known = paired_difference(a["error"], b["error"], weights=draws_of(a))
+    assert [gain.value, gain.low, gain.high, p.value] == [
+        known["accuracy_gain"], *known["accuracy_gain_ci"], known["accuracy_gain_p"]
+    ]  # fmt: skip
+    assert pairs.value == 47 and second.value - first.value == pytest.approx(gain.value) and gain.value > 0
+    assert [one.value for one in medians] == [np.median(a["error"]), np.median(b["error"])]
+    table = tables.compare(run, run, ["icp", "ours:icp"], ("x", "y"))
     assert table.title == "A = x, B = y" and list(table.cells.index) == ["icp", "ours:icp"]
     pairs, a, b, gain, p, *medians = (one.value for one in table.cells.loc["ours:icp"])
     assert pairs == 48 and 0 < p <= 1 and gain == pytest.approx(b - a)
     assert cell(table, "icp", "p").value == 1
     assert medians == [run.row(name)["error"].median() for name in ("ours", "icp")]
     with pytest.raises(InputError, match="rows ours-n1 and ours have no pair in common"):
-        compare(run, other, ["ours-n1:ours"])
+        tables.compare(run, other, ["ours-n1:ours"])
     for text in ("ours:", ":ours", "nobody:ours", "rootsift"):
         with pytest.raises(InputError, match="row '.*' is not in the run, expected one of "):
-            compare(run, other, [text])
+            tables.compare(run, other, [text])
     with pytest.raises(InputError, match="no row in common: icp, .* and nobody"):
-        compare(run, write_run(tmp_path / "c", {"nobody": halves["icp"]}))
+        tables.compare(run, write_run(tmp_path / "c", {"nobody": halves["icp"]}))
 
 
-def test_figures_show_every_pair_every_number_of_views_and_every_row(run):
-    (axis,) = figures.error_distribution(run).axes
+def test_figures_show_every_pair_and_every_row(run):
+    (axis,) = tables.error_distribution(run).axes
     assert sum(len(points.get_offsets()) for points in axis.collections) == 48 + len(CATEGORIES)  # and the medians
     assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES)
-    left, right = figures.accuracy_against_views(run).axes
-    line = left.get_lines()[0]
-    assert list(line.get_xdata()) == [1, 3, 5, 10, 20]
-    assert line.get_ydata()[2] == run.summary["methods"]["ours-n5"]["acc30"]
-    assert list(right.get_lines()[-1].get_ydata()) == [13.4, 26.2, 31.1, 38.2, 38.3]
-    (axis,) = figures.error_curves(run, ["ours", "icp"]).axes
+    (axis,) = tables.error_curves(run, ["ours", "icp"]).axes
     curve = axis.get_lines()[0]
     height = curve.get_ydata()[np.searchsorted(curve.get_xdata(), 30, side="right") - 1]
     assert height == pytest.approx(100 * np.mean(run.row("ours")["error"] <= 30))

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from co3d_folders import random_camera
 
-from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, correspondence_score, cyclical_iou, global_score, mask_iou
-from zsp_lite.data.frames import Frame
+from zsp_lite.best_view import correspondence_score, cyclical_iou, global_score, mask_iou
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
-from zsp_lite.views import View
 
 
 def matches(similarities) -> Matches:
@@ -64,12 +61,3 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     shifted = torch.eye(6).roll(1, 0)
     first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
     assert cyclical_iou(shifted, first, last) == 1 and cyclical_iou(shifted, last, first) == 0
-
-
-def test_all_selectors_take_the_same_comparison():
-    grid = torch.ones(2, 2, dtype=torch.bool)
-    frame = Frame(np.zeros((2, 2, 3), np.uint8), None, None, random_camera(0, (2, 2)))
-    view = View(frame, feature_map([1.0, 0.0]), grid, np.ones((2, 2)))
-    comparison = ViewMatch(view, view, torch.eye(4), matches([1.0] * 4), 4)
-    scores = {name: score(comparison) for name, score in VIEW_SELECTORS.items()}
-    assert scores == {"correspond": 0, "global": 1, "saliency": 1, "cyclical": 1}

@@ -64,16 +64,6 @@ def test_unproject_undoes_project(seed):
     np.testing.assert_allclose(camera.unproject(*camera.project(points)), points, rtol=1e-9, atol=1e-9)
 
 
-@given(seeds)
-def test_matrix_and_intrinsics_compose_to_project(seed):
-    camera, points = visible_points(seed)
-    homogeneous = np.c_[points, np.ones(len(points))]
-    image = (camera.K @ (camera.matrix @ homogeneous.T)[:3]).T
-    pixels, depth = camera.project(points)
-    np.testing.assert_allclose(image[:, :2] / image[:, 2:], pixels, rtol=1e-9, atol=1e-7)
-    np.testing.assert_allclose(camera.to_camera(camera.centre), 0, atol=1e-9)
-
-
 @given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
 def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height, width):
     camera, points = visible_points(seed)

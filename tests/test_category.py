@@ -30,11 +30,11 @@ def similarity(rng):
     return Sim3(np.exp(0.3 * rng.normal()), Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
 
 
-def problem(seed: int, n: int = 6, steps: int = 5, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypotheses]]:
-    """Make n poses and hypotheses of n * steps pairs; the half turn comes first in the share `flipped` of the pairs."""
+def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypotheses]]:
+    """Make six poses and hypotheses of all 30 pairs; the half turn comes first in the share `flipped` of the pairs."""
     rng = np.random.default_rng(seed)
-    truth, pairs = [similarity(rng) for _ in range(n)], []
-    ends = [(a, (a + step) % n) for step in 1 + rng.permutation(n - 1)[:steps] for a in range(n)]
+    truth, pairs = [similarity(rng) for _ in range(6)], []
+    ends = [(a, (a + step) % 6) for step in 1 + rng.permutation(5) for a in range(6)]
     wrong = set(rng.permutation(len(ends))[: int(flipped * len(ends))].tolist())
     for k, (a, b) in enumerate(ends):
         right_and_turned = [truth[b].inverse() @ truth[a], truth[b].inverse() @ HALF_TURN @ truth[a]]
@@ -54,22 +54,6 @@ def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of
         np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=1e-2)
         assert np.array_equal(one.sim3.matrix, again.objects[name].sim3.matrix)
     assert len(alignment.disagreements) == 3 and min(alignment.disagreements.values()) > 150
-
-
-@settings(max_examples=3)
-@given(seeds)
-def test_a_turn_of_one_world_turns_the_pose_of_its_object_only(seed):
-    _, pairs = problem(seed)
-    turn, same, moved = similarity(np.random.default_rng(seed + 1)), Sim3.identity(), []
-    for one in pairs:
-        before, after = turn.inverse() if one.reference == "002" else same, turn if one.target == "002" else same
-        sim3s = tuple(after @ sim3 @ before for sim3 in one.sim3s)
-        moved.append(replace(one, sim3s=sim3s, centre=before.inverse().apply(one.centre)))
-    first, second = synchronise(pairs).objects, synchronise(moved).objects
-    for name in first:
-        expected = first[name].sim3 @ turn.inverse() if name == "002" else first[name].sim3
-        assert rotation_error(second[name].sim3.R, expected.R) < 0.1
-        assert second[name].probability == pytest.approx(first[name].probability, abs=1e-3)
 
 
 def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn():

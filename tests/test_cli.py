@@ -201,7 +201,7 @@ def test_a_reader_that_ends_early_ends_the_output_without_an_error():
 
 @pytest.mark.slow
 def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zsp_lite.benchmark.run.load_backbone", lambda name: CoordinateBackbone())
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setenv("COLUMNS", "200")
     rows = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "2", "--targets", "3", "--methods", "table3"]
     for name, options in (("a", []), ("b", ["--quiet"])):

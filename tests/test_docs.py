@@ -1,5 +1,6 @@
 """README.md, docs/ and notebooks: what they name exists, commands parse, code runs, cells are short."""
 
+import functools
 import importlib.util
 import json
 import re
@@ -27,6 +28,7 @@ PAGES = [
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
+CODE = (".py", ".ipynb")
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 
@@ -67,15 +69,19 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
         assert (REPOSITORY / path).exists() or path.startswith("notebooks/exercises/re"), path
 
 
+@functools.cache
+def all_code() -> str:
+    folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
+    return "\n".join(path.read_text() for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
+
+
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_environment_variable_and_make_target_that_is_named_exists(page):
-    folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
-    files = [path for folder in folders for path in (*folder.rglob("*.py"), *folder.rglob("*.ipynb"))]
     named, inline = set(re.findall(r"\bZSP_LITE_\w+", markdown(page))), _INLINE_CODE.findall(markdown(page))
     pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
     named |= {code for code in inline if re.fullmatch(pattern, code)}
     for name in named:
-        assert any(name.removeprefix("$") in path.read_text() for path in files), name
+        assert name.removeprefix("$") in all_code(), name
     targets = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
     for command in (*inline, *command_blocks(page)):
         assert set(re.findall(r"(?:^|\s)make ([a-z-]+)", command)) <= targets, command

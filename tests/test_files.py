@@ -232,10 +232,3 @@ def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is
     with writing(tmp_path / "out"):
         assert main(["synth", "--category", "chair", "--out", str(tmp_path / "out")]) == 2
     assert "another process is writing to it" in capsys.readouterr().err
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file/new: cannot be written .*Not a directory.*, expected a folder"):
-        with writing(tmp_path / "file/new"):
-            pass

@@ -109,7 +109,7 @@ def test_a_reader_accepts_its_format_and_refuses_damage_by_an_input_error(folder
         contents |= changed_json(text).map(lambda one: pack(file, one))
     read(folder)
 
-    @settings(max_examples=200, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=100, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(contents)
     def test_one(data: bytes) -> None:
         (folder / file).write_bytes(data)

@@ -1,5 +1,6 @@
 """Vision transformers in Hugging Face's format: small random ones of each architecture, against transformers itself."""
 
+import functools
 import json
 import sys
 from pathlib import Path
@@ -31,15 +32,19 @@ def kind(request) -> str:
     return request.param
 
 
+SHAPES = (64, 64, 3), (50, 90, 3)
+PICTURES = [np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
+
+
 @pytest.fixture()
 def pictures() -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
-    return [rng.integers(0, 256, shape, dtype=np.uint8) for shape in ((64, 64, 3), (50, 90, 3))]
+    return PICTURES
 
 
-def by_transformers(folder: Path, kind: str, pictures, size: int):
-    """Return input and output of every block of the eager model, its output, and its blocks."""
-    architecture = ARCHITECTURES[kind]
+@functools.cache
+def by_transformers(folder: Path, kind: str, size: int):
+    """For `PICTURES`, return input and output of every block of the eager model, its output, and its blocks."""
+    architecture, pictures = ARCHITECTURES[kind], PICTURES
     model = AutoModel.from_pretrained(folder, attn_implementation="eager", dtype=torch.float32)
     model = getattr(model, "vision_model", model).eval()
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
@@ -69,7 +74,7 @@ def projection(architecture, block, x, facet: str):
 def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(kind, folders, pictures, facet):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
-    seen, _, blocks = by_transformers(folders[kind], kind, pictures, size)
+    seen, _, blocks = by_transformers(folders[kind], kind, size)
     for layer in range(DEPTH):
         before, after = seen[layer]
         expected = after if facet == "token" else projection(architecture, blocks[layer], before, facet)
@@ -81,7 +86,7 @@ def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its
 def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_output(kind, folders, pictures):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
-    seen, output, blocks = by_transformers(folders[kind], kind, pictures, size)
+    seen, output, blocks = by_transformers(folders[kind], kind, size)
     if kind == "dinov3_vit":  # its attention adds a rotary embedding
         attention = output.attentions[-1][:, :, 0]
     else:

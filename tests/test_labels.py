@@ -137,11 +137,11 @@ def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
     assert read_labels(tmp_path / "v2", "chair") == {}
 
 
-def random_label(seed, name="a", reference="zero"):
+def random_label(seed, name="a"):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
     trans[:3, 3] = np.random.default_rng(seed).normal(size=3)
-    return PoseLabel(trans, name, reference)
+    return PoseLabel(trans, name, "zero")
 
 
 def transform(matrix, points):

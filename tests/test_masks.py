@@ -8,7 +8,7 @@ import pytest
 from synthetic_views import look_at
 
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.photograph import motorcycle_photograph
+from zsp_lite.data.photograph import load_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
@@ -17,9 +17,9 @@ RADIUS = 0.3
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
 
 
-def ball_on_floor(direction, distance: float = 2.0) -> tuple[Frame, np.ndarray]:
+def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
     """A frame of a ball on a floor in front of a wall, in metres, and the true mask; the depth has holes."""
-    camera = look_at(direction, distance)
+    camera = look_at(direction, 2.0)
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R  # world directions
@@ -129,6 +129,6 @@ def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
 
 
 def test_the_photographed_motorcycle_is_found():
-    photograph = motorcycle_photograph()
+    photograph = load_photograph()
     (found,) = masks_from_depth([replace(photograph, mask=None)])
     assert overlap(found.mask, photograph.mask > 0.5) > 0.7

@@ -154,8 +154,8 @@ def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, 
 # Pictures
 
 
-def render(mesh, camera, samples=1, coordinates=None):
-    return MeshScene(mesh, STUDIO, 0, coordinates, samples).render(camera)
+def render(mesh, camera, samples=1):
+    return MeshScene(mesh, STUDIO, 0, samples=samples).render(camera)
 
 
 def standing_quad(folder, texture, **material):
@@ -164,8 +164,8 @@ def standing_quad(folder, texture, **material):
     return canonical_mesh(mesh, ModelInfo().axes(".obj"))
 
 
-def from_the_front(mesh, size=48):
-    return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), size, margin=1.5)
+def from_the_front(mesh):
+    return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), 48, margin=1.5)
 
 
 def intersect(camera, vertices, faces):

@@ -1,14 +1,12 @@
 """Pose errors against analytic angles, and the statistics against values worked out by hand."""
 
-from statistics import NormalDist
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsp_lite.benchmark.statistics import bootstrap_ci, figures_of, object_draws, pair_draws, paired_test
+from zsp_lite.benchmark.statistics import bootstrap_ci, figures_of, object_draws, paired_test
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median, rotation_error
 
@@ -113,9 +111,8 @@ def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
         assert any(fits)
 
 
-def test_only_the_seed_changes_a_draw_not_the_order_of_pairs_or_other_categories():
+def test_neither_the_order_of_pairs_nor_other_categories_change_a_draw():
     weights = object_draws(PAIRS, ["x"] * 6)
-    assert (object_draws(PAIRS, ["x"] * 6, seed=1) != weights).any()
     np.testing.assert_array_equal(object_draws(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
     both = object_draws(PAIRS * 2, ["w"] * 6 + ["x"] * 6)
     np.testing.assert_array_equal(both[:, 6:], weights)
@@ -123,25 +120,6 @@ def test_only_the_seed_changes_a_draw_not_the_order_of_pairs_or_other_categories
     np.testing.assert_allclose(both[:, :6].sum(axis=1), 6)
     # Pairs of two objects are resampled one by one.
     np.testing.assert_array_equal(np.unique(object_draws([("a", "b"), ("b", "a")])), [0, 1, 2])
-
-
-def test_resampled_objects_cover_the_truth_where_resampled_pairs_do_not():
-    """A simulated world: a pair is solved if its two objects and chance together are easy enough."""
-    rng, n, m, worlds = np.random.default_rng(0), 50, 10, 200
-    truth, hits = 100 * NormalDist(0, np.sqrt(1 + 2 * 0.8**2)).cdf(0.3), np.zeros(2)
-    categories = np.repeat(["x", "y"], n)
-    for _ in range(worlds):
-        easiness = rng.normal(0, 0.8, size=(2, m))
-        first = np.tile(np.arange(n) % m, (2, 1))
-        second = (first + rng.integers(1, m, size=(2, n))) % m
-        total = np.take_along_axis(easiness, first, 1) + np.take_along_axis(easiness, second, 1)
-        errors = np.where(0.3 + total + rng.normal(size=(2, n)) > 0, 10.0, 90.0).ravel()
-        objects = np.stack([first.ravel(), second.ravel()], axis=-1)
-        for i, weights in enumerate((object_draws(objects, categories, 400), pair_draws(2 * n, 400))):
-            low, high = bootstrap_ci(errors, acc30, weights)
-            hits[i] += low <= truth <= high
-    by_objects, by_pairs = hits / worlds
-    assert 0.9 <= by_objects <= 0.99 and by_pairs < 0.75
 
 
 def test_the_mean_of_category_medians_is_over_categories():

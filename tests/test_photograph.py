@@ -10,7 +10,7 @@ from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.depth import fit_plane, unproject_depth
-from zsp_lite.data.photograph import PHOTOGRAPH_FRONT, PHOTOGRAPH_UP, motorcycle_frame, motorcycle_photograph
+from zsp_lite.data.photograph import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import axis_deviation, object_points
 from zsp_lite.viz.photograph import run_photograph
@@ -43,12 +43,12 @@ def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_b
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
     floor = frame.depth[CLEAR_OF_THE_FLOOR] > 0
     normal, _ = fit_plane(unproject_depth(frame.depth, frame.camera)[CLEAR_OF_THE_FLOOR][floor], 0.01)
-    assert angle(-np.sign(normal[1]) * normal, PHOTOGRAPH_UP) < 2
-    assert abs(angle(PHOTOGRAPH_FRONT, PHOTOGRAPH_UP) - 90) < 1
+    assert angle(-np.sign(normal[1]) * normal, UP) < 2
+    assert abs(angle(FRONT, UP) - 90) < 1
 
 
 def test_the_photograph_is_scaled_as_scenes_of_co3d_and_is_the_same_at_every_call(frame):
-    first, second = motorcycle_photograph(), motorcycle_photograph()
+    first, second = load_photograph(), load_photograph()
     assert axis_deviation(object_points(first)) == pytest.approx(1, abs=1e-4)
     unit = axis_deviation(object_points(frame))
     assert unit == pytest.approx(0.22, abs=0.005)  # metres, as the documentation says
@@ -91,7 +91,7 @@ def photograph():
     """Stands in for the photograph in all that follows."""
     rendered = render(look_at((-0.7, 1, 0.35)), AT_HOME, "photograph")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zsp_lite.viz.photograph.motorcycle_photograph", lambda: rendered)
+        patch.setattr("zsp_lite.data.photograph.load_photograph", lambda: rendered)
         yield rendered
 
 
@@ -103,7 +103,7 @@ def results(motorcycles, photograph):
 def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_object(results, photograph):
     truth = photograph.camera.R @ CANONICAL
     points = photograph.camera.to_camera(np.random.default_rng(0).uniform(-1, 1, (400, 3)))
-    by_eye = np.array([PHOTOGRAPH_FRONT, PHOTOGRAPH_UP])
+    by_eye = np.array([FRONT, UP])
     for result in results:
         relative = result.estimate.target_camera.R @ ELSEWHERE.R @ photograph.camera.R.T
         error = rotation_error(result.estimate.sim3.R, relative)

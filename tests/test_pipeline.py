@@ -239,17 +239,6 @@ def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(reference, targe
     assert np.linalg.norm(middle - truth) < 0.5
 
 
-def test_collinear_points_fall_back_and_say_so(method, reference):
-    # The same view twice, at one depth everywhere, with one column of patches as foreground: points on a line.
-    flat = replace(reference, depth=np.full_like(reference.depth, 4.0))
-    views = extract_views(method.backbone, [object_crop(flat)] * 2)
-    for view in views:
-        view.foreground[:] = False
-        view.foreground[:, 14] = True
-    estimate = method.estimate_from_views(views[0], views[1:])
-    assert estimate.flags and "collinear" in estimate.note
-
-
 @pytest.mark.parametrize("solver", ["paper", "verified"])
 def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(method, reference, targets, solver):
     method = replace(method, solver=solver)

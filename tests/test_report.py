@@ -16,13 +16,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.pose_picture import coverage
-from zsp_lite.viz.report import (
-    _two_poses_figure,
-    overview,
-    table_rows,
-    write_overview,
-    write_report,
-)
+from zsp_lite.viz.report import _two_poses_figure, overview, table_rows, write_overview, write_report
 
 pytestmark = pytest.mark.slow
 

@@ -53,8 +53,7 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
     np.testing.assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
 
 
-@pytest.mark.parametrize("solver", ["paper", "verified"])
-@pytest.mark.parametrize("quarters", [1, 2, 3])
+@pytest.mark.parametrize(("solver", "quarters"), [("paper", 1), ("paper", 2), ("paper", 3), ("verified", 1)])
 def test_the_pose_of_a_turned_reference_is_that_of_the_image_as_given(frames, solver, quarters):
     rolled = turn_frame(frames[0], quarters)
     method = ZeroShotPose(UprightBackbone(), solver=solver, upright=False)
@@ -100,8 +99,9 @@ def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames):
 @pytest.mark.slow
 def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
-    folder = ellipsoids.root / "ellipsoid"
-    words = ["estimate", str(folder / "a"), str(folder / "b"), "--targets", "2", "--out", str(tmp_path)]
+    monkeypatch.setattr("zsp_lite.own_objects.write_pair", lambda *_: [])
+    words = ["estimate", *(str(ellipsoids.root / "ellipsoid" / name) for name in "ab"), "--targets", "2"]
+    words += ["--solver", "paper", "--out", str(tmp_path)]
     for options, images in (([], 3), (["--not-upright"], 6)):
         UprightBackbone.images = 0
         assert cli.main([*words, *options]) == 0

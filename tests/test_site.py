@@ -116,6 +116,19 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
             assert output.text.strip().splitlines()[0].strip() in page.text
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_shows_every_line_of_its_text_also_one_that_begins_with_a_percent_sign(pages, path):
+    shown = "".join(pages[page_of(path)].text.split())
+    cells = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown"]
+    formulas, code, tags = r"\$\$.*?\$\$|\$.*?\$", r"```.*?```", r"<.*?>"
+    pictures, links = r"!\[.*?\)", r"\]\(.*?\)"
+    beginnings = r"(?m:^\s*([\d#>]+\.?|[-*]) )"  # of headings, quotations and lines of lists
+    signs = r"[`\"'_*.\[\]|\\&-]"
+    others = re.compile("|".join([formulas, code, pictures, links, tags, beginnings, signs]), re.DOTALL)
+    for line in others.sub(lambda other: "|" + other[0].count("\n") * "\n", "\n".join(cells)).splitlines():
+        assert "".join(max(line.split("|"), key=len).split()) in shown, line
+
+
 def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guides_for_marking(site, pages):
     for path in EXERCISES:
         source = "\n".join(cell.source for cell in nbformat.read(path, 4).cells)

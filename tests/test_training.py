@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from small_backbones import small_vit
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.synthetic.assembly import make_shape, random_materials
@@ -24,36 +25,53 @@ from zsp_lite.training.trainee import Trainee, as_trainee, initial_backbone
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture(scope="module", autouse=True)
+def two_rooms():
+    """Rooms take five times as long as a view."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendering, "ROOMS", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
-def renders():
-    """The renders of four training objects."""
-    return render_set(range(4))
+def azimuths() -> list[float]:
+    """Of every view of `renders`, one object after the other."""
+    return []
 
 
-def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(monkeypatch):
-    azimuths = []
+@pytest.fixture(scope="module")
+def renders(azimuths):
+    """The renders of three training objects."""
 
     def kept(azimuth, **others):
         azimuths.append(azimuth)
         return orbit_pose(azimuth, **others)
 
-    monkeypatch.setattr("zsp_lite.training.renders.orbit_pose", kept)
-    render_object(3)
-    turns = np.subtract.outer(azimuths, azimuths)
-    apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
-    partner = np.arange(8) ^ 1
-    found = apart[np.arange(8), partner]
-    assert ((5 <= found) & (found <= 45)).all()
-    apart[np.arange(8), partner] = apart[np.arange(8), np.arange(8)] = 360
-    assert (apart.min(1) >= 45).all()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendering, "orbit_pose", kept)
+        return render_set(range(3))
+
+
+def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(renders, azimuths):
+    partner = np.arange(VIEWS) ^ 1
+    for of_object in np.reshape(azimuths, (3, VIEWS)):
+        turns = np.subtract.outer(of_object, of_object)
+        apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
+        found = apart[np.arange(VIEWS), partner]
+        assert ((5 <= found) & (found <= 45)).all()
+        apart[np.arange(VIEWS), partner] = apart[np.arange(VIEWS), np.arange(VIEWS)] = 360
+        assert (apart.min(1) >= 45).all()
 
 
 def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
     for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
         np.testing.assert_array_equal(array, rows[1])  # a number stands for one object
     inside = ~np.isnan(renders.surface[..., 0])
-    assert renders.rgb.shape == (4, VIEWS, SIZE, SIZE, 3) and inside.shape == (4, VIEWS, GRID, GRID)
+    assert renders.rgb.shape == (3, VIEWS, SIZE, SIZE, 3) and inside.shape == (3, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
+    for number, points in enumerate(renders.surface):  # coordinates of the object, not of its instances
+        shape, seen = make_shape(rendering.build_random_object, [number, 1]).vertices, points[inside[number]]
+        assert (seen > shape.min(0) - 0.01).all() and (seen < shape.max(0) + 0.01).all()
     normals = np.linalg.norm(renders.geometry[..., :3].astype(np.float64), axis=-1)
     np.testing.assert_allclose(normals[inside], 1, atol=5e-3)
     np.testing.assert_array_equal(renders.geometry[~inside], 0)
@@ -184,7 +202,7 @@ def test_geometry_loss_counts_geometry_only_on_the_object():
 
 def test_the_mean_key_of_the_crops_is_subtracted(renders):
     model = as_trainee(initial_backbone(renders, 24, 2, 2), 1, renders, 48)
-    batch = sample_batch(renders, np.random.default_rng(7), 4, VIEWS, 48, (0.85, 1.0))
+    batch = sample_batch(renders, np.random.default_rng(7), 3, VIEWS, 48, (0.85, 1.0))
     with torch.no_grad():
         keys = model(batch.images).keys
     assert keys.mean((0, 1)).norm() > 0.1
@@ -234,13 +252,7 @@ def pictures() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def backbone() -> VisionTransformer:
-    """Small, with weights large enough that its output depends on the picture from the start."""
-    torch.manual_seed(1)
-    model = VisionTransformer(32, 8, embed_dim=24, depth=2, num_heads=2)
-    for module in model.modules():
-        if isinstance(module, torch.nn.Linear):
-            torch.nn.init.xavier_uniform_(module.weight)
-    return model
+    return small_vit(1, embed_dim=24, depth=2, num_heads=2)
 
 
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():

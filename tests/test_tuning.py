@@ -21,16 +21,16 @@ ALL_AROUND_TARGET = ("5 views all around", 288.0, 5, np.zeros(6), 0.1)
 TRUE_WEIGHTS = ScoreCoefficients(6, 0, -4, -2, 0, 3, 0, -1, 2)
 
 
-def sample_outcomes(n: int, rng: np.random.Generator, m: int = 6) -> list[Outcome]:
+def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
     """Pairs with one correct hypothesis each, drawn with probability proportional to exp(score) under TRUE_WEIGHTS."""
     outcomes = []
     for index in range(n):
-        terms = rng.normal(size=(m, len(TERM_NAMES)))
+        terms = rng.normal(size=(6, len(TERM_NAMES)))
         score = terms @ np.array(astuple(TRUE_WEIGHTS))
         probability = np.exp(score - score.max())
-        errors = np.full(m, 120.0)
-        errors[rng.choice(m, p=probability / probability.sum())] = 0
-        outcomes.append(Outcome(f"category {index % 4}", terms, errors, 90 * (1 - np.eye(m)), *ALL_AROUND_TARGET))
+        errors = np.full(6, 120.0)
+        errors[rng.choice(6, p=probability / probability.sum())] = 0
+        outcomes.append(Outcome(f"category {index % 4}", terms, errors, 90 * (1 - np.eye(6)), *ALL_AROUND_TARGET))
     return outcomes
 
 

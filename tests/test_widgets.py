@@ -46,11 +46,12 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
     before, caption = widget.picture.value, widget.caption.value
     assert before[:4] == b"\x89PNG" and caption
     for control in widget.controls.values():
-        pictures, start = [], control.value
+        start = control.value
         for value in values_of(control):
             control.value = value
-            pictures.append(widget.picture.value)
-        assert any(picture != before for picture in pictures), control.description
+            if widget.picture.value != before:
+                break
+        assert widget.picture.value != before, control.description
         control.value = start
         assert (widget.picture.value, widget.caption.value) == (before, caption)
 

@@ -73,7 +73,7 @@ class Lab:
 
 
 @contextmanager
-def serve(folder: Path, state: Path, data: Path, patience: float = 180):
+def serve(folder: Path, state: Path, data: Path):
     """A `Lab` on `folder`, with settings, workspaces and log in `state`, so that the user's own stay as they are."""
     for plugin, settings in _SETTINGS.items():
         path = state / "settings" / f"{plugin}.jupyterlab-settings"
@@ -102,7 +102,7 @@ def serve(folder: Path, state: Path, data: Path, patience: float = 180):
     with open(state / "jupyterlab.log", "w") as log:
         server = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
     try:
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + 180
         while not _answers(lab):
             if server.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError(f"JupyterLab did not start:\n{(state / 'jupyterlab.log').read_text()[-3000:]}")
@@ -198,7 +198,7 @@ _PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .
 })).then(all => all.join('|'), () => null)"""
 
 
-def slider_moves_picture(output, patience: float = 90) -> bool:
+def slider_moves_picture(output) -> bool:
     """Whether the pictures of a widget change when one of its sliders is moved by keyboard."""
     output.scroll_into_view_if_needed()
     before = output.evaluate(_PICTURES)
@@ -206,7 +206,7 @@ def slider_moves_picture(output, patience: float = 90) -> bool:
         for key in ("ArrowRight", "ArrowLeft", "ArrowLeft"):  # it may stand at one end
             handle.focus()
             handle.press(key)
-            deadline = time.monotonic() + patience / 3
+            deadline = time.monotonic() + 30
             while time.monotonic() < deadline:
                 time.sleep(0.2)
                 if output.evaluate(_PICTURES) not in (before, None):
@@ -255,10 +255,10 @@ def _await_marks(page, cloud: str, number: int) -> None:
     )
 
 
-def photograph(page, path: Path, width: int = 1300, highest: int = 15_000) -> None:
+def photograph(page, path: Path) -> None:
     """The notebook as a picture, up to the height in pixels that Chromium can draw at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cells = page.evaluate("() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height")
-    page.set_viewport_size({"width": width, "height": int(min(cells + 150, highest))})
+    page.set_viewport_size({"width": 1300, "height": int(min(cells + 150, 15_000))})
     time.sleep(2)  # until everything is laid out anew
     page.screenshot(path=path, timeout=120_000)

@@ -36,8 +36,6 @@ PACK = """(array) => {
   return btoa(text);
 }"""
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):

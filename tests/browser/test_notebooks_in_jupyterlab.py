@@ -28,8 +28,6 @@ LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def lab(browser, tmp_path_factory):

@@ -16,9 +16,9 @@ from test_importers import write_lists, write_nerfstudio
 
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.own import read_poses
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.exchange import read_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import shipped_pairs

@@ -1,0 +1,10 @@
+"""Chromium for the tests of this folder."""
+
+import pytest
+from lab_in_browser import running_chromium
+
+
+@pytest.fixture(scope="session")
+def browser():
+    with running_chromium() as running:
+        yield running
