@@ -179,11 +179,8 @@ def dot(place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", 
     return element("circle", cx=place[0], cy=place[1], r=radius, fill=fill, stroke=stroke, stroke_width=thick)
 
 
-def ring(place: np.ndarray, stroke: str, radius: float = 6.5, thick: float = 2, dash: str | None = None) -> str:
-    return element(
-        "circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick,
-        stroke_dasharray=dash,
-    )  # fmt: skip
+def ring(place: np.ndarray, stroke: str, radius: float, thick: float) -> str:
+    return element("circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick)
 
 
 def curve(path: str, stroke: str = INK, thick: float = 1.6, dash: str | None = None, head: bool = False) -> str:
@@ -249,9 +246,9 @@ def text(
     )  # fmt: skip
 
 
-def group(content: str, x: float = 0, y: float = 0, scale: float = 1, opacity: float | None = None) -> str:
+def group(content: str, x: float = 0, y: float = 0, scale: float = 1) -> str:
     transform = f"translate({number(x)} {number(y)})" + (f" scale({scale:g})" if scale != 1 else "")
-    return f"<g{attributes(transform=transform, opacity=None if opacity is None else f'{opacity:g}')}>\n{content}</g>\n"
+    return f"<g{attributes(transform=transform)}>\n{content}</g>\n"
 
 
 def svg(content: str, width: float, height: float, title: str, description: str) -> str:
@@ -287,12 +284,12 @@ def draw_images(words: bool = True) -> str:
     return reference.draw(BLUE) + "".join(target.draw(ORANGE) for target in targets)
 
 
-def draw_grid(x: float, y: float, size: float, cells: int, stroke: str = "white", thick: float = 0.8) -> str:
+def draw_grid(x: float, y: float, size: float, cells: int, thick: float = 0.8) -> str:
     steps = [size * i / cells for i in range(1, cells)]
     path = "".join(
         f"M{number(x + s)} {number(y)}v{number(size)}M{number(x)} {number(y + s)}h{number(size)}" for s in steps
     )
-    return curve(path, stroke, thick)
+    return curve(path, "white", thick)
 
 
 @cache
@@ -417,7 +414,7 @@ def draw_method() -> str:
 
     stages = [
         ("Features", "01", ("A network describes each", "patch by a vector Φ."), draw_features()),
-        ("Cycle", "02", ("A match is kept if the way", "*u* → *v* → *u*′ ends near *u*."), draw_cycle()),
+        ("Cycle", "02", ("Matches come first whose way", "*u* → *v* → *u*′ ends near *u*."), draw_cycle()),
         ("Best view", "03", ("The view is chosen whose", "matches score highest."), draw_best_view()),
         ("Depth", "04", ("Depth turns the patches *u*, *v*", "into the 3D points *x*, *y*."), draw_depth()),
         ("Umeyama, RANSAC", "04", ("Of many fits, the one with", "which most matches agree."), draw_fit()),
@@ -608,18 +605,18 @@ def draw_cycles() -> str:
     drawn = case(
         20, "A short cycle", ("front left", "front left", "front left"), (12, 16),
         ("*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
-         "*u*′ is next to *u*: the match (*u*, *v*) is kept."),
+         "*u*′ is next to *u*: the match (*u*, *v*) ranks high."),
     )  # fmt: skip
     drawn += curve(f"M430 20V{height - 20}", LINE, 1.2)
     drawn += case(
         450, "A long cycle", ("foot left", "foot right", "top right"), (0, 0),
-        ("The way back leads to another part.", "*d*(*u*, *u*′) is large: the match (*u*, *v*) is dropped."),
+        ("The way back leads to another part.", "*d*(*u*, *u*′) is large: the match (*u*, *v*) ranks low."),
     )  # fmt: skip
     return svg(
         drawn, width, height, "The cycle",
         "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the target, a dashed "
-        "arrow leads back to u', close to u, and the match is kept. Right: the dashed arrow ends far from u, and the "
-        "match is dropped.",
+        "arrow leads back to u', close to u, and the match ranks high. Right: the dashed arrow ends far from u, and "
+        "the match ranks low.",
     )  # fmt: skip
 
 
