@@ -4,6 +4,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+sys.modules["rfc3987_syntax"] = None  # jsonschema would build parsers of addresses with it, which takes seconds
+
 ROOT = Path(__file__).parents[2]  # also Sphinx's source folder, so that all relative links stay as they are
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
@@ -42,6 +44,7 @@ exclude_patterns += ["**/.ipynb_checkpoints", "notebooks/exercises/release", "da
 nb_execution_mode = "off"  # outputs are those stored in the notebooks
 nb_merge_streams = True
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
+myst_disable_syntax = ["myst_line_comment"]  # a line may begin with a percent sign
 myst_heading_anchors = 4  # the anchors of GitHub
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
@@ -49,6 +52,8 @@ default_role = "py:obj"  # `name` in docstrings: a link if the name is documente
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
+autodoc_use_type_comments = False
+toc_object_entries = False
 python_maximum_signature_line_length = 80
 napoleon_use_ivar = True
 
@@ -58,6 +63,7 @@ course_repository = _project.get("urls", {}).get("Repository", "")
 html_theme = "sphinx_book_theme"
 html_title = "zsp-lite"
 html_css_files = ["style.css"]
+html_js_files = [("site.js", {"defer": "defer"})]
 html_static_path = ["static", "../playground"]
 html_sidebars = {"docs/playground": []}  # its pictures take the whole width
 templates_path = ["templates"]

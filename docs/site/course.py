@@ -4,7 +4,8 @@
 - Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own preprocessors.
 - Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an install cell.
 - Docstrings keep their indented examples.
-- Intervals such as [47.6, 66.2] never break over two lines.
+- Intervals such as [47.6, 66.2] never break over two lines. Wide tables use the margin at the right.
+- The members of the modules in the reference are folded.
 """
 
 import json
@@ -13,6 +14,7 @@ import shutil
 from copy import deepcopy
 from html import escape, unescape
 from pathlib import Path
+from types import FunctionType, ModuleType
 from urllib.parse import urlsplit
 
 import nbformat
@@ -21,6 +23,7 @@ import plotly.io
 from docutils import nodes
 from nbformat import NotebookNode
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from traitlets.config import PyFileConfigLoader
@@ -29,6 +32,7 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
+WIDE = 7, 80  # columns, and characters of a row, from which on a table uses the margin
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
 # The pages below a page, which the sidebar leaves out.
@@ -173,6 +177,50 @@ def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
             part.replace(text, nodes.Text(joined))
 
 
+def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
+    """Let wide tables, and outputs that have one, use the margin at the right (`doctree-read`)."""
+    for table in list(doctree.findall(nodes.table)):
+        rows = [[cell.astext() for cell in row] for row in table.findall(nodes.row)]
+        if is_wide(rows):
+            table.replace_self(box := nodes.container(classes=["full-width"]))
+            box += table
+    for part in doctree.findall(nodes.raw):
+        rows = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL) for row in part.astext().split("</tr>")]
+        if is_wide([[re.sub("<.*?>", "", cell) for cell in row] for row in rows]):
+            output = part.parent
+            while "cell_output" not in output.get("classes", ["cell_output"]):
+                output = output.parent
+            output["classes"].append("full-width")
+
+
+def is_wide(rows: list[list[str]]) -> bool:
+    return any(len(row) >= WIDE[0] and len("".join(row)) >= WIDE[1] for row in rows)
+
+
+def mark_place(app: Sphinx, doctree: nodes.document) -> None:
+    """Class the strip at the top of a notebook by the middle of its first marked box, in percent (`doctree-read`)."""
+    for image in doctree.findall(nodes.image):
+        if "/here_" in image["uri"]:
+            strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
+            box = re.search('<rect x="([^"]*)"[^>]*? width="([^"]*)"[^>]*stroke="#0072B2"', strip)
+            middle = (float(box[1]) + float(box[2]) / 2) / float(re.search('width="(.*?)"', strip)[1])
+            image["classes"].append(f"here-{100 * middle:.0f}")
+
+
+def fold_members(app: Sphinx, doctree: nodes.document) -> None:
+    """Fold what a module of the reference defines, below links to all of it (`doctree-read`)."""
+    for section in list(doctree.findall(nodes.section)):
+        members = [node for node in section.children if isinstance(node, addnodes.desc)]
+        if members and app.env.docname.startswith("docs/api/"):
+            marks = [(member[0]["ids"][0], member[0]["fullname"]) for member in members if member[0]["ids"]]
+            links = ", ".join(f'<a href="#{mark}"><code>{name}</code></a>' for mark, name in marks)
+            start = (
+                f'<p class="members">{links}</p><details class="members"><summary>Signatures and arguments</summary>'
+            )
+            section.insert(section.index(members[0]), nodes.raw("", start, format="html"))
+            section += nodes.raw("", "</details>", format="html")
+
+
 def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
     """Leave the part before the colon of the notebooks' titles in the sidebar (Sphinx's event `env-updated`)."""
     for name, contents in env.tocs.items():
@@ -229,8 +277,14 @@ def add_plotly(app: Sphinx, pagename: str, templatename: str, context: dict, doc
         app.add_js_file("plotly.min.js", priority=100)
 
 
+def skip_imported(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
+    """Leave out what a module imports from other packages, before autodoc analyses them (`autodoc-skip-member`)."""
+    foreign = isinstance(member, ModuleType) or not getattr(member, "__module__", "").startswith("zsp_lite")
+    return True if what == "module" and foreign and isinstance(member, ModuleType | type | FunctionType) else None
+
+
 def mark_examples(app: Sphinx, kind: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """Mark indented blocks of a docstring as literal blocks (`autodoc-process-docstring`, before napoleon)."""
+    """Mark indented blocks of a docstring as literal, and link pages (`autodoc-process-docstring`, before napoleon)."""
     text, literal = [], False
     for line in lines:
         indented = line.startswith("    ")
@@ -238,7 +292,8 @@ def mark_examples(app: Sphinx, kind: str, name: str, thing: object, options: obj
             literal = True
             text += ["::", ""]
         literal = literal and (indented or not line)
-        text.append(line if literal else line.replace("|", r"\|"))
+        page = re.sub(r"\bdocs/(\w+)\.md", r"`docs/\1.md <../\1.html>`__", line.replace("|", r"\|"))
+        text.append(line if literal else page)
     lines[:] = text
 
 
@@ -247,7 +302,11 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("source-read", read_source)
     app.connect("doctree-read", describe_pictures)
     app.connect("doctree-read", keep_intervals)
+    app.connect("doctree-read", widen_tables)
+    app.connect("doctree-read", mark_place)
+    app.connect("doctree-read", fold_members)
     app.connect("env-updated", shorten_titles)
+    app.connect("autodoc-skip-member", skip_imported)
     app.connect("autodoc-process-docstring", mark_examples, priority=400)
     app.connect("html-page-context", add_plotly)
     app.connect("build-finished", write_files)

@@ -21,9 +21,9 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
-# Latin, accents, Greek, punctuation, letters and operators, brackets, alphabets of mathematics.
-CHARACTERS = [(0x20, 0x17F), (0x300, 0x3F6), (0x2010, 0x2063), (0x2100, 0x22FF), (0x2308, 0x230B), (0x27E6, 0x27EB)]
-CHARACTERS += [(0x1D400, 0x1D7FF)]
+# Latin, accents, Greek, punctuation, letters and operators, brackets; bold, italic and script alphabets.
+CHARACTERS = [(0x20, 0xFF), (0x300, 0x36F), (0x391, 0x3F6), (0x2010, 0x2063), (0x2100, 0x22FF), (0x2308, 0x230B)]
+CHARACTERS += [(0x27E6, 0x27EB), (0x1D400, 0x1D503), (0x1D6A4, 0x1D7FF)]
 
 
 @cache

@@ -7,12 +7,13 @@ one. The directive `picture` embeds a picture that a notebook shows, so that the
     :heading: The map of a real pair
     ```
 
-is the first picture below the heading that contains these words. `:number: 2` is the second one. The path may also be
-that of a drawing, which has its description inside, or of a photograph (`:alt:` describes it). What stands in the
-directive `notes` is shown in the presenter's view only.
+is the first picture below the heading that contains these words. The path may also be that of a drawing, which has its
+description inside. `:tiles: 3 3 8 4` cuts a picture of 3 columns and 3 rows, and shows the first 8 parts in 4 columns.
+What stands in the directive `notes` is shown in the presenter's view only.
 """
 
 import base64
+import io
 import re
 from html import escape, unescape
 from pathlib import Path
@@ -21,46 +22,35 @@ import nbformat
 from docutils import nodes
 from docutils.parsers.rst import directives
 from nbformat import NotebookNode
+from PIL import Image
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 DECKS = "docs/slides/"
-FORMATS = {".svg": "image/svg+xml", ".png": "image/png", ".jpg": "image/jpeg"}
 
 
 class Picture(SphinxDirective):
     """Embed a picture file or a picture of a notebook's stored outputs, with its alternative text."""
 
     required_arguments = 1
-    option_spec = {
-        "heading": directives.unchanged,
-        "number": directives.positive_int,
-        "alt": directives.unchanged,
-    }
+    option_spec = {"heading": directives.unchanged, "tiles": directives.positive_int_list}
 
     def run(self) -> list[nodes.Node]:
         path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
         if not path.is_file():
             raise self.error(f"no file {self.arguments[0]}")
         self.env.note_dependency(str(path))
-        needed = {".ipynb": "heading", ".png": "alt", ".jpg": "alt"}.get(path.suffix)
-        if needed and needed not in self.options:
-            raise self.error(f"picture {self.arguments[0]} has no option :{needed}:, which it needs")
-        if path.suffix not in {".ipynb", *FORMATS}:
-            raise self.error(f"picture {self.arguments[0]} is none of .ipynb, {', '.join(FORMATS)}")
-        if path.suffix == ".ipynb":
-            notebook = nbformat.read(path, as_version=4)
-            found = pictures_below(notebook, self.options["heading"])
-            number = self.options.get("number", 1)
-            if len(found) < number:
-                raise self.error(
-                    f"{path.name} has {len(found)} pictures below the heading {self.options['heading']!r}, "
-                    f"expected at least {number}"
-                )
-            form, data, alt = found[number - 1]
+        if path.suffix == ".svg":
+            form, data = "image/svg+xml", base64.b64encode(path.read_bytes()).decode()
+            alt = unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         else:
-            form, data = FORMATS[path.suffix], base64.b64encode(path.read_bytes()).decode()
-            alt = self.options.get("alt") or unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
+            heading = self.options["heading"]
+            found = pictures_below(nbformat.read(path, as_version=4), heading)
+            if not found:
+                raise self.error(f"{path.name} has no picture below the heading {heading!r}")
+            form, data, alt = found[0]
+            if "tiles" in self.options:
+                data = arranged(data, *self.options["tiles"])
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
 
@@ -98,6 +88,19 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
                     data = output.data[form].replace("\n", "")
                     found.append((form, data, output.metadata.get(form, {}).get("alt", "")))
     return found
+
+
+def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -> str:
+    """Cut a picture in base64 into equal tiles, and lay the first of them out in another number of columns."""
+    picture = Image.open(io.BytesIO(base64.b64decode(data)))
+    width, height = picture.width // columns, picture.height // rows
+    result = Image.new("RGB", (new_columns * width, -(-count // new_columns) * height), "white")
+    for tile in range(count):
+        left, top = tile % columns * width, tile // columns * height
+        part = picture.crop((left, top, left + width, top + height))
+        result.paste(part, (tile % new_columns * width, tile // new_columns * height))
+    result.save(file := io.BytesIO(), picture.format, quality=95)
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def choose_template(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object) -> str | None:
