@@ -3,7 +3,7 @@
 
 const CANVAS = 448, CELL = CANVAS / SIDE, CROP = 224, FIRST_PAIR = 3; // sizes in pixels
 const MARKS = { // told apart by shape as well as by colour
-  right: ["●", "#56b4e9"], wrong: ["✕", "#e69f00"], unknown: ["■", "#d0d0d0"], u: ["□", "white"], back: ["○", "yellow"],
+  right: ["●", "#56b4e9"], wrong: ["✕", "#e69f00"], unknown: ["▲", "#d0d0d0"], u: ["□", "white"], back: ["○", "yellow"],
 };
 const STEPS = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
 const LIBRARY_DEFAULTS = { saliency: 0.05, binned: true, cycle: true, k: 50, kmeans: true };
