@@ -33,35 +33,45 @@ c.ClearSolutions.text_stub = "*Write your answer here, in place of this line.*"
 # NAME_STUDENT_assignsubmission_file_EXERCISE.ipynb, or with "/" before EXERCISE.
 # Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb. Browsers and people add " (1)", "-Copy1".
 EXERCISES = "|".join(sorted(folder.name for folder in (HERE / "source").glob("*")))
-HANDED_IN = (
-    r".*/[^/]+?_(?:LATE_)?(?P<student_id>\d+)_(?:assignsubmission_file_?/?|\d+_)"
-    rf"(?P<file_id>{EXERCISES})[^/]*\.ipynb$"
-)
+STUDENT = r".*/[^/]+?_(?:LATE_)?(?P<student_id>\d+)_(?:assignsubmission_file_?/?|\d+_)"
+HANDED_IN = rf"{STUDENT}(?P<file_id>{EXERCISES})[^/]*\.ipynb$"
 c.FileNameCollectorPlugin.named_regexp = HANDED_IN
 # A second collection replaces the files of the first.
 c.ZipCollectApp.force = c.ExtractorPlugin.force = True
 
 
+def downloaded(assignment):
+    """Files of a download by (student, exercise); "" for what a name does not have."""
+    found, folder = {}, HERE / "downloaded" / assignment / "extracted"
+    for file in sorted(folder.rglob("*")):
+        if file.is_file():
+            path = file.as_posix()
+            named = re.match(HANDED_IN, path) or re.match(STUDENT, path)
+            names = named.groupdict() if named else {}
+            key = names.get("student_id", ""), names.get("file_id", "")
+            found.setdefault(key, []).append(file.relative_to(folder).as_posix())
+    return found
+
+
 class Collector(FileNameCollectorPlugin):
-    """Files whose names match HANDED_IN, one for each student.
+    """Files whose names match HANDED_IN. None of a student who has two of them.
 
     `nbgrader autograde` grades what is newer than what it has graded. So a file keeps
     the time of its first collection, until the student hands in another one.
     """
 
-    found = Dict()  # file by student and exercise
+    files = Dict()
 
     def collect(self, submitted_file):
         info = super().collect(submitted_file)
         if info:
             student, name = info["student_id"], info["file_id"]
-            other = self.found.setdefault((student, name), submitted_file)
-            if other != submitted_file:
-                self.parent.fail(
-                    f"Nothing was collected. {student} has two files, {other} and"
-                    f" {submitted_file}: remove one in archive/, or the older zip file."
-                )
-            folder = HERE / "submitted" / student / self.parent.coursedir.assignment_id
+            assignment = self.parent.coursedir.assignment_id
+            self.files = self.files or downloaded(assignment)
+            if len(self.files[student, name]) > 1:
+                self.log.warning("%s has several files %s: skipped", student, name)
+                return None
+            folder = HERE / "submitted" / student / assignment
             time = self.parent.coursedir.get_existing_timestamp(str(folder))
             if not time or not same(folder / f"{name}.ipynb", Path(submitted_file)):
                 time = datetime.now(UTC).replace(tzinfo=None)
@@ -167,6 +177,7 @@ class Marks(ExportPlugin):
                 one.parent.name: self.score(gradebook, assignment, one.parent.name)
                 for one in folders
             }
+            found = dict(sorted((found | self.not_collected(assignment.name)).items()))
             rows += [
                 (assignment.name, student, score, f"{assignment.max_score:g}", state)
                 for student, (score, state) in found.items()
@@ -178,6 +189,24 @@ class Marks(ExportPlugin):
         with open(self.to or self.root / "grades.csv", "w", newline="") as file:
             names = ["assignment", "student_id", "score", "max_score", "state"]
             csv.writer(file).writerows([names, *rows])
+
+    def not_collected(self, name):
+        """No score, and the reason, for students without exactly one valid file.
+
+        What was copied by hand counts: only `zip_collect` writes timestamp.txt.
+        """
+        files, found = downloaded(name), {}
+        for student in {student for student, _ in files}:
+            folder = self.root / "submitted" / student / name
+            valid = files.get((student, name), [])
+            collected = len(valid) == 1 or not (folder / "timestamp.txt").is_file()
+            if collected and (folder / f"{name}.ipynb").is_file():
+                continue
+            others = [files[key] for key in files if key[0] == student]
+            count = f"{len(valid)} files, " if len(valid) > 1 else ""
+            names = ", ".join(valid or sum(others, []))
+            found[student] = "", f"not collected: {count}{names}"
+        return found
 
     def score(self, gradebook, assignment, student):
         """The score as text, empty if there is none, and the state of a hand-in."""
@@ -205,12 +234,11 @@ class Marks(ExportPlugin):
     def list_open(self, name, found):
         for student, (_, state) in found.items():
             if state != "graded":
-                self.log.warning("%s of %s: %s", name, student, state)
-        extracted = self.root / "downloaded" / name / "extracted"
-        for file in sorted(extracted.rglob("*")):
-            if file.is_file() and not re.match(HANDED_IN, file.as_posix()):
-                path = file.relative_to(extracted)
-                self.log.warning("%s: %s was not collected", name, path)
+                self.log.warning("%s of %s: %s", name, student or "?", state)
+        for (student, exercise), files in downloaded(name).items():
+            if exercise != name and not found[student][1].startswith("not collected"):
+                names = ", ".join(files)
+                self.log.warning("%s of %s: not collected: %s", name, student, names)
 
     def fill_worksheet(self, name, found):
         """Fill in downloaded/EXERCISE/worksheet.csv; its lines are "Participant N"."""
