@@ -167,6 +167,7 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
         (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,first,')}", "line 2: .*first"),
         (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
         (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
+        (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
     ],
 )  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
@@ -174,7 +175,7 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=f"poses {path}.*{told}"):
         resolve([f"theirs={path}"])
-    path.write_text(f"{COLUMNS}\n{RIGHT},surplus\n")
+    path.write_text(f"{COLUMNS}\n{RIGHT}\n")
     assert resolve([f"theirs={path}"])["theirs"].features == "none"
 
 

@@ -54,7 +54,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
 
 
 def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
-    """Read poses, with a line for each pair, and the hash of the file; surplus fields of a line are ignored."""
+    """Read poses, with a line for each pair, and the hash of the file."""
     data, poses = read_bytes(path, "poses"), {}
     try:
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), restval="")
@@ -65,6 +65,8 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
         raise InputError(f"poses {path}: no column {', '.join(missing)}, expected a CSV file with these")
     for number, line in lines:
         try:
+            if None in line:
+                raise ValueError(f"more than the {len(reader.fieldnames)} fields of the header")
             rotation = Sim3(1.0, _numbers("rotation", line["rotation"], 9).reshape(3, 3), np.zeros(3)).R
             translation, scale = (line.get(name, "") for name in ("translation", "scale"))
             translation = _numbers("translation", translation, 3) if translation else None
