@@ -19,7 +19,7 @@ settings.load_profile("no deadline")
 if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
     install_import_hook("zsp_lite", "typechecking.typechecker")
 
-from zsp_lite.errors import InputError  # noqa: E402
+from zsp_lite.errors import FatalError, InputError  # noqa: E402
 
 _raises = pytest.raises
 
@@ -37,12 +37,12 @@ def _unchecked_raises(expectation):
 
 @wraps(_raises)
 def raises(expected, *args, **kwargs):
-    """`pytest.raises`, but inside `raises(InputError)` annotations are not checked.
+    """`pytest.raises`, but inside `raises(InputError)` and `raises(FatalError)` annotations are not checked.
 
     Bad input violates the annotations as well, but these tests are about the library's own error.
     """
     expectation = _raises(expected, *args, **kwargs)
-    if expected is InputError and not args:
+    if expected in (InputError, FatalError) and not args:
         return _unchecked_raises(expectation)
     return expectation
 

@@ -16,7 +16,7 @@ from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, NoPoseError
 from zsp_lite.labelling.session import Labelling
 from zsp_lite.metrics import rotation_error
 from zsp_lite.own_objects import estimate_pose, open_source
@@ -76,7 +76,7 @@ def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_pa
 def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
     def fail(problem):
         if C in (problem.pair.reference_sequence, problem.pair.target_sequence) or everything:
-            raise InputError("no pose")
+            raise NoPoseError("no pose")
         return solve(problem)
 
     solve, everything = align.hypotheses, False

@@ -1,5 +1,7 @@
 """Umeyama and RANSAC: recovery, equivariance, reflections, degenerate input."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3, _draw_samples, ransac, umeyama
-from zsp_lite.errors import InputError
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.errors import InputError, rotation_matrix
 
 seeds = st.integers(0, 2**32 - 1)
 scales = st.floats(0.3, 4.0)
@@ -54,6 +57,29 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
 def test_what_is_no_similarity_is_refused(scale, R, t):
     with pytest.raises(InputError):
         Sim3(scale, R, t)
+
+
+@pytest.mark.parametrize("rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)])
+def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_its_distance(rounded):
+    exact = similarity(3).R
+    R = rounded(exact)
+    nearest = Rotation.from_matrix(R.astype(float)).as_matrix()
+    found = Sim3.from_matrix(np.vstack([np.c_[2 * R.astype(float), np.ones(3)], [0, 0, 0, 1]]))
+    for one in (Sim3(1.0, R, np.zeros(3)).R, rotation_matrix("R", np.stack([R, R]))[1], found.R):
+        np.testing.assert_allclose(one, nearest, atol=1e-12)
+    assert found.scale == pytest.approx(2, abs=0.02)
+    np.testing.assert_array_equal(Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32))
+    with pytest.raises(InputError, match=r"Sim3: R is .*, 0\.029 off the nearest rotation, expected"):
+        Sim3(1.0, 1.03 * exact, np.zeros(3))
+
+
+def test_a_similarity_keeps_its_values_when_the_arrays_it_was_made_of_change():
+    R, t, trans = np.eye(3), np.zeros(3), np.eye(4)
+    found, label = Sim3(1.0, R, t), PoseLabel(trans, "a", "a")
+    for array in (R, t, trans):
+        array[0] = 5
+    assert_same(found, Sim3.identity())
+    assert np.array_equal(label.trans, np.eye(4))
 
 
 # Umeyama
@@ -139,6 +165,21 @@ def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     first, second = ransac(source, target, seed=5), ransac(source, target, seed=np.random.default_rng(5))
     assert_same(first[0], second[0], atol=0)
     assert (first[1] == second[1]).all()
+
+
+def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wins_wherever_it_is(monkeypatch):
+    source, target, truth, right = contaminated(3, outliers=0.8)
+    tracemalloc.start()
+    found, inliers = ransac(np.tile(source, (20, 1)), np.tile(target, (20, 1)), trials=20_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6  # all residuals at once are 160 MB, their offsets 480 MB
+    assert inliers.reshape(20, 50).all(axis=0)[right].mean() > 0.9
+    np.testing.assert_allclose(found.matrix, truth.matrix, atol=0.15)
+    monkeypatch.setattr("zsp_lite.alignment._BLOCK", 50 * 64)
+    in_blocks, more = ransac(source, target, trials=20_000)
+    assert more.sum() >= ransac(source, target, trials=64)[1].sum() and (more >= right).mean() > 0.9
+    np.testing.assert_allclose(in_blocks.matrix, truth.matrix, atol=0.15)
 
 
 def test_of_two_motions_with_as_many_inliers_the_closer_fit_wins():

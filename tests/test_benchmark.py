@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,11 +90,12 @@ def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):
 def test_frames_that_cannot_be_used_count_as_failures(tmp_path):
     class Blind(CoordinateBackbone):
         def features(self, image):
-            raise InputError("blind")
+            found = super().features(image)
+            return replace(found, saliency=0 * found.saliency)
 
     row = run_rows(["ours"], tmp_path, 2, 5, backbone=Blind(grid=8))["ours"]
     assert row["failed"] == row["n"] == 2 and row["acc30"] == 0 and row["median"] == 180
-    assert set(read_run(tmp_path).row("ours")["failed"]) == {"blind"}
+    assert read_run(tmp_path).row("ours")["failed"].str.contains("all 5 target views were left out").all()
 
 
 def test_a_target_view_with_an_empty_mask_is_left_out_and_the_pair_is_not_lost(tmp_path):

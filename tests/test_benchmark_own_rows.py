@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 import torch
 from benchmark_folder import BACKBONE, exact_keypoints, own_matcher, own_method, placement, run_rows, small_folder
+from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
+from zsp_lite.align import align_category
+from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import identity
@@ -21,13 +24,14 @@ from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, desc
 from zsp_lite.benchmark.own import kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate_pair
-from zsp_lite.benchmark.runs import read_lines, read_run
+from zsp_lite.benchmark.runs import LINES, read_lines, read_run
+from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.pipeline import ZeroShotPose
 
 OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints")
@@ -113,7 +117,7 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     assert [row["failed"] for row in found.values()] == [0, 1, 0]
     for name in ("none", "uneven"):
         assert read_run(tmp_path).row(name)["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
-    with pytest.raises(InputError, match="scores of matches are negative, expected 0 or more"):  # less than no match
+    with pytest.raises(FatalError, match="scores of matches are negative, expected 0 or more"):  # less than no match
         run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)
 
 
@@ -149,7 +153,7 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
-    with pytest.raises(InputError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
+    with pytest.raises(FatalError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
         run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
 
 
@@ -222,18 +226,74 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 
-def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can_be_stored(tmp_path):
+def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can_be_stored(tmp_path, caplog):
     rows = {
         "large": lambda problem: Answer(2 * np.eye(3)), "words": lambda problem: "north",
         "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]), "far view": lambda problem: (np.eye(3), 2),
     }  # fmt: skip
     assert all(row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values())
+    told = "large failed on 1 of 1 pairs, counted as 180°; the first: pose of the row is [[2.0, 0.0, 0.0], "
+    assert told in caplog.text and told in next(iter(every_table(read_run(tmp_path).summary))).note
     run_rows({"sure": lambda problem: Answer(np.eye(3), inliers=4, confidence=1 / 3)}, tmp_path)
     assert read_run(tmp_path).row("sure")[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
     for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}):
         with pytest.raises(InputError, match="run.jsonl cannot be written: "):
             run_rows({"wrong": lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
         assert not [line for line in read_lines(tmp_path) if "wrong" in line.results]
+
+
+def test_a_row_may_answer_in_few_digits(tmp_path):
+    exact = Rotation.from_rotvec([0.3, 0.5, -0.2]).as_matrix()
+    rows = {
+        "exact": lambda problem: exact, "half": lambda problem: exact.astype(np.float16),
+        "decimals": lambda problem: Answer(exact.round(4)),
+        "sim3": lambda problem: Sim3(1.0, exact.round(3), np.ones(3)),
+    }  # fmt: skip
+    found = run_rows(rows, tmp_path, 2)
+    assert [row["failed"] for row in found.values()] == [0] * 4
+    assert [row["median"] for row in found.values()] == pytest.approx([found["exact"]["median"]] * 4, abs=0.1)
+
+
+def overwrite(*frames):
+    for frame in frames:
+        frame.rgb[:], frame.depth[:], frame.mask[:] = 0, 1, 1
+
+
+class Vandal:
+    """Rows of every kind that overwrite all that they get."""
+
+    def problem(self, problem):
+        overwrite(*problem.frames())
+        for view in (*problem.views(), *problem.estimate().target_views, problem.reference, *problem.targets):
+            view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
+        found = problem.estimate(settings={"solver": "verified"})
+        found.matches.reference[:], found.sim3.R[:] = 0, np.eye(3)
+        return np.eye(3)
+
+    def matcher(self, similarity, first, second):
+        similarity[:], first[:], second[:] = 0, False, False
+        return torch.zeros(len(first), dtype=torch.long), torch.zeros(len(first))
+
+    def keypoints(self, first, second):
+        first[:], second[:] = 0, 0
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+
+    def estimate(self, reference, targets):
+        overwrite(reference, *targets)
+        return np.eye(3)
+
+
+def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
+    vandal = Vandal()
+    own = {"problem": vandal.problem, "matcher": vandal.matcher, "keypoints": vandal.keypoints, "estimator": vandal}
+    library = {name: name for name in ("ours", "verified", "sift", "ours-mask", "icp")}
+    for name, rows in (("alone", library), ("last", own | library), ("first", library | own)):
+        run_rows(rows, tmp_path / name, 2)
+    alone, *others = (read_run(tmp_path / name) for name in ("alone", "last", "first"))
+    for name in library:
+        for run in others:
+            found, expected = run.row(name), alone.row(name)
+            assert found.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
 
 
 def fails(problem):
@@ -245,22 +305,57 @@ def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
     own = SimpleNamespace(estimate=lambda reference, targets: fails(None))
     rows = fails, own, lambda first, second: fails(None), lambda similarity, first, second: fails(None)
     for number, row in enumerate(rows):
-        with pytest.raises(InputError, match=where):
+        with pytest.raises(FatalError, match=where):
             run_rows({f"mine {number}": row}, tmp_path)
-    with pytest.raises(InputError, match="ValueError: invalid literal"):
+    with pytest.raises(FatalError, match="ValueError: invalid literal"):
         run_rows({"mine": lambda problem: (np.eye(3), "first")}, tmp_path)
     assert not read_lines(tmp_path)
 
 
-def test_a_backbone_that_answers_nan_ends_the_run_instead_of_counting_pairs_as_failed(tmp_path):
-    class NotANumber(CoordinateBackbone):
-        def __call__(self, images):
-            return [replace(one, keys=one.keys * float("nan")) for one in super().__call__(images)]
+class Broken(CoordinateBackbone):
+    """A backbone with what is wrong in its feature maps."""
 
-    with pytest.raises(InputError, match="keys, .* hold values that are not finite"):
-        run_rows(["ours"], tmp_path, backbone=NotANumber(grid=8))
-    with pytest.raises(InputError, match="the run has no pair that all its rows have finished"):
-        read_run(tmp_path)
+    wrong = None
+
+    def __call__(self, images):
+        return type(self).wrong(super().__call__(images))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
+        (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
+        (lambda maps: maps[1:], "returned 0 of nothing"), (lambda maps: maps[9], "IndexError"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "align"])
+def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypatch, wrong, told, run):
+    monkeypatch.setattr(Broken, "wrong", staticmethod(wrong))
+    backbone = Broken(grid=8)
+    with pytest.raises(FatalError, match=told):
+        if run == "align":
+            align_category(Co3D(small_folder()), "lump", backbone, targets=2, out=tmp_path)
+        else:
+            run_rows({"row": run}, tmp_path, backbone=backbone)
+    assert not (tmp_path / LINES).read_bytes()
+
+
+@pytest.mark.parametrize("run", ["category", "align"])
+def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(tmp_path, run, monkeypatch):
+    def read(dataset, annotation):
+        if annotation.sequence_name == "300_c":
+            raise InputError("image 300_c cannot be decoded")
+        return load(dataset, annotation)
+
+    load = Co3D.load
+    monkeypatch.setattr(Co3D, "load", read)
+    with pytest.raises(FatalError, match="300_c cannot be decoded"):
+        if run == "align":
+            align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
+        else:
+            run_rows(["category"], tmp_path, targets=2)
+    assert "300_c" not in (tmp_path / LINES).read_text()
 
 
 def test_groups_are_made_of_rows_and_rows_of_known_features():

@@ -8,20 +8,24 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cloudpickle
+import cv2
 import numpy as np
 import pytest
 import torch
 from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
 from synthetic_views import CoordinateBackbone
+from threadpoolctl import threadpool_info
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.execution import make_chunks, open_workers
+from zsp_lite.benchmark.execution import make_chunks, one_thread, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
@@ -165,9 +169,39 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
-def test_any_executor_will_do(undisturbed, tmp_path):
-    with ThreadPoolExecutor(2) as executor:
-        assert again(tmp_path, executor)["methods"] == undisturbed[1]["methods"]
+def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
+    class Counting(ThreadPoolExecutor):
+        def submit(self, function, *arguments):
+            sizes.append(len(cloudpickle.dumps(arguments)))
+            return super().submit(function, *arguments)
+
+    sizes, heavy = [], replace(QUICK, _weights=np.zeros(1_000_000))
+    with Counting(2) as executor:
+        found = evaluate(small_folder(), heavy, ROWS, 6, 3, tmp_path, executor)
+    assert found["methods"] == undisturbed[1]["methods"]
+    assert len(sizes) > 2 and max(sizes) < 10_000
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".rows")) == []
+
+
+def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
+    def counts():
+        return cv2.getNumThreads(), {one["filepath"]: one["num_threads"] for one in threadpool_info()}
+
+    def block(waits_for, then):
+        with one_thread():
+            started.wait()
+            waits_for.wait()
+            inside = counts()
+        then.set()
+        return inside
+
+    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
+    go.set()
+    before = counts()
+    with ThreadPoolExecutor(2) as executor:  # the first block to start may be the first or the last to end
+        inside = [one.result() for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))]
+    assert [one[0] for one in inside] == [1, 1]
+    assert counts() == before
 
 
 def test_unusable_executors_are_refused(monkeypatch):

@@ -108,7 +108,7 @@ def two_layouts(tmp_path, noise=0.0):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
     write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
-    write_label(tmp_path / "v1", "chair", PoseLabel(trans, "b", "a"))
+    write_label(tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a"))  # as a text of few decimals
     return worlds, trans
 
 
@@ -119,12 +119,12 @@ def test_labels_are_transferred_between_worlds(tmp_path):
     labels = read_labels(tmp_path / "v2", "chair")
     np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
-    assert rotation_error(labels["b"].trans[:3, :3], expected) < 1e-4
+    assert rotation_error(labels["b"].trans[:3, :3], expected) < 0.01
     # Both labels map the centre of the reference cloud to the same point of the other object.
     centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
     landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
     np.testing.assert_allclose(
-        landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-4
+        landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-3
     )
 
 
@@ -176,10 +176,10 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "expected a rigid transform"),
-        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rigid transform"),
+        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "a.json: trans is .*, 1 off the nearest rotation"),
+        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rotation"),
         ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
-        ({"seq": "b"}, "has seq 'b' .* seq as in its name"),
+        ({"seq": "b"}, "has seq 'b', expected seq as in its name"),
         ({"seq": None}, r"got `null` - at `\$.seq`"),
     ],
 )

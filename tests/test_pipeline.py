@@ -4,6 +4,7 @@ The values are the truth, or symmetries of the problem (`test_sample_pairs.py` h
 setting that is ignored fails: each case changes one, and names the first result that must differ.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,14 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, ref
 
 from zsp_lite import pipeline
 from zsp_lite.alignment import ransac
+from zsp_lite.best_view import ViewMatch, correspondence_score
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose, view_alignment
+from zsp_lite.pipeline import ZeroShotPose, align_best_view, view_alignment
 from zsp_lite.verified import VerifiedSolver, solver
-from zsp_lite.views import extract_views, object_crop, patch_mask
+from zsp_lite.views import View, extract_views, object_crop, patch_mask
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +172,73 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
     alone = estimate_noisy(views[:2], trials=1000, seed=5, threshold=0.3)
     np.testing.assert_array_equal(estimate.sim3.matrix, alone.sim3.matrix)
     assert list(estimate.timings) == ["matching", "solver"]
+
+
+def overwritten(*found):
+    """Overwrite all that a plug-in was given with zeros, in place."""
+    for one in found:
+        if isinstance(one, View):
+            overwritten(one.frame.rgb, one.frame.depth, one.soft_mask, *one.patch_points, *one.measured_points)
+            overwritten(one.features.keys, one.features.saliency, one.foreground)
+        elif isinstance(one, ViewMatch):
+            overwritten(one.reference, one.target, one.similarity, one.matches.reference, one.matches.distance)
+        else:
+            one[...] = 0
+
+
+class Vandal:
+    """A plug-in of every kind that does what it should, and overwrites all that it was given."""
+
+    def matcher(self, similarity, *foregrounds):
+        score, partner = similarity.max(dim=1)
+        overwritten(similarity, *foregrounds)
+        return partner, score.double()
+
+    def selector(self, one):
+        score = correspondence_score(one.matches, one.k)
+        overwritten(one)
+        return score
+
+    def solver(self, reference, targets, matched, *, seed, threshold):
+        found = align_best_view(reference, targets, matched, seed=seed, threshold=threshold)
+        kept = replace(found, matches=deepcopy(found.matches))
+        overwritten(reference, *targets, *matched)
+        return kept
+
+    def backbone(self, images):
+        maps = CoordinateBackbone()(images)
+        overwritten(*images)
+        self.last = maps[0].keys
+        return maps
+
+
+def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets):
+    def estimate(**settings):
+        return ZeroShotPose(**({"backbone": CoordinateBackbone()} | settings)).estimate(reference, targets)
+
+    vandal, before = Vandal(), deepcopy((reference.rgb, targets[0].depth))
+    plain = {"matcher": lambda similarity, *_: (similarity.argmax(dim=1), similarity.amax(dim=1).double())}
+    for spoiled, same in (
+        ({"matcher": vandal.matcher}, plain),
+        ({"matcher": vandal.matcher, "solver": "verified"}, plain | {"solver": "verified"}),
+        ({"view_selector": vandal.selector}, {}), ({"solver": vandal.solver}, {}), ({"backbone": vandal.backbone}, {}),
+    ):  # fmt: skip
+        found, expected = estimate(**spoiled), estimate(**same)
+        np.testing.assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
+        views, others = ((one.reference_view, *one.target_views) for one in (found, expected))
+        for one, other in zip(views, others, strict=True):
+            assert torch.equal(one.features.keys, other.features.keys) and torch.equal(one.foreground, other.foreground)
+            assert np.array_equal(one.frame.rgb, other.frame.rgb) and np.array_equal(one.frame.depth, other.frame.depth)
+    assert np.array_equal(reference.rgb, before[0]) and np.array_equal(targets[0].depth, before[1])
+
+
+@pytest.mark.parametrize(
+    "answer", [lambda maps: maps[:-1], lambda maps: [*maps, maps[0]], lambda maps: [1] * len(maps)]
+)
+def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(reference, targets, answer):
+    method = ZeroShotPose(lambda images: answer(CoordinateBackbone()(images)))
+    with pytest.raises(InputError, match=r"backbone function returned \d of .* for 6 images, expected 6 of FeatureMap"):
+        method.estimate(reference, targets)
 
 
 def test_a_solver_says_whether_kmeans_selects_its_matches(views):

@@ -1,5 +1,6 @@
 """A reference turned in the image: `upright=False` finds the turn, and the pose is that of the image as given."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +19,12 @@ class UprightBackbone(CoordinateBackbone):
     """Coordinates of the object in upright images, noise in turned ones. The object's z is blue and points up."""
 
     images = 0  # that features were computed of
+    seconds = 0.0  # of each image
     salient = True  # whether turned images have a foreground
 
     def features(self, image):
         UprightBackbone.images += 1
+        time.sleep(self.seconds)
         found = super().features(image)
         rows, columns = np.nonzero(image.any(axis=-1))
         height = image[rows, columns, 2].astype(float) - image[rows, columns, 2].mean()
@@ -87,13 +90,15 @@ def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
     assert method.estimate(turn_frame(frames[0], 1), frames[1:]).reference_turn == 270
 
 
-def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames):
+def test_an_upright_reference_gives_the_same_with_and_without_the_turns(frames, monkeypatch):
+    monkeypatch.setattr(UprightBackbone, "seconds", 0.02)
     plain = ZeroShotPose(UprightBackbone()).estimate(frames[0], frames[1:])
     tried = ZeroShotPose(UprightBackbone(), upright=False).estimate(frames[0], frames[1:])
     assert (tried.sim3.matrix == plain.sim3.matrix).all()
     assert tried.reference_turn == plain.reference_turn == 0
     assert (tried.matches.reference == plain.matches.reference).all()
     assert list(tried.timings) == list(plain.timings)
+    assert tried.timings["features"] >= 0.02 * (len(frames) + 3)
 
 
 @pytest.mark.slow

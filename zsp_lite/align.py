@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneConfig, as_backbone
+from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
@@ -27,7 +27,7 @@ from zsp_lite.category import SAME_ANGLE, CategoryAlignment, PairHypotheses, obj
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, NoPoseError
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import write_atomic
@@ -51,14 +51,14 @@ class _Line(msgspec.Struct):
 class PairSolver:
     """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
 
-    def __init__(self, root: str, category: str, backbone: FeatureExtractor | str | BackboneConfig, threads: int):
+    def __init__(self, root: str, category: str, backbone: BackboneLike, threads: int):
         self._store = FrameStore(Co3D(root), category, {"backbone": as_backbone(backbone)}, threads)
 
     def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
         """Find the hypotheses of the pairs of a chunk."""
         for pair, _ in chunk:
             line: dict[str, Any] = {"pair": pair.key}
-            with suppress(InputError):  # the views determine no pose
+            with suppress(NoPoseError):
                 found = hypotheses(Problem(pair, self._store))
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
                 line |= {"probabilities": found.probabilities.tolist()}
@@ -68,7 +68,7 @@ class PairSolver:
 def align_category(
     dataset: Co3D,
     category: str,
-    backbone: FeatureExtractor | str | BackboneConfig = "zsp-tiny",
+    backbone: BackboneLike = "zsp-tiny",
     sequences: Sequence[str] | None = None,
     pairs: int | None = None,
     targets: int = 5,
@@ -153,7 +153,7 @@ def estimate_with_helpers(
     found = {(0, 1): solve(*sources[:2], reference_frame=reference_frame)}
     for a, b in permutations(range(len(sources)), 2):
         if (a, b) != (0, 1) and sources[b].format != "image":  # an image alone is the reference of pairs only
-            with suppress(InputError):  # a pair that has no pose says nothing
+            with suppress(NoPoseError):
                 found[a, b] = solve(sources[a], sources[b], reference_frame=None if a else reference_frame)
     names = [f"{k} {one.name}" for k, one in enumerate(sources)]
     pairs = {

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array
+from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array, rotation_matrix
 
 # Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
 # paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
@@ -19,6 +19,7 @@ SCALE_RANGE = (0.2, 5.0)
 # widths, above the rounding of float32 coordinates on a line.
 _COLLINEAR_SAMPLE, _COLLINEAR_CLOUD = 1e-6, 1e-5
 MOST_TRIALS = 10_000_000
+_BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,17 +27,15 @@ class Sim3:
     """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera points."""
 
     scale: float  # positive, unitless
-    R: Float[np.ndarray, "3 3"]  # rotation
+    R: Float[np.ndarray, "3 3"]  # rotation; the nearest one of what is given (see `errors.rotation_matrix`)
     t: Float[np.ndarray, "3"]  # translation, in units of the target's scene
 
     def __post_init__(self):
-        rotation, translation = real_array("Sim3: R", self.R, (3, 3)), real_array("Sim3: t", self.t, (3,))
+        translation = real_array("Sim3: t", self.t, (3,)).copy()
         if not np.isfinite(translation).all() or not 0 < self.scale < np.inf:
             raise InputError(f"Sim3: scale is {self.scale} and t {translation}, expected finite numbers, scale above 0")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
-            raise InputError(f"Sim3: R is {rotation.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
         object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(self, "R", rotation)
+        object.__setattr__(self, "R", rotation_matrix("Sim3: R", real_array("Sim3: R", self.R, (3, 3))))
         object.__setattr__(self, "t", translation)
 
     def __repr__(self) -> str:
@@ -175,28 +174,42 @@ def ransac(
     if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
         raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
-    samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
+    rng, block = np.random.default_rng(seed), max(_BLOCK // len(source), 1)
+    winners = []
+    for first in range(0, trials, block):
+        samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
+        winners += _best_trial(source, target, samples, threshold, scale_range)
+    if not winners:
+        found = f"no usable sample in {trials} trials over {len(source)} points"
+        raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
+    sim3, chosen, _ = min(winners, key=lambda one: (-one[1].sum(), one[2]))
+
+    if chosen.sum() >= 3:
+        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
+        if conditioning[0] > _COLLINEAR_SAMPLE:
+            return Sim3(*(part[0] for part in fit)), chosen
+    return sim3, chosen
+
+
+def _best_trial(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], samples: Int[np.ndarray, "trials size"],
+    threshold: float, scale_range: tuple[float, float],
+) -> list[tuple[Sim3, Bool[np.ndarray, " n"], float]]:  # fmt: skip
+    """Return the fit to the best sample, its inliers and the sum of their residuals; [] if no sample is usable."""
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        found = f"no usable sample in {trials} trials over {len(source)} points"
-        raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
+        return []
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
-
     linear = scale[:, None, None] * rotation
     offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
     residual = np.sqrt(np.square(offset).sum(axis=1))
     inlier = residual < threshold
     counts = inlier.sum(axis=1)
     leaders = np.flatnonzero(counts == counts.max())
-    best = leaders[np.where(inlier[leaders], residual[leaders], 0).sum(axis=1).argmin()]
-    chosen = inlier[best]
-
-    if counts[best] >= 3:
-        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
-        if conditioning[0] > _COLLINEAR_SAMPLE:
-            return Sim3(*(part[0] for part in fit)), chosen
-    return Sim3(scale[best], rotation[best], translation[best]), chosen
+    sums = np.where(inlier[leaders], residual[leaders], 0).sum(axis=1)
+    best = leaders[sums.argmin()]
+    return [(Sim3(scale[best], rotation[best], translation[best]), inlier[best], float(sums.min()))]
 
 
 def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:

@@ -4,8 +4,8 @@ import math
 import numbers
 import reprlib
 import traceback
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 # Largest coordinate, in any unit of length or in pixels. Beyond 1e150 squares overflow, and LAPACK may never return.
 MAX_LENGTH = 1e9
+# Largest entry of the difference between a rotation matrix from outside, a few decimals or half precision, and the
+# nearest rotation; and of |R @ R.T - I| for a rotation in float32, which is kept as it is.
+ROTATION_TOLERANCE, _FLOAT32_TOLERANCE = 1e-2, 1e-6
 _LONGEST = 1000  # characters of a message
 
 
@@ -27,14 +30,32 @@ class InputError(ValueError):
         super().__init__(message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}")
 
 
-class FatalError(InputError):
-    """An InputError of the backbone or a row's code, which ends a benchmark run; others count the pair as failed."""
+class NoPoseError(InputError):
+    """Two objects whose views do not determine a pose, for instance for want of depth; all else is in order."""
+
+
+class FatalError(ValueError):
+    """An error that ends a benchmark run: a broken backbone, an unreadable frame, a mistake in the code of a row.
+
+    It is no InputError, by which a row says that a pair has no pose, and nothing is stored for the pair that it hits.
+    """
 
 
 def describe_failure(error: BaseException) -> str:
     """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
     *_, last = traceback.extract_tb(error.__traceback__)
     return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
+
+
+@contextmanager
+def ends_the_run(what: str) -> Iterator[None]:
+    """Turn an error of the block, which reads data or calls a backbone, into a FatalError: it is not the pair's."""
+    try:
+        yield
+    except InputError as error:
+        raise FatalError(str(error)) from error
+    except Exception as error:  # a plug-in may raise anything
+        raise FatalError(f"{what} failed: {describe_failure(error)}") from error
 
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:
@@ -82,3 +103,41 @@ def real_array(name: str, values: object, shape: tuple[int | None, ...] | None =
     if shape is not None:
         expected += f" of shape {shape}".replace("None", "n")
     raise InputError(f"{name} {found or f'is {reprlib.repr(values)}'}, expected {expected}")
+
+
+def rotation_matrix(name: str, values: object) -> "np.ndarray":
+    """Convert rotations (..., 3, 3) from outside to float64: rounded ones become the nearest rotations.
+
+    InputError, which says how far off they are, for matrices that are no rotations within `ROTATION_TOLERANCE`.
+    """
+    import numpy as np
+
+    matrix = real_array(name, values)
+    if matrix.shape[-2:] != (3, 3):
+        raise InputError(f"{name} has shape {matrix.shape}, expected (..., 3, 3)")
+    check_magnitude(name, matrix)
+    deviation = np.abs(matrix @ matrix.swapaxes(-1, -2) - np.eye(3)).max(axis=(-2, -1))
+    rounded = (deviation > _FLOAT32_TOLERANCE) | (np.linalg.det(matrix) < 0)
+    if not rounded.any():
+        return matrix.copy()
+    left, _, right = np.linalg.svd(matrix)
+    left[..., 2] *= np.linalg.det(left @ right)[..., None]  # of a reflection, the nearest rotation
+    nearest = left @ right
+    off = np.abs(nearest - matrix).max()
+    if off > ROTATION_TOLERANCE:
+        found = f"is {reprlib.repr(matrix.tolist())}, {off:.2g} off the nearest rotation"
+        raise InputError(f"{name} {found}, expected a rotation, R @ R.T = identity and det R = 1")
+    return np.where(rounded[..., None, None], nearest, matrix)
+
+
+def rigid_matrix(name: str, values: object) -> "np.ndarray":
+    """Convert a rigid transform (4, 4) from outside to float64, with the rotation that `rotation_matrix` returns."""
+    import numpy as np
+
+    matrix = real_array(name, values, (4, 4)).copy()
+    check_magnitude(name, matrix)
+    if (off := np.abs(matrix[3] - (0, 0, 0, 1)).max()) > ROTATION_TOLERANCE:  # for instance a transposed matrix
+        raise InputError(f"{name} has the last row {matrix[3].tolist()}, {off:.2g} off the expected 0 0 0 1")
+    matrix[:3, :3] = rotation_matrix(name, matrix[:3, :3])
+    matrix[3] = 0, 0, 0, 1
+    return matrix

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zsp_lite.errors import FatalError, InputError
+from zsp_lite.errors import InputError
 
 Grid = tuple[int, int]  # (rows, columns) of patches
 # A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
@@ -24,20 +24,28 @@ SALIENCY_THRESHOLD = 0.05
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Features of one image. InputError if shapes do not fit together, FatalError if values are not finite."""
+    """Features of one image: copies of what is given, as float32 tensors on the CPU without gradients.
+
+    InputError if shapes do not fit together or values are not finite.
+    """
 
     keys: Float[Tensor, "h w d"]  # key of each patch
     saliency: Float[Tensor, "h w"]  # saliency of each patch, in [0, 1]
     global_feature: Float[Tensor, " e"]  # feature of the whole image
 
-    def __post_init__(self):  # because a user may plug in any backbone
+    def __post_init__(self):  # because a user may plug in any backbone, on any device
+        for name in ("keys", "saliency", "global_feature"):
+            values = torch.as_tensor(getattr(self, name)).detach().cpu()
+            # `clone` outside inference mode: the copy can enter a graph with gradients.
+            with torch.inference_mode(False):
+                object.__setattr__(self, name, values.to(torch.float32).clone())
         keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
         if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
                 f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, W, D), (H, W)"
             )
         if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
-            raise FatalError("FeatureMap: keys, saliency or global feature hold values that are not finite")
+            raise InputError("FeatureMap: keys, saliency or global feature hold values that are not finite")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape

@@ -24,6 +24,7 @@ from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
 from zsp_lite.matchers import MATCHERS, Matcher
 
@@ -146,7 +147,7 @@ def match(
         (sim,) = (similarities if binning else key_similarities)(ref, [target])
     on_ref = ref.foreground() if ref_foreground is None else ref_foreground
     on_target = target.foreground() if target_foreground is None else target_foreground
-    on_ref, on_target = (torch.as_tensor(mask, device=sim.device) for mask in (on_ref, on_target))
+    on_ref, on_target = torch.as_tensor(on_ref), torch.as_tensor(on_target)
     if cycle_from == "reference":
         start, end, on_start, on_end = ref, target, on_ref, on_target
     else:
@@ -155,16 +156,21 @@ def match(
         score, neighbour = _cycles(sim, on_start, on_end, published=cycle_from == "target")
     else:
         rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
-        neighbour, score = rank(sim, on_start.flatten(), on_end.flatten())
+        # Copies, since a matcher may overwrite what it gets, such as the similarities of the background.
+        answer = rank(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
+        neighbour, score = (torch.as_tensor(one).cpu() for one in answer)
+        if not len(neighbour) == len(score) == len(sim):
+            found = f"{len(neighbour)} partners and {len(score)} scores"
+            raise InputError(f"the matcher returned {found}, expected one for each of {len(sim)} patches")
     best = sim.gather(1, neighbour[:, None])[:, 0]
 
     # The rest works on a few hundred numbers, in NumPy.
-    score, best, neighbour = (x.cpu().numpy() for x in (score, best, neighbour))
+    score, best, neighbour = score.numpy(), best.numpy(), neighbour.numpy()
     order = np.lexsort((-best, -score))
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
-        by_cluster = np.lexsort((-start.saliency.flatten().cpu().numpy()[order], clusters))  # the most salient first
+        by_cluster = np.lexsort((-start.saliency.flatten().numpy()[order], clusters))  # the most salient first
         first = np.unique(clusters[by_cluster], return_index=True)[1]
         order = order[np.sort(by_cluster[first])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
@@ -234,7 +240,7 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
     """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
-    keys = features.keys.cpu().double()
+    keys = features.keys.double()
     index = torch.from_numpy(index)
     descriptors = keys.flatten(0, 1)[index]
     if binning:

@@ -4,9 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError, check_magnitude, real_array
-
-_ROTATION_TOLERANCE = 1e-2  # largest entry of |R @ R.T - I|
+from zsp_lite.errors import rotation_matrix
 
 
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
@@ -25,7 +23,8 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     Raises:
         InputError: For other shapes and matrices that are no rotations.
     """
-    return rotation_angle(_rotations("first", first), _rotations("second", second))
+    first = rotation_matrix("rotation_error: first", first)
+    return rotation_angle(first, rotation_matrix("rotation_error: second", second))
 
 
 def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]) -> np.ndarray | float:
@@ -84,15 +83,3 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None) -> np.ndarray | 
         return np.mean(values, axis=-1)
     weights = np.asarray(weights)
     return (weights * values).sum(axis=-1) / weights.sum(axis=-1)
-
-
-def _rotations(name: str, values: ArrayLike) -> Float[np.ndarray, "*batch 3 3"]:
-    """Convert and check rotation matrices."""
-    matrices = real_array(f"rotation_error: {name}", values)
-    if matrices.shape[-2:] != (3, 3):
-        raise InputError(f"rotation_error: {name} has shape {matrices.shape}, expected (..., 3, 3)")
-    check_magnitude(f"rotation_error: {name}", matrices)
-    deviation = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max(initial=0)
-    if deviation > _ROTATION_TOLERANCE or (np.linalg.det(matrices) < 0).any():
-        raise InputError(f"rotation_error: {name} is no rotation, expected R @ R.T = identity, det R = 1")
-    return matrices

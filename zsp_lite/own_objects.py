@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import DEFAULT, BackboneConfig, as_backbone
+from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, view_span
@@ -21,7 +21,6 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
 from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
-from zsp_lite.features import FeatureExtractor
 from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame, camera_from_pose
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
@@ -113,7 +112,7 @@ def estimate_pose(
     targets: int = 5,
     mask: str | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
-    backbone: str | BackboneConfig | FeatureExtractor = DEFAULT,
+    backbone: BackboneLike = DEFAULT,
     out: str | Path | None = None,
     upright: bool = True,
 ) -> PairResult:

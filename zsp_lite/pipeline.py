@@ -3,6 +3,7 @@
 import pkgutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
-from zsp_lite.errors import InputError, check_choice, check_integer, check_number
+from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
@@ -107,11 +108,12 @@ class ZeroShotPose:
             InputError: There are no targets, no target is usable, or the reference has an empty mask or no known
                 depth.
         """
-        timings: dict[str, float] = {}
+        timings = Counter()
         with timed(timings, "features"):
             first, *others = self.views([reference, *targets])
         found = self.estimate_from_views(first, others)
-        return replace(found, timings=timings | found.timings)
+        timings.update(found.timings)  # adds the features of the reference's turns
+        return replace(found, timings=dict(timings))
 
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
@@ -150,12 +152,14 @@ class ZeroShotPose:
         if not targets:
             raise InputError("no target views, expected at least one")
         if defect := frame_defect(reference.frame):
-            raise InputError(f"reference {reference.frame.name or 'view'}: {defect}")
+            raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")
         if self.upright or matched is not None:
             return self._solve(reference, targets, matched)
-        turned = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
-        turns = [reference, *extract_views(self.backbone, turned, self.foreground)]
-        found, failures, timings = [], [], Counter()
+        features: dict[str, float] = {}
+        with timed(features, "features"):
+            turned = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
+            turns = [reference, *extract_views(self.backbone, turned, self.foreground)]
+        found, failures, timings = [], [], Counter(features)
         for quarters, view in enumerate(turns):
             try:
                 one = self._solve(view, targets)
@@ -180,14 +184,14 @@ class ZeroShotPose:
             with timed(timings, "matching"):
                 matched = self.match_views(reference, targets)
         usable, flags = usable_targets(targets)
-        found = self._solver()(
-            reference, [targets[i] for i in usable], [matched[i] for i in usable],
-            seed=self.seed, threshold=self.threshold,
-        )  # fmt: skip
+        seen = reference, [targets[i] for i in usable], [matched[i] for i in usable]
+        if not isinstance(self.solver, str):  # a plug-in may overwrite what it gets
+            seen = deepcopy(seen)
+        found = self._solver()(*seen, seed=self.seed, threshold=self.threshold)
         scores = np.full(len(targets), -np.inf)
         scores[usable] = found.view_scores
         return replace(
-            found, view=usable[found.view], view_scores=scores, target_views=tuple(targets),
+            found, view=usable[found.view], view_scores=scores, reference_view=reference, target_views=tuple(targets),
             timings=timings | found.timings, flags=(*flags, *found.flags),
             hypotheses=tuple(replace(one, view=usable[one.view]) for one in found.hypotheses),
         )  # fmt: skip
@@ -229,8 +233,11 @@ def align_best_view(
     """
     timings: dict[str, float] = {}
     with timed(timings, "view"):
-        select = VIEW_SELECTORS[view_selector] if isinstance(view_selector, str) else view_selector
-        scores = np.array([select(one) for one in matched], dtype=np.float64)
+        if isinstance(view_selector, str):
+            scores = [VIEW_SELECTORS[view_selector](one) for one in matched]
+        else:  # a plug-in may overwrite what it gets
+            scores = [view_selector(deepcopy(one)) for one in matched]
+        scores = np.array(scores, dtype=np.float64)
         best = int(scores.argmax())
         matches = matched[best].matches
     with timed(timings, "alignment"):

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, NoPoseError
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
@@ -42,7 +42,7 @@ class View:
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
         """Foreground patches with measured depth."""
-        return np.asarray(self.foreground.cpu()) & self.measured_points[1]
+        return self.foreground.numpy() & self.measured_points[1]
 
 
 def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
@@ -55,8 +55,19 @@ def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
 
 def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency") -> list[View]:
     """Extract the views of object crops, their features in one batch; see `frame_view` for the foreground."""
-    maps = backbone([crop.rgb for crop in crops])
-    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps)]
+    maps = feature_maps(backbone, crops)
+    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps, strict=True)]
+
+
+def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[FeatureMap]:
+    """Call a backbone on copies of the crops' images; InputError unless it returns a feature map for each."""
+    maps = list(backbone([crop.rgb.copy() for crop in crops]))
+    if len(maps) != len(crops) or not all(isinstance(one, FeatureMap) for one in maps):
+        name = getattr(backbone, "name", type(backbone).__name__)
+        kinds = ", ".join(sorted({type(one).__name__ for one in maps})) or "nothing"
+        expected = f"expected {len(crops)} of FeatureMap"
+        raise InputError(f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}")
+    return maps
 
 
 def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") -> View:
@@ -66,9 +77,9 @@ def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") 
     mask covers at least a quarter. A frame with an empty mask has no foreground.
     """
     if foreground == "mask" or (crop.mask is not None and not crop.mask.any()):
-        return View(crop, features, patch_mask(crop, features.grid).to(features.keys.device), crop.mask)
+        return View(crop, features, patch_mask(crop, features.grid), crop.mask)
     # As a soft mask: 0 for no saliency, 0.5 at the threshold of the foreground, 1 from twice that on.
-    ramp = (features.saliency.cpu().numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
+    ramp = (features.saliency.numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
     soft_mask = cv2.resize(ramp, crop.camera.size[::-1], interpolation=cv2.INTER_LINEAR)
     return View(crop, features, features.foreground(), soft_mask)
 
@@ -76,7 +87,7 @@ def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") 
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
     """Select the target views that a pose can be estimated in: those without a `frame_defect`, with a foreground patch.
 
-    Returns their indices, and for each other view a flag that names it and the reason. InputError if none is usable.
+    Returns their indices, and for each other view a flag that names it and the reason. NoPoseError if none is usable.
     """
     usable, flags = [], []
     for index, target in enumerate(targets):
@@ -86,7 +97,7 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
         else:
             usable.append(index)
     if not usable:
-        raise InputError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
+        raise NoPoseError(f"all {len(targets)} target views were left out: {'; '.join(flags)}")
     return usable, tuple(flags)
 
 

@@ -76,8 +76,8 @@ class Backbone:
             images: RGB images (H, W, 3) of any sizes, uint8 or float in [0, 1].
 
         Returns:
-            One FeatureMap per image, float32, on the backbone's device. The saliency is the CLS attention averaged over
-            the saliency heads, min-max normalised to [0, 1].
+            One FeatureMap per image, float32, on the CPU. The saliency is the CLS attention averaged over the saliency
+            heads, min-max normalised to [0, 1].
 
         Raises:
             InputError: For other image types, shapes or values.
@@ -95,11 +95,7 @@ class Backbone:
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
             parts = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
-        # Copied outside inference mode: these tensors can enter a graph with gradients, and they do not keep the whole
-        # batch in memory.
-        return [
-            FeatureMap(*(values[index].to(torch.float32, copy=True) for values in parts)) for index in range(len(batch))
-        ]
+        return [FeatureMap(*one) for one in zip(*(values.cpu() for values in parts), strict=True)]
 
 
 def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:

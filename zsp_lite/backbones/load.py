@@ -63,6 +63,9 @@ class BackboneConfig:
     image_size: int | None = None
 
 
+BackboneLike = FeatureExtractor | str | Path | BackboneConfig  # a backbone, or what `load_backbone` takes
+
+
 def load_backbone(
     name_or_path: str | Path | BackboneConfig = DEFAULT,
     device: str | torch.device | None = None,
@@ -113,9 +116,9 @@ def load_backbone(
     return backbone
 
 
-def as_backbone(backbone: FeatureExtractor | str | BackboneConfig) -> FeatureExtractor:
-    """Return a backbone as it is, and load one that is given by name or by its config."""
-    return load_backbone(backbone) if isinstance(backbone, str | BackboneConfig) else backbone
+def as_backbone(backbone: BackboneLike) -> FeatureExtractor:
+    """Return a backbone as it is, and load one that is given by name, by the path of its file or by its config."""
+    return load_backbone(backbone) if isinstance(backbone, str | Path | BackboneConfig) else backbone
 
 
 def available_backbones() -> dict[str, Path | None]:

@@ -13,7 +13,7 @@ from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, NoPoseError
 
 _K = 50  # number of matches, as in "Ours"
 
@@ -67,7 +67,7 @@ def _of_all_objects(store: FrameStore, views: int) -> list[PairHypotheses]:
     if ("category", views) not in store.kept:
         found = []
         for pair in object_pairs(store.dataset, store.category, None, None, views):
-            with suppress(InputError):  # the views determine no pose
+            with suppress(NoPoseError):
                 found.append(hypotheses(Problem(pair, store)))
         store.kept["category", views] = found
     return store.kept["category", views]

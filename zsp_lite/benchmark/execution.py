@@ -8,10 +8,10 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing import active_children, get_context, parent_process
+from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import cloudpickle
 import cv2
@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer
+from zsp_lite.io.files import digest, read_bytes, write_atomic
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
@@ -37,20 +38,25 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None
+    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that the method `lines` of what `make` makes, such as a `run.Evaluator`, finds."""
+    """Yield the lines that the method `lines` of what `make` makes, such as a `run.Evaluator`, finds.
+
+    `shared` is a new file in a folder that all workers see.
+    """
     if executor is None:
         evaluator = make()
         with one_thread():
             for chunk in chunks:
                 yield from ([line] for line in evaluator.lines(chunk))
         return
-    # cloudpickle: methods and backbones that are defined in a notebook travel by value.
-    make = cloudpickle.dumps((uuid4(), make))
+    # cloudpickle: methods and backbones that are defined in a notebook travel by value. In a file, because a backbone
+    # has megabytes, and each worker reads it once.
+    pickled = cloudpickle.dumps(make)
     futures = []
     try:
-        futures += [executor.submit(_evaluate_chunk, make, chunk) for chunk in chunks]
+        write_atomic(shared, pickled)
+        futures += [executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk) for chunk in chunks]
         for future in as_completed(futures):
             yield future.result()
     except Exception as error:
@@ -63,29 +69,45 @@ def evaluate_chunks(
     finally:
         for future in futures:
             future.cancel()
+        shared.unlink(missing_ok=True)
 
 
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(make: bytes, chunk: Chunk) -> list[dict[str, Any]]:
+def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[str, Any]]:
     """Evaluate a chunk in a worker, which keeps its evaluator for the next one of the same call."""
-    if getattr(_worker, "make", None) != make:
-        _worker.evaluator, _worker.make = cloudpickle.loads(make)[1](), make
+    if getattr(_worker, "shared", None) != shared:
+        pickled = read_bytes(shared, "rows of the run")
+        if digest(pickled) != digest_of_it:  # never unpickle what somebody else has written
+            raise InputError(f"rows of the run {shared} have changed, expected the file that this run wrote")
+        _worker.evaluator, _worker.shared = cloudpickle.loads(pickled)(), shared
     with one_thread():
         return list(_worker.evaluator.lines(chunk))
+
+
+_lock, _blocks, _of_process = threading.Lock(), 0, ExitStack()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Restrict all libraries to one thread within a block: more are slower on small matrices, and disturb workers."""
-    cv2_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    global _blocks
+    with _lock:
+        _blocks += 1
+        # OpenCV and BLAS have one number for all threads of the process: the last of several blocks restores it.
+        if _blocks == 1:
+            _of_process.callback(cv2.setNumThreads, cv2.getNumThreads())
+            cv2.setNumThreads(1)
+            _of_process.enter_context(threadpool_limits(1, user_api="blas"))
     try:
-        with threadpool_limits(1):  # torch, BLAS, OpenMP
+        with threadpool_limits(1, user_api="openmp"):  # of this thread; torch counts by it
             yield
     finally:
-        cv2.setNumThreads(cv2_threads)
+        with _lock:
+            _blocks -= 1
+            if not _blocks:
+                _of_process.close()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from typing import Any, Protocol
@@ -15,12 +16,12 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError, real_array
+from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.views import IMAGE_SIZE, View, frame_view, object_crop
+from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
 FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
@@ -72,7 +73,7 @@ def as_answer(found: Any) -> Answer:
 
 
 def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
-    return Sim3(1.0, real_array("pose of the row", pose), np.zeros(3)).R
+    return rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3)))
 
 
 class FrameStore:
@@ -94,16 +95,17 @@ class FrameStore:
     def _frame(self, key: FrameKey) -> Frame:
         """Return a frame's object crop, resized to the backbone's input."""
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
-        annotation = self.dataset.frame(self.category, *key)
-        return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
+        with ends_the_run(f"reading frame {key[0]}/{key[1]}"):
+            annotation = self.dataset.frame(self.category, *key)
+            return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
 
     def _describe(self, features: str, key: FrameKey) -> Any:
         """Return what an extractor computes from a frame's crop."""
         extractor, crop = self.extractors[features], self.frame(key)
-        describe = getattr(extractor, "describe", None)
+        extract = getattr(extractor, "describe", None) or partial(feature_maps, extractor)
         # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
-        with threadpool_limits(self.threads):
-            return self.timed(features, describe or extractor, [crop if describe else crop.rgb])[0]
+        with threadpool_limits(self.threads), ends_the_run(f"features {features!r}"):
+            return self.timed(features, extract, [crop])[0]
 
     def _view(self, features: str, key: FrameKey, foreground: str) -> View:
         """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
@@ -126,9 +128,16 @@ class Problem:
     def __init__(self, pair: Pair, store: FrameStore):
         self.pair, self.seed, self.store = pair, pair.seed, store
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
-        self.keys: list[FrameKey] = [(pair.reference_sequence, pair.reference_frame), *targets]
+        self.keys: tuple[FrameKey, ...] = (pair.reference_sequence, pair.reference_frame), *targets
         self._estimates: dict[tuple, PoseEstimate] = {}
         self._similarity = cache(self._compare)
+        self._hand_over: Callable[[Any], Any] = lambda shared: shared
+
+    def with_copies(self) -> "Problem":
+        """Return the problem for a row of one's own: what it returns are copies, which the row may overwrite."""
+        problem = copy(self)
+        problem._hand_over = deepcopy
+        return problem
 
     @property
     def reference(self) -> View:
@@ -148,11 +157,11 @@ class Problem:
         frames = [self.store.frame(key) for key in self.keys]
         if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
             raise InputError(f"no depth map: {', '.join(missing)}")
-        return frames
+        return self._hand_over(frames)
 
     def views(self) -> list[View]:
         """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
-        return [self.store.view("backbone", key, "saliency") for key in self.keys]
+        return self._hand_over([self.store.view("backbone", key, "saliency") for key in self.keys])
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
@@ -169,7 +178,7 @@ class Problem:
             self._estimates[name] = method.estimate_from_views(reference, targets, matched)
             for stage, seconds in self._estimates[name].timings.items():
                 self.store.timings.setdefault(stage, []).append(seconds)
-        return self._estimates[name]
+        return self._hand_over(self._estimates[name])
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
         similarity = self._similarity(reference.features, target.features, method.binning)

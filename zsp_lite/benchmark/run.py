@@ -10,13 +10,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Float
 from torch import get_num_threads
 from tqdm import tqdm
 
-from zsp_lite.backbones.load import BackboneConfig, as_backbone
+from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
@@ -29,7 +30,6 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, labelled_categories, shipped_pairs
 from zsp_lite.errors import FatalError, InputError, check_integer, describe_failure
-from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 
 def evaluate(
     data: str | Path,
-    backbone: FeatureExtractor | str | BackboneConfig,
+    backbone: BackboneLike,
     methods: str | Sequence[str] | Mapping[str, Any] = GROUPS["default"],
     pairs: int | Mapping[str, int] = 100,
     targets: int = 5,
@@ -96,7 +96,10 @@ def evaluate(
         with open_run(out, settings, allow_other_version):
             make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
             evaluate_pairs(out, make, work, pool, workers)
-    return _write_summary(read_run(out), out)
+    found = read_run(out)
+    for failure in found.failures:
+        logger.warning("%s", failure)
+    return _write_summary(found, out)
 
 
 def write_reports(run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN) -> dict:
@@ -133,11 +136,12 @@ def evaluate_pairs(
     todo = {pair: names for pair, names in new.items() if names}
     chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
     make = partial(make, max(1, get_num_threads() // workers))
+    shared = Path(out) / f".rows-{uuid4()}"  # for the workers
     quiet = not logger.isEnabledFor(logging.INFO)
     look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
     with (
         tqdm(total=len(work), initial=len(work) - len(todo), **look) as bar,
-        closing(execution.evaluate_chunks(make, chunks, pool)) as found,
+        closing(execution.evaluate_chunks(make, chunks, pool, shared)) as found,
     ):
         for lines in found:
             add_lines(out, lines, kind)
@@ -197,9 +201,10 @@ def evaluate_pair(
 
 
 def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dict[str, Any]:
-    start = time.perf_counter()
+    start, own = time.perf_counter(), replace(method, targets=None) not in METHODS.values()
+    given = problem.with_copies() if own else problem
     try:
-        answer = as_answer(method.solve(problem)) if method.solve else _answer(method, problem, truths)
+        answer = as_answer(method.solve(given)) if method.solve else _answer(method, problem, truths)
         if not 0 <= answer.view < len(truths):
             raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
     except FatalError:
@@ -207,7 +212,7 @@ def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dic
     except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
         return {"error": 180.0, "failed": str(error)}
     except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
-        if replace(method, targets=None) in METHODS.values():
+        if not own:
             raise
         raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
     result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])

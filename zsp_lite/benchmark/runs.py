@@ -88,8 +88,19 @@ class Run:
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
         data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
         data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
-        note = {"note": self.note} if self.note else {}
+        notes = " ".join(filter(None, [self.note, *self.failures]))
+        note = {"note": notes} if notes else {}
         return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
+
+    @cached_property
+    def failures(self) -> list[str]:
+        """Of each row that failed on pairs: on how many, and the reason of the first."""
+        failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)["failed"]
+        pairs = self.table["row"].value_counts()
+        return [
+            f"{name} failed on {len(reasons)} of {pairs[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
+            for name, reasons in failed
+        ]
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""

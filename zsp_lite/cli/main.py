@@ -21,7 +21,7 @@ from zsp_lite.cli.demo import demo
 from zsp_lite.cli.doctor import doctor
 from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.synth import synth
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 
 
 @click.group(
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except click.UsageError as error:
         command = error.ctx.command_path if error.ctx else "zsp-lite"
         message = f"{error.format_message()} (see: {command} --help)"
-    except InputError as error:
+    except (InputError, FatalError) as error:
         message = str(error)
     except BrokenPipeError:  # the reader of the output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

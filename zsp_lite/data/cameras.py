@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array
+from zsp_lite.errors import check_integer, check_magnitude, check_number, real_array, rotation_matrix
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
@@ -22,10 +22,6 @@ NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 _QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
-# Largest entry of |R @ R.T - I|: a matrix above the first is refused, one above the second (rounded to a few
-# decimals) is replaced by the nearest rotation. Rotations in float32 are below both.
-_ROTATION_TOLERANCE = 1e-3
-_FLOAT32_TOLERANCE = 1e-6
 MOST_PIXELS = 1_000_000  # of a side
 _STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
 
@@ -45,12 +41,7 @@ class Camera:
             array = np.array(real_array(f"camera {name}", getattr(self, name), shape))
             check_magnitude(f"camera {name}", array)
             object.__setattr__(self, name, array)
-        deviation = np.abs(self.R @ self.R.T - np.eye(3)).max()
-        if deviation > _ROTATION_TOLERANCE or np.linalg.det(self.R) < 0:
-            raise InputError(f"camera R is {self.R.tolist()}, expected a rotation: R @ R.T = identity, det R = 1")
-        if deviation > _FLOAT32_TOLERANCE:
-            left, _, right = np.linalg.svd(self.R)
-            object.__setattr__(self, "R", left @ right)
+        object.__setattr__(self, "R", rotation_matrix("camera R", self.R))
         check_number("camera focal_length", float(self.focal_length.min()), above=1e-3)
         real_array("image size (height, width)", tuple(self.size), (2,))
         for side in self.size:

@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
-from zsp_lite.errors import InputError, check_magnitude
+from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 
-_RIGID_TOLERANCE = 1e-3  # largest deviation from a rigid transform: labels are decimal numbers of few digits
 _Row = tuple[float, float, float, float]
 
 
@@ -36,6 +35,9 @@ class PoseLabel:
     trans: Float[np.ndarray, "4 4"]
     seq: str
     reference_seq: str
+
+    def __post_init__(self):
+        object.__setattr__(self, "trans", np.array(self.trans, dtype=np.float64))
 
 
 def label_folder(root: str | Path, category: str) -> Path:
@@ -59,14 +61,9 @@ def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict
 def read_label(path: Path) -> PoseLabel:
     """Read a label file; InputError if it lacks a field, is not rigid, or has another name."""
     label = read_json(path, _LabelFile, "label")
-    trans = np.array(label.trans)
-    check_magnitude(f"label {path}: trans", trans)
-    rotation = trans[:3, :3]
-    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(trans[3] - (0, 0, 0, 1)).max())
-    if deviation > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or label.seq != path.stem:
-        found = f"seq {label.seq!r} and trans {trans.tolist()}"
-        raise InputError(f"label {path} has {found}, expected a rigid transform, and seq as in its name")
-    return PoseLabel(trans, label.seq, label.reference_seq)
+    if label.seq != path.stem:
+        raise InputError(f"label {path} has seq {label.seq!r}, expected seq as in its name")
+    return PoseLabel(rigid_matrix(f"label {path}: trans", label.trans), label.seq, label.reference_seq)
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:

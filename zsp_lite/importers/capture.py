@@ -13,12 +13,11 @@ from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame, check_pixels, read_grey16, read_image, read_mask
-from zsp_lite.errors import MAX_LENGTH, InputError, real_array
+from zsp_lite.errors import MAX_LENGTH, InputError, real_array, rigid_matrix
 from zsp_lite.io.files import decode_json, path_inside, read_bytes, read_json
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-_RIGID_TOLERANCE = 2e-2  # largest deviation from a rigid transform: poses are decimal numbers of few digits
 _SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -74,15 +73,8 @@ def camera_from_pose(
     pose: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], size: tuple[int, int], where: str
 ) -> Camera:
     """Create a camera from fx, fy, cx, cy and its camera-to-world pose in OpenCV's axes; errors begin with `where`."""
+    pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
-    if (
-        not np.abs(pose).max() <= MAX_LENGTH  # false for NaN too
-        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or np.abs(pose[3] - (0, 0, 0, 1)).max() > _RIGID_TOLERANCE  # for instance a transposed matrix
-    ):
-        raise InputError(f"{where}: pose is {pose.tolist()}, expected a finite rigid camera-to-world matrix")
-    rotation = np.linalg.multi_dot(np.linalg.svd(rotation)[::2])
     values = real_array(f"{where}: intrinsics", intrinsics, (4,))
     try:
         return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, view_span
-from zsp_lite.errors import InputError
+from zsp_lite.errors import NoPoseError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.poses import Poses, exp_, float_tensor
@@ -245,7 +245,7 @@ def _normalisation(
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
     """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the outliers as invalid."""
     if (n := int(valid.sum())) < MIN_POINTS:
-        raise InputError(f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}")
+        raise NoPoseError(f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}")
     kept = valid.copy()
     kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
     mean, spread = points[kept].mean(axis=0), standard_deviation(points[kept])
