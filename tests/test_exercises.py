@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
 
@@ -94,10 +95,7 @@ MISTAKES = {
             "last trial, not the best": ("if (residuals < threshold).sum() > best.sum():", "if True:"),
             "no fit to all inliers": ("fit(x[best], y[best])", "fit(x[sample], y[sample])"),
             "the same match twice in a sample": ("replace=False", "replace=True"),
-            "the last number of inliers, not the best": (
-                "needed(best.sum())",
-                "needed(done and (residuals < threshold).sum())",
-            ),
+            "last count, not the best": ("needed(best.sum())", "needed(done and (residuals < threshold).sum())"),
             "never stops early": (" and done < needed(best.sum())", ""),
         },
     },
@@ -112,10 +110,7 @@ MISTAKES = {
         },
         "accuracy": {
             "pairs drawn": ("np.unique(objects", "np.unique(np.arange(len(errors))"),
-            "mean over objects": (
-                "right[drawn].sum(axis=1) / number[drawn].sum(axis=1)",
-                "(right / number)[drawn].mean(1)",
-            ),
+            "object means": ("right[drawn].sum(axis=1) / number[drawn].sum(axis=1)", "(right / number)[drawn].mean(1)"),
             "30 degrees count as below 30": ("< threshold", "<= threshold"),
         },
     },
@@ -325,6 +320,20 @@ def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared,
         assert failing_tests(prepared(assignment), notebook, notebook) == {f"test_{task}_1", f"test_{task}_2"}
 
 
+def turn_into_text(cell):
+    cell.cell_type = "markdown"
+    del cell["outputs"], cell["execution_count"]
+
+
+# What is listed, and a damage to a solution that is its cause.
+DAMAGES = {
+    "cells that are there twice": lambda cell, cells: cells.append(deepcopy(cell)),
+    "solutions that are not code": lambda cell, _: turn_into_text(cell),
+    "cells deleted or without metadata": lambda cell, _: cell.metadata.pop("nbgrader"),
+    "cells of another release": lambda cell, _: cell.metadata.nbgrader.update(checksum="", schema_version=2),
+}
+
+
 @pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning")
 def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, monkeypatch):
     """Ada has one task right and calls the library in another; Bob's file is damaged, Eve's a PDF, Dan has two."""
@@ -354,6 +363,12 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
     downloads = folder / "downloaded" / name
     (downloads / "archive").mkdir(parents=True)
     with zipfile.ZipFile(downloads / "archive" / "all.zip", "w") as archive:
+        for number, damage in enumerate(DAMAGES.values(), 110):
+            notebook = deepcopy(handed_in)
+            damage(graded(notebook)[first], notebook.cells)
+            archive.writestr(f"A_{number}_assignsubmission_file_{name}.ipynb", nbformat.writes(notebook))
+        text, test, stripped, *_ = graded(handed_in, grade=True, locked=True).values()  # nbgrader puts them back
+        turn_into_text(text), handed_in.cells.insert(1, deepcopy(test)), stripped.metadata.pop("nbgrader")
         archive.writestr(f"Ada Lovelace_123_assignsubmission_file_{name} (1).ipynb", nbformat.writes(handed_in))
         archive.writestr(f"Bob_124_assignsubmission_file_{name}.ipynb", "{")
         archive.writestr("Eve_125_assignsubmission_file_homework.pdf", "")
@@ -374,12 +389,15 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
                 grade.manual_score, grade.needs_manual_grade = 1.5, False
         gradebook.db.commit()
     assert points == {f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)}
-    assert set(re.findall("'checksum' for cell (\\w+) has changed", log)) == set(points)
+    assert set(re.findall("(?:'checksum' for|Missing grade) cell (\\w+)", log)) == set(points)
     run_nbgrader(["export"])
     states = [line.removeprefix(name + ",") for line in (folder / "grades.csv").read_text().splitlines()[1:]]
-    assert states[:2] == ["123,5.5,20,graded", "124,,20,not graded: damaged file"]
-    assert states[2] == "125,,20,not collected: all/Eve_125_assignsubmission_file_homework.pdf"
-    assert states[3].startswith('126,,20,"not collected: 2 files, all/Dan_126') and len(states) == 4
+    not_graded = "{0},,20,not graded: submitted/{0}/05_metrics/05_metrics.ipynb: {1}".format
+    assert states[:4] == [not_graded(i, f"{cause}: {first}") for i, cause in enumerate(DAMAGES, 110)]
+    assert states[4:6] == ["123,5.5,20,graded", not_graded(124, "damaged file")]
+    assert states[6] == "125,,20,not collected: all/Eve_125_assignsubmission_file_homework.pdf"
+    assert states[7].startswith('126,,20,"not collected: 2 files, all/Dan_126') and len(states) == 8
+    assert all(state.removeprefix(f"{i},,20,") in log for i, state in enumerate(states[:4], 110))
     filled = (downloads / "worksheet_filled.csv").read_text().splitlines()
     assert filled[1:] == ["Participant 123,5.5", "Participant 124,", "Participant 125,", "Participant 126,"]
 

@@ -14,7 +14,9 @@ from latex2mathml.converter import convert
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from nbgrader.api import MissingEntry
+from nbgrader.converters.base import NbGraderException
 from nbgrader.plugins import ExportPlugin, FileNameCollectorPlugin
+from nbgrader.preprocessors import NbGraderPreprocessor
 from traitlets import Dict
 
 c = get_config()  # noqa: F821, nbgrader defines it
@@ -100,15 +102,78 @@ def keep_hand_ins(notebooks, **_):
 
 c.Autograde.post_convert_hook = keep_hand_ins
 
-# A cell that a student deleted is put back: its test fails, its answer is empty.
+
+def marked(notebook):
+    """Cells with metadata of nbgrader by their grade id; None if there is no id."""
+    found = {}
+    for cell in notebook.cells:
+        if "nbgrader" in cell.metadata:
+            grade_id = (cell.metadata.nbgrader or {}).get("grade_id")
+            found.setdefault(grade_id, []).append(cell)
+    return found
+
+
+def fault(handed_in, exercise):
+    """Why a notebook cannot be graded; empty if it can be.
+
+    nbgrader puts back a test and the text of the first cell. It cannot know which of
+    two solutions or answers counts, nor find one without its metadata. A solution that
+    became text may be a note: nbgrader would run it, perhaps after the right code.
+    """
+    path = HERE / "release" / exercise / f"{exercise}.ipynb"
+    if not path.is_file():
+        return f"no file release/{exercise}/{path.name}"
+    release, found = marked(nbformat.read(path, as_version=4)), marked(handed_in)
+    found.pop(None, None)
+    faults = {}
+    for name in release | found:
+        given, (wanted,) = found.get(name, []), release.get(name, [None])
+        data = wanted and wanted.metadata.nbgrader
+        if any(cell.metadata.nbgrader != data for cell in given):
+            cause = "cells of another release"
+        elif not given and (data.solution or not data.grade):
+            cause = "cells deleted or without metadata"
+        elif data.solution and len(given) > 1:
+            cause = "cells that are there twice"
+        elif data.solution and wanted.cell_type == "code" != given[0].cell_type:
+            cause = "solutions that are not code"
+        else:
+            continue
+        faults.setdefault(cause, []).append(name)
+    return "; ".join(f"{cause}: {', '.join(faults[cause])}" for cause in faults)
+
+
+class CheckHandIn(NbGraderPreprocessor):
+    """Refuse what cannot be graded, and remove metadata that nbgrader stumbles over."""
+
+    def preprocess(self, nb, resources):
+        names = resources["nbgrader"]
+        if cause := fault(nb, names["assignment"]):
+            file = "submitted/{student}/{assignment}/{notebook}.ipynb".format(**names)
+            raise NbGraderException(f"not graded: {file}: {cause}")
+        for grade_id, cells in marked(nb).items():
+            if grade_id:
+                cells.pop()  # the last copy of a test counts
+            for cell in cells:
+                del cell.metadata["nbgrader"]
+        return nb, resources
+
+
+c.Autograde.sanitize_preprocessors.insert(0, CheckHandIn)
 c.OverwriteCells.add_missing_cells = True
 
 # JupyterLab, started with this file: no offer to build it, no question about news.
 c.ServerApp.tornado_settings = {"page_config_data": {"buildCheck": False}}
 c.LabApp.news_url = None
 
-# Seconds for one cell. The first import of torch takes most of them on a slow machine.
-c.Execute.timeout = 120
+
+def seconds(cell):
+    """Limit for a cell: that of `nbgrader validate`, but time to import torch."""
+    first = cell.metadata.get("nbgrader", {}).get("grade_id") == "setup"
+    return 120 if first else 30
+
+
+c.Execute.timeout_func = seconds
 
 
 class Renderer(IPythonRenderer):
@@ -215,14 +280,16 @@ class Marks(ExportPlugin):
         graded = self.root / "autograded" / student / assignment.name
         if not (handed_in / name).is_file():
             return "", f"not graded: no file {name}"
-        try:
-            nbformat.read(handed_in / name, as_version=4)
-        except Exception:  # whatever a damaged file raises
-            return "", "not graded: damaged file"
-        if not (graded / name).is_file():
-            return "", "not graded"
         if not same(handed_in / name, graded / COPY):
-            return "", "handed in again, not graded"
+            try:
+                cause = fault(nbformat.read(handed_in / name, 4), assignment.name)
+            except Exception:  # whatever a damaged file raises
+                cause = "damaged file"
+            if cause:
+                file = f"submitted/{student}/{assignment.name}/{name}"
+                return "", f"not graded: {file}: {cause}"
+            again = "handed in again, " if (graded / name).is_file() else ""
+            return "", f"{again}not graded"
         try:
             submission = gradebook.find_submission(assignment.name, student)
         except MissingEntry:
