@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,22 +76,27 @@ def import_capture(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
             "of masks that are named like the pictures (--masks DIR)"
         )
-    loads = [frame.load for frame in capture]
     if box is None:
-        seen = [index for index, load in enumerate(loads) if load().shows_object]
+        bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
     else:
-        found = masks_from_box(LazyFrames(loads), box)
+        found = masks_from_box((frame.load() for frame in capture), box)
         bits = [np.packbits(frame.mask > ON_OBJECT) for frame in found]
-        loads = [partial(_with_mask, *one) for one in zip(loads, bits, strict=True)]
         seen = [index for index, mask in enumerate(bits) if mask.any()]
     if not seen:
         raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
-    loads = [loads[index] for index in seen]
-    frames = LazyFrames(loads)
+
+    def load(index: int) -> Frame:
+        frame = capture[index].load()
+        if box is None:
+            return frame
+        mask = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
+        return replace(frame, mask=mask.astype(np.float32))
+
+    frames = LazyFrames(load, seen)
     flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
-    scaled = LazyFrames([partial(_scaled, load, scale) for load in loads])
+    scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
     data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):
         folder.mkdir(parents=True, exist_ok=True)
@@ -105,29 +109,17 @@ def import_capture(
 class LazyFrames(Sequence[Frame]):
     """Frames that are loaded at each access, because those of a capture do not fit into memory together."""
 
-    def __init__(self, loads: Sequence[Callable[[], Frame]]):
-        self._loads = loads
+    def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
+        self._load, self._indices = load, indices
 
     def __len__(self) -> int:
-        return len(self._loads)
+        return len(self._indices)
 
-    def __getitem__(self, index: int) -> Frame:
-        return self._loads[index]()
+    def __getitem__(self, position: int) -> Frame:
+        return self._load(self._indices[position])
 
     def __iter__(self) -> Iterator[Frame]:
-        return (load() for load in self._loads)
-
-
-def _with_mask(load: Callable[[], Frame], bits: UInt8[np.ndarray, " n"]) -> Frame:
-    """Load a frame with the mask of which the bits are given."""
-    frame = load()
-    mask = np.unpackbits(bits, count=frame.depth.size).reshape(frame.depth.shape)
-    return replace(frame, mask=mask.astype(np.float32))
-
-
-def _scaled(load: Callable[[], Frame], scale: float) -> Frame:
-    """Load a frame without a name, with its lengths multiplied by `scale`."""
-    return replace(scale_frame(load(), scale), name="")
+        return map(self._load, self._indices)
 
 
 def fuse(
