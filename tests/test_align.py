@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import permutations
 
+import msgspec
 import numpy as np
 import pytest
 from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
@@ -15,11 +16,13 @@ from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, NoPoseError
 from zsp_lite.labelling.session import Labelling
 from zsp_lite.metrics import rotation_error
 from zsp_lite.own_objects import estimate_pose, open_source
+from zsp_lite.viz.category_sheet import objects_figure
 
 BACKBONE = SlowBackbone(grid=8, _seconds=0)
 A, B, C = SEQUENCES
@@ -102,6 +105,15 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     np.testing.assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
     labelling = Labelling(root, "lump", SEQUENCES, reference=A)
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
+
+
+def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(run, monkeypatch):
+    dataset, frames = Co3D(small_folder()), Co3D.frames
+    monkeypatch.setattr(Co3D, "frames", lambda *of: [msgspec.structs.replace(one, mask=None) for one in frames(*of)])
+    shown = [axis.images[0].get_array() for axis in objects_figure(dataset, "lump", run[1]).axes]
+    assert len(shown) == 6
+    whole = [resize_frame(dataset.load(one), (224, 224)).rgb.tolist() for one in dataset.frames("lump", A)]
+    assert shown[0].tolist() in whole
 
 
 def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):

@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from co3d_folders import random_camera, seeds, sequence_data
@@ -14,8 +15,10 @@ from zsp_lite.data.depth import decode_depth, encode_depth, inpaint_depth, patch
 from zsp_lite.data.frames import (
     Frame,
     crop_to_object,
+    frame_defect,
     mask_to_bbox,
     read_depth,
+    read_image,
     read_mask,
     resize_frame,
     write_depth,
@@ -23,7 +26,8 @@ from zsp_lite.data.frames import (
 )
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
-from zsp_lite.points import axis_deviation, object_pixels, object_points, standard_deviation
+from zsp_lite.points import axis_deviation, object_pixels, object_points, standard_deviation, world_cloud
+from zsp_lite.views import object_crop
 
 SIZE = (24, 32)
 
@@ -106,6 +110,38 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     write_mask(tmp_path / "known.png", depth > 0)
     np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
     assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header: a mask of booleans
+
+
+@pytest.mark.parametrize(
+    ("extension", "options"),
+    [
+        (".png", ()),
+        (".jpg", ()),
+        (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)),
+        (".jpg", (cv2.IMWRITE_JPEG_RST_INTERVAL, 2)),
+    ],
+)
+def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
+    pixels = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
+    if extension == ".jpg":  # a thumbnail in a segment of its own
+        thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
+        data = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail + data[2:]
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    for behind in (b"", b"mp4 \xff\xda \xff\xd9 \xff\xda", b"\xff\xd9", data[:-9], bytes(99), b"IDAT IEND IDAT"):
+        path.write_bytes(data + behind)
+        np.testing.assert_array_equal(read_image(path), decoded)
+    for end in (*range(0, len(data), 37), len(data) - 2, len(data) - 1):
+        path.write_bytes(data[:end])
+        with pytest.raises(InputError, match="cannot be decoded"):
+            read_image(path)
+
+
+def test_a_mask_file_of_zeros_and_ones_is_an_empty_mask_for_all(tmp_path):
+    assert cv2.imwrite(str(tmp_path / "mask.png"), np.eye(*SIZE, dtype=np.uint8))
+    frame = replace(sequence_data("one").frames[0], mask=read_mask(tmp_path / "mask.png"))
+    assert frame.mask.any() and frame_defect(frame) == "empty object mask" and not len(world_cloud([frame])[0])
+    np.testing.assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
 
 
 def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Captures written in every format from rendered views are read with the true cameras and depth, and imported."""
 
 import json
+import weakref
 from dataclasses import replace
 
 import cv2
@@ -12,7 +13,7 @@ from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers import READERS, import_capture
+from zsp_lite.importers import READERS, CaptureFrame, import_capture
 from zsp_lite.importers.convert import fuse
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.synthetic.export import make_object
@@ -123,6 +124,20 @@ def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
         column, row = np.floor(pixels).astype(int).clip(0, np.array(frame.camera.size[::-1]) - 1).T
         assert (cv2.dilate(frame.mask, np.ones((5, 5)))[row, column] > 0.5).mean() > 0.97
         np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
+
+
+@pytest.mark.parametrize("box", [None, (20, 30, 60, 70)])
+def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
+    def load_counted(captured):
+        frame = load(captured)
+        images.append(weakref.ref(frame.rgb))  # a frame with another mask has the same one
+        held.append(sum(image() is not None for image in images))
+        return frame
+
+    load, images, held = CaptureFrame.load, [], []
+    monkeypatch.setattr(CaptureFrame, "load", load_counted)
+    assert import_capture(scan, tmp_path / "data", "teapot", "mine", box).frames == 8
+    assert max(held) <= 3
 
 
 def test_distortion_is_corrected(tmp_path, views):

@@ -123,7 +123,7 @@ def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
     box = tuple(map(int, (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)))
     away = replace(second, camera=replace(away, t=away.t - (0, 0, 9)))  # behind the camera
     black = replace(second, rgb=np.zeros_like(second.rgb))
-    masked = masks_from_box([first, away, black, second], box)
+    masked = list(masks_from_box([first, away, black, second], box))
     assert overlap(masked[0].mask, truth) > 0.9 and overlap(masked[3].mask, other) > 0.9
     assert not masked[1].mask.any() and not masked[2].mask.any()
 

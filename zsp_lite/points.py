@@ -9,6 +9,7 @@ from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 
 _FAR = 4.0  # points of a frame farther from their median than this multiple of the median distance are outliers
+_SAMPLE = 1 << 21  # points of many frames that are held at once; 50 MB
 
 
 def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
@@ -20,6 +21,17 @@ def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray
 def object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """Unproject the pixels of `object_pixels` to camera-frame points; N may be 0."""
     return unproject_depth(frame.depth, frame.camera)[object_pixels(frame)]
+
+
+def world_points(frame: Frame, pixels: Bool[np.ndarray, "height width"], step: int = 1) -> Float[np.ndarray, "n 3"]:
+    """Unproject every `step`-th of some pixels of known depth, row by row, to world points."""
+    rows, columns = np.divmod(np.flatnonzero(pixels)[::step], pixels.shape[1])
+    return frame.camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, frame.depth[rows, columns])
+
+
+def sampling_step(frame: Frame, count: int) -> int:
+    """Return the step by which the `world_points` of `count` frames of this size fit into memory together."""
+    return max(1, count * frame.depth.size // _SAMPLE)
 
 
 def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:
@@ -46,7 +58,7 @@ def world_cloud(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "n 3"], UInt
     clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for frame in frames:
         if not frame_defect(frame) and (inside := object_pixels(frame)).any():
-            points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera)[inside])
+            points = world_points(frame, inside)
             kept = near_median(points, _FAR)
             clouds.append(points[kept])
             colours.append(frame.rgb[inside][kept])

@@ -50,7 +50,8 @@ def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
 
     The aspect is not kept. A frame without a mask, or with an empty one, is not cropped.
     """
-    return resize_frame(frame if frame.mask is None or not frame.mask.any() else crop_to_object(frame), (size, size))
+    cropped = crop_to_object(frame) if frame.mask is not None and frame.shows_object else frame
+    return resize_frame(cropped, (size, size))
 
 
 def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency") -> list[View]:
@@ -76,7 +77,7 @@ def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") 
     The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches of which the frame's
     mask covers at least a quarter. A frame with an empty mask has no foreground.
     """
-    if foreground == "mask" or (crop.mask is not None and not crop.mask.any()):
+    if foreground == "mask" or not crop.shows_object:
         return View(crop, features, patch_mask(crop, features.grid), crop.mask)
     # As a soft mask: 0 for no saliency, 0.5 at the threshold of the foreground, 1 from twice that on.
     ramp = (features.saliency.numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)

@@ -4,6 +4,7 @@ All image files are opened here.
 """
 
 import io
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,6 +23,9 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
+# The start of a JPEG's segment, or the end of the image: FF and a byte other than that of image data (00), of a marker
+# alone (01, D0 to D8) and of padding (FF).
+_JPEG_MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
 
@@ -50,6 +54,11 @@ class Frame:
                 raise InputError(f"{label} {name} has {found}, expected shape {size} and values from 0 to {top:g}")
             object.__setattr__(self, name, values)
 
+    @property
+    def shows_object(self) -> bool:
+        """Whether some pixel is on the object; without a mask all are."""
+        return self.mask is None or bool((self.mask > ON_OBJECT).any())
+
     def __repr__(self) -> str:
         height, width = self.camera.size
         depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
@@ -61,7 +70,7 @@ def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable frame."""
     if frame.rgb.max() < _BLACK:
         return "black image"
-    if frame.mask is not None and not frame.mask.any():
+    if not frame.shows_object:
         return "empty object mask"
     if frame.depth is None:
         return "no depth map"
@@ -187,19 +196,35 @@ def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or too large."""
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
-    # OpenCV fills the missing part of a truncated file with grey. A complete file has an end marker after the last
-    # start of image data (a JPEG's embedded thumbnail has an end marker of its own).
-    start, end = (b"\xff\xda", b"\xff\xd9") if is_jpeg else (b"IDAT", b"IEND")
     image, expected = None, "a complete JPEG or PNG"
     with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
         width, height = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data)).size  # reads the header only
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
-        elif data.rfind(end) > data.rfind(start):
+        elif _has_jpeg_end(data) if is_jpeg else _has_png_end(data):  # OpenCV fills missing parts of an image with grey
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image
+
+
+def _has_jpeg_end(data: bytes) -> bool:
+    """Say whether a JPEG file has the end marker of its image; any data may follow, as in a phone's motion photos."""
+    position = 2
+    while marker := _JPEG_MARKER.search(data, position):
+        if marker[0] == b"\xff\xd9":
+            return True
+        # A segment begins with its length. Image data follow the segment FFDA; they contain no other marker.
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2])
+    return False
+
+
+def _has_png_end(data: bytes) -> bool:
+    """Say whether a PNG file has its last chunk; any data may follow."""
+    position = 8  # after the signature
+    while data[position + 4 : position + 8] not in (b"IEND", b""):
+        position += 12 + int.from_bytes(data[position : position + 4])  # length, kind and checksum have 4 bytes each
+    return len(data) >= position + 12
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:

@@ -169,7 +169,7 @@ def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFra
     poses = _numbers(lists["poses.txt"], f"{folder}/poses.txt", (12, 16))
     masks, size = files_by_stem(Path(folder) / "masks"), read_image(path_inside(folder, lists["rgb.txt"][0])).shape[:2]
     frames = []
-    for number, (image, depth, pose) in enumerate(zip(lists["rgb.txt"], lists["depth.txt"], poses), 1):
+    for number, (image, depth, pose) in enumerate(zip(lists["rgb.txt"], lists["depth.txt"], poses, strict=True), 1):
         image, depth = path_inside(folder, image), path_inside(folder, depth)
         matrix = np.array([*pose, 0, 0, 0, 1][:16]).reshape(4, 4)
         camera = camera_from_pose(matrix, intrinsics, size, f"capture {folder}, line {number} of the lists")

@@ -1,6 +1,6 @@
 """Conversion of a capture to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,10 +16,11 @@ from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
-from zsp_lite.points import axis_deviation, object_pixels, object_points
+from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
+_LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -65,7 +66,9 @@ def import_capture(
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     capture = evenly_spaced(capture, max_frames)
-    if masks is not None and box is None:
+    if box is not None:
+        capture = [replace(frame, mask=None) for frame in capture]
+    elif masks is not None:
         files = files_by_stem(masks)
         capture = [replace(frame, mask=files.get(frame.image.stem)) for frame in capture]
     if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
@@ -73,27 +76,54 @@ def import_capture(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
             "of masks that are named like the pictures (--masks DIR)"
         )
-    frames = [frame.load() for frame in capture]
-    frames = frames if box is None else masks_from_box(frames, box)
-    seen = [index for index, frame in enumerate(frames) if (frame.mask > ON_OBJECT).any()]
+    if box is None:
+        bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
+    else:
+        found = masks_from_box((frame.load() for frame in capture), box)
+        bits = [np.packbits(frame.mask > ON_OBJECT) for frame in found]
+        seen = [index for index, mask in enumerate(bits) if mask.any()]
     if not seen:
-        raise InputError(f"the masks of all {len(frames)} frames are empty, expected an object")
-    empty, frames = len(frames) - len(seen), [frames[index] for index in seen]
+        raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
+
+    def load(index: int) -> Frame:
+        frame = capture[index].load()
+        if box is None:
+            return frame
+        mask = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
+        return replace(frame, mask=mask.astype(np.float32))
+
+    frames = LazyFrames(load, seen)
     flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
-    scaled = [replace(scale_frame(frame, scale), name="") for frame in frames]
+    scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
     data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
     with writing(root):
         folder.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(frames), empty, len(points), scale, flags)
+    return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, flags)
+
+
+class LazyFrames(Sequence[Frame]):
+    """Frames that are loaded at each access, because those of a capture do not fit into memory together."""
+
+    def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
+        self._load, self._indices = load, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> Frame:
+        return self._load(self._indices[position])
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._load, self._indices)
 
 
 def fuse(
-    frames: Sequence[Frame],
+    frames: Collection[Frame],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Fuse the depth inside the masks by TSDF (Curless and Levoy 1996) to world points, RGB colours and normals."""
     o3d = load_open3d()
@@ -128,9 +158,13 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
     return replace(frame, camera=camera, depth=(frame.depth * scale).astype(np.float32))
 
 
-def _spread(frames: Sequence[Frame]) -> float:
+def _spread(frames: Collection[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
-    points = np.concatenate([frame.camera.to_world(object_points(frame))[::7] for frame in frames])
+    clouds = []
+    for frame in frames:
+        step = max(_LEAST_STEP, sampling_step(frame, len(frames)))
+        clouds.append(world_points(frame, object_pixels(frame), step))
+    points = np.concatenate(clouds)
     if not len(points):
         raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
     deviation = np.abs(points - np.median(points, axis=0))

@@ -5,8 +5,10 @@ parts; the object is the part at the point that the optical axes approach. Where
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -14,10 +16,10 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from zsp_lite.data.cameras import Box
-from zsp_lite.data.depth import fit_plane, unproject_depth
+from zsp_lite.data.depth import fit_plane
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, largest_region, mask_to_bbox
 from zsp_lite.errors import InputError
-from zsp_lite.points import object_pixels, object_points, standard_deviation
+from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
 # By colours.
 _ITERATIONS = 4  # of GrabCut
@@ -50,19 +52,22 @@ _LYING = 0.5  # share of the object's points that may lie in the plane around it
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
 
 
-def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
+def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
     """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
     a further frame is the projection of the object points of the frames before it and of a ball as wide as the first
     box, which stands for what is not visible there. A mask is empty where a further frame does not show the object.
+    The frames are read one by one, as their masks are asked for. InputError if the box finds nothing.
     """
-    height, width = frames[0].camera.size
+    frames = iter(frames)
+    first = next(frames)
+    height, width = first.camera.size
     top, left, box_height, box_width = box
     inside = min(top, left) >= 0 and top + box_height <= height and left + box_width <= width
     if not inside or min(box_height, box_width) < _SMALLEST_BOX:
         raise InputError(f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}")
-    first = replace(frames[0], mask=grab_cut(frames[0].rgb, box))
+    first = replace(first, mask=grab_cut(first.rgb, box))
     points = _inner_points(first)
     if not len(points):
         raise InputError(f"frame {first.name}: no object with known depth in the box {tuple(box)}, expected another")
@@ -72,15 +77,21 @@ def masks_from_box(frames: Sequence[Frame], box: Box) -> list[Frame]:
     directions = np.random.default_rng(0).normal(size=(_POINTS // 4, 3))
     ball = radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     ball += first.camera.unproject(middle, depth + _BALL_OFFSET * radius)
-    masked = [first]
-    for frame in frames[1:]:
+    return chain([first], _masks_from_points(frames, points, ball))
+
+
+def _masks_from_points(
+    frames: Iterator[Frame], points: Float[np.ndarray, "n 3"], ball: Float[np.ndarray, "m 3"]
+) -> Iterator[Frame]:
+    """Segment the object in frames, given world points on it and those of a ball that stands for the rest."""
+    for frame in frames:
         found = _project_box(frame, np.concatenate([points, ball]))
-        seen = min(found[2:]) >= _SMALLEST_BOX and not frame_defect(frame)
+        seen = min(found[2:]) >= _SMALLEST_BOX and not frame_defect(replace(frame, mask=None))
         mask = grab_cut(frame.rgb, found) if seen else np.zeros(frame.camera.size, np.float32)
-        masked.append(replace(frame, mask=mask))
-        points = np.concatenate([points, _inner_points(masked[-1])])
+        masked = replace(frame, mask=mask)
+        points = np.concatenate([points, _inner_points(masked)])
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
-    return masked
+        yield masked
 
 
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
@@ -113,7 +124,7 @@ def separate_colours(
 def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """World points inside the mask, without its border, where depth may be that of the background."""
     inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
-    return frame.camera.to_world(object_points(inner))
+    return world_points(inner, object_pixels(inner))
 
 
 def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
@@ -134,14 +145,19 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     """Segment the object in frames of one world; InputError if nothing stands out where the cameras look."""
     if not any((frame.depth > 0).any() for frame in frames):
         raise InputError(f"no depth is known in any of {len(frames)} frames, expected some to find the object")
-    points = [_world_points(frame) for frame in frames]
-    focus, distance = _focus(frames, points)
-    near = [np.linalg.norm(one - focus, axis=-1) < _REACH * distance for one in points]  # False for NaN
-    plane = _supporting_plane(frames, [one[chosen] for one, chosen in zip(points, near)], distance)
+    focus, distance = _focus(frames)
+    pixels, sample = [], []
+    for frame in frames:
+        near = frame.depth > 0
+        near[near] = _within(world_points(frame, near), focus, distance)
+        pixels.append(near)
+        sample.append(world_points(frame, near, sampling_step(frame, len(frames))))
+    plane = _supporting_plane([frame.camera.centre for frame in frames], np.concatenate(sample), distance)
     if plane is not None:
-        near = [chosen & (one @ plane[0] - plane[1] > _CLEARANCE * distance) for one, chosen in zip(points, near)]
-    parts = _part_at(focus, points, near, _VOXEL * distance)
-    masked = [replace(frame, mask=_with_unknown(frame, part)) for frame, part in zip(frames, parts)]
+        for frame, near in zip(frames, pixels, strict=True):
+            near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
+    parts = _part_at(focus, frames, pixels, _VOXEL * distance)
+    masked = [replace(frame, mask=_with_unknown(frame, part)) for frame, part in zip(frames, parts, strict=True)]
     if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
             f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks, expected "
@@ -150,39 +166,46 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     return masked
 
 
-def mask_flags(frames: Sequence[Frame]) -> tuple[str, ...]:
-    """Say in one line what speaks against the masks of frames of one world; frames with empty masks do not count."""
-    frames = [frame for frame in frames if (frame.mask > ON_OBJECT).any() and not frame_defect(frame)]
-    if not frames:
+def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
+    """Say in one line what speaks against the masks of frames of one world; frames with a defect do not count."""
+    on_object, around, centres = [], [], []
+    for frame in frames:
+        if not frame_defect(frame):
+            known, mask = frame.depth > 0, frame.mask > ON_OBJECT
+            widened = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            step = sampling_step(frame, len(frames))
+            on_object.append(world_points(frame, known & mask, step))
+            around.append(world_points(frame, known & ~widened, step))
+            centres.append(frame.camera.centre)
+    if not centres:
         return ()
-    plane, distance = _plane_around(frames)
-    found = Counter(sign for frame in frames for sign in _signs(frame, plane, distance))
-    signs = [f"{sign} ({count} of {len(frames)} frames)" for sign, count in found.items()]
+    centre, cloud = np.median(np.concatenate(on_object), axis=0), np.concatenate(around)
+    distance = float(np.linalg.norm(centres - centre, axis=1).mean())
+    plane = _supporting_plane(centres, cloud[_within(cloud, centre, distance)], distance)
+    usable = (frame for frame in frames if not frame_defect(frame))
+    found = Counter(sign for frame in usable for sign in _signs(frame, plane, distance))
+    signs = [f"{sign} ({count} of {len(centres)} frames)" for sign, count in found.items()]
     if plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"the masks may be wrong: {', '.join(signs)}",) if signs else ()
 
 
-def _world_points(frame: Frame) -> Float[np.ndarray, "h w 3"]:
-    """World points of all pixels, NaN where the depth is unknown."""
-    points = frame.camera.to_world(unproject_depth(frame.depth, frame.camera))
-    points[frame.depth <= 0] = np.nan
-    return points
+def _within(points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], distance: float) -> Bool[np.ndarray, " n"]:
+    """Select the points that may be part of an object at the focus of cameras at a distance."""
+    return np.linalg.norm(points - focus, axis=1) < _REACH * distance
 
 
 def _supporting_plane(
-    frames: Sequence[Frame], points: Sequence[Float[np.ndarray, "_ 3"]], distance: float
+    centres: Sequence[Float[np.ndarray, "3"]], cloud: Float[np.ndarray, "n 3"], distance: float
 ) -> Plane | None:
-    """Fit the plane that an object stands on to the points around it; None if there is none."""
-    centres = np.stack([frame.camera.centre for frame in frames])
-    cloud = np.concatenate(points)
+    """Fit the plane that an object stands on to the points around it, below the cameras; None if there is none."""
     cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]
     rest = cloud
     for _ in range(_PLANES):
         if len(rest) < _MIN_PIXELS:
             break
         normal, offset = fit_plane(rest, _PLANE_DISTANCE * distance)
-        if np.median(centres @ normal - offset) < 0:
+        if np.median(np.stack(centres) @ normal - offset) < 0:
             normal, offset = -normal, -offset
         height = cloud @ normal - offset
         on = np.abs(height) < _PLANE_DISTANCE * distance
@@ -194,7 +217,7 @@ def _supporting_plane(
     return None
 
 
-def _focus(frames: Sequence[Frame], points: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, "3"], float]:
+def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the optical axes of the cameras, and their mean distance from it."""
     centres = np.stack([frame.camera.centre for frame in frames])
     axes = np.stack([frame.camera.R[2] for frame in frames])
@@ -209,27 +232,32 @@ def _focus(frames: Sequence[Frame], points: Sequence[np.ndarray]) -> tuple[Float
     known, (height, width) = frames[first].depth > 0, frames[first].camera.size
     middle = np.zeros_like(known)
     middle[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
-    chosen = points[first][known & middle if (known & middle).any() else known]
-    depth = frames[first].camera.to_camera(chosen)[:, 2]
-    focus = np.median(chosen[depth <= np.quantile(depth, 0.25)], axis=0)
+    chosen = known & middle if (known & middle).any() else known
+    points, depth = world_points(frames[first], chosen), frames[first].depth[chosen]
+    focus = np.median(points[depth <= np.quantile(depth, 0.25)], axis=0)
     return focus, float(np.linalg.norm(focus - centres[first]))
 
 
 def _part_at(
-    focus: Float[np.ndarray, "3"], points: Sequence[np.ndarray], near: Sequence[np.ndarray], voxel: float
+    focus: Float[np.ndarray, "3"], frames: Sequence[Frame], pixels: Sequence[np.ndarray], voxel: float
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels `near` in the connected part with the most points, which count less far from the focus."""
-    cloud = np.concatenate([one[chosen] for one, chosen in zip(points, near)])
-    selected = [chosen.copy() for chosen in near]
-    if len(cloud):
-        cells = np.floor((cloud - cloud.min(axis=0)) / voxel).astype(int)
-        grid = np.zeros(cells.max(axis=0) + 1, bool)
-        grid[tuple(cells.T)] = True
-        part = ndimage.label(grid, np.ones((3, 3, 3)))[0][tuple(cells.T)]
-        weight = np.exp(-np.square(np.linalg.norm(cloud - focus, axis=1) / (8 * voxel)))
-        ends = np.cumsum([mask.sum() for mask in selected])[:-1]
-        for mask, on_part in zip(selected, np.split(part == np.bincount(part, weight).argmax(), ends)):
-            mask[mask] = on_part
+    """Select the pixels in the connected part with the most points, which count less far from the focus."""
+    clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]  # to be computed twice, not kept
+    corners = [(cloud.min(axis=0), cloud.max(axis=0)) for cloud in (make() for make in clouds) if len(cloud)]
+    if not corners:
+        return list(pixels)
+    low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
+    shape = np.floor((high - low) / voxel).astype(int) + 1
+    weight, cells = np.zeros(shape.prod()), []
+    for points in (make() for make in clouds):
+        cells.append(np.ravel_multi_index(np.floor((points - low) / voxel).astype(int).T, shape).astype(np.int32))
+        near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
+        weight += np.bincount(cells[-1], near, len(weight))
+    part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
+    chosen = part == np.bincount(part, weight).argmax()
+    selected = [some.copy() for some in pixels]
+    for mask, cell in zip(selected, cells, strict=True):
+        mask[mask] = chosen[cell]
     return selected
 
 
@@ -265,17 +293,6 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     if (found & mask).sum() / (found | mask).sum() < _COLOUR_IOU:
         yield "colours disagree"
     if plane is not None:
-        height = _world_points(frame)[mask & (frame.depth > 0)] @ plane[0] - plane[1]
+        height = world_points(frame, mask & (frame.depth > 0)) @ plane[0] - plane[1]
         if (height < _PLANE_DISTANCE * distance).sum() > _LYING * len(height):
             yield "much of it lies in the plane around it"
-
-
-def _plane_around(frames: Sequence[Frame]) -> tuple[Plane | None, float]:
-    """Fit the plane that an object stands on to points outside of its masks; return also the cameras' distance."""
-    points, masks = [_world_points(frame) for frame in frames], [frame.mask > ON_OBJECT for frame in frames]
-    centre = np.nanmedian(np.concatenate([one[mask] for one, mask in zip(points, masks)]), axis=0)
-    distance = float(np.mean([np.linalg.norm(frame.camera.centre - centre) for frame in frames]))
-    widened = [cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for mask in masks]
-    near = [np.linalg.norm(one - centre, axis=-1) < _REACH * distance for one in points]  # False for NaN
-    around = [one[chosen & ~mask] for one, chosen, mask in zip(points, near, widened)]
-    return _supporting_plane(frames, around, distance), distance

@@ -1,4 +1,4 @@
-"""Contact sheet of a category: its objects seen by one camera, as scanned and in their common frame."""
+"""Picture of a category: its objects seen by one camera, as scanned and in their common frame."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
 from zsp_lite.category import CategoryAlignment
+from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
@@ -15,10 +16,10 @@ from zsp_lite.viz.plots import VERMILLION
 
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
 _DOUBTFUL = 0.8  # an object with a lower probability should be looked at
-MOST = 10  # objects of a sheet
+MOST = 10  # objects of a figure
 
 
-def contact_sheet(
+def objects_figure(
     dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None
 ) -> Figure:
     """Show objects by the frame that is nearest to one camera: in their own worlds above, in the common frame below.
@@ -38,13 +39,13 @@ def contact_sheet(
         rows["or turned"] = turned
     size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
     figure, axes = plt.subplots(len(rows), len(names), figsize=size, layout="constrained", squeeze=False)
-    for line, (title, cameras) in zip(axes, rows.items()):
+    for line, (title, cameras) in zip(axes, rows.items(), strict=True):
         line[names.index(next(iter(cameras)))].set_ylabel(title)
-        for axis, name in zip(line, names):
+        for axis, name in zip(line, names, strict=True):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in cameras:
                 axis.imshow(_nearest(dataset, category, name, cameras[name]))
-    for axis, name in zip(axes[1], names):
+    for axis, name in zip(axes[1], names, strict=True):
         text, colour = f"{name[:16]}\n{100 * objects[name].probability:.0f} %", VERMILLION if name in look else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
     return figure
@@ -68,8 +69,10 @@ def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
     return rows
 
 
-def _frames(dataset: Co3D, category: str, name: str) -> list:
-    return [one for one in dataset.frames(category, name) if None not in (one.viewpoint, one.mask)]
+def _frames(dataset: Co3D, category: str, name: str) -> list[FrameAnnotation]:
+    """Read the frames of an object with a camera, and those with a mask only if there are some."""
+    frames = [one for one in dataset.frames(category, name) if one.viewpoint is not None]
+    return [one for one in frames if one.mask is not None] or frames
 
 
 def _nearest(

@@ -52,7 +52,7 @@ def write_category_report(path: Path, alignment: CategoryAlignment, dataset: Co3
     """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
     names = list(alignment.objects)
     parts = [names[start : start + category_sheet.MOST] for start in range(0, len(names), category_sheet.MOST)]
-    figures = [category_sheet.contact_sheet(dataset, category, alignment, part) for part in parts]
+    figures = [category_sheet.objects_figure(dataset, category, alignment, part) for part in parts]
     sheets = [_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures]
     text = _template("category.html").render(
         category=category, columns=category_sheet.COLUMNS, rows=category_sheet.object_rows(alignment),
