@@ -94,6 +94,7 @@ def align_category(
     Raises:
         InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
             of them, or OUT holds another run.
+        FatalError: The backbone is broken, or a frame cannot be read.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
     loaded = as_backbone(backbone)
