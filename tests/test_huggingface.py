@@ -52,7 +52,7 @@ def by_transformers(folder: Path, kind: str, size: int):
     if kind == "vit_mae":
         model.config.mask_ratio = 0.0
         options["noise"] = torch.arange((size // architecture.patch) ** 2).float().repeat(len(pictures), 1)
-    blocks, seen = model.get_submodule(architecture.stack), []
+    (blocks,), seen = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)], []
     for block in blocks:
         block.register_forward_hook(lambda module, inputs, output: seen.append((inputs[0], output)))
     with torch.no_grad():
@@ -63,8 +63,9 @@ def by_transformers(folder: Path, kind: str, size: int):
 
 def projection(architecture, block, x, facet: str):
     """Return queries, keys or values of a block for its input."""
-    attention = block.get_submodule(architecture.attention)
-    return getattr(attention, f"{facet[0]}_proj")(block.get_submodule(architecture.norm)(x)).detach()
+    names = f"{facet[0]}_proj", facet  # of newer and of older releases of transformers
+    (project,) = [module for name, module in block.named_modules() if name.rpartition(".")[2] in names]
+    return project(block.get_submodule(architecture.norm)(x)).detach()
 
 
 # what it computes
