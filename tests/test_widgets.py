@@ -91,7 +91,7 @@ def test_attention_names_the_patch_with_the_largest_weight():
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
     truth = examples.sample_pair()
     kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
-    widget = features.similarities(truth.reference.rgb, truth.target.rgb, kinds, truth.cells, truth.valid, "other")
+    widget = features.patch_similarities(truth.reference.rgb, truth.target.rgb, kinds, truth.cells, truth.valid, "other")
     widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
     row, col = cells[15 * 28 + 9]
     assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
