@@ -97,7 +97,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     text = capsys.readouterr().out
     assert "lump: 3 objects in one frame" in text and "100.0% of 6 ordered pairs are within 30°" in text
     assert f"{A} to {C}: the best pose of the pair alone is 180° away" in text
-    assert (out / "report.html").read_text().count("<img") == 1 and (out / "objects.jpg").stat().st_size > 1000
+    assert (out / "report.html").read_bytes().count(b"<img") == 1 and (out / "objects.jpg").stat().st_size > 1000
     alignment = json.loads((out / "alignment.json").read_text())
     assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
     np.testing.assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)

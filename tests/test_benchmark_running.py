@@ -36,6 +36,7 @@ from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 
 pytestmark = pytest.mark.slow
+needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep")
 
 QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
@@ -63,6 +64,7 @@ def _children(pid: int) -> set[int]:
     return {int(child) for child in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True).stdout.split()}
 
 
+@needs_signals
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
     stored = 0
     for workers, more in ((2, 1), (1, 3)):
@@ -115,6 +117,7 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     assert not packed.exists() and (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
 
 
+@needs_signals
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path, monkeypatch):
     seen, before = [], _children(os.getpid())
 
@@ -132,6 +135,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
 
 
+@needs_signals
 def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
     from distributed import LocalCluster
 

@@ -61,7 +61,7 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
-        assert not re.search("^(from|import) ipywidgets", path.read_text(), re.MULTILINE), path.name
+        assert not re.search("^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE), path.name
 
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
